@@ -1,0 +1,162 @@
+"""Maximum a posteriori pose of a camera from point-to-plane distances, reprojections and a motion prior.
+
+Gauss-Newton on the right perturbation T_world_camera <- T_world_camera exp(x), with Cauchy weights recomputed at every
+step. Point-to-plane with projective association: Chen and Medioni, 1992; Newcombe et al., "KinectFusion", 2011.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.odometry import se3
+from operators.odometry.camera import Pixels, Points, project
+from operators.odometry.se3 import Matrix, Vector
+from operators.odometry.surface import DepthNoise, Surface
+
+CAUCHY = 2.0  # residuals of this many sigmas count half
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """One term's part of the normal equations, and how well it fits."""
+
+    H: Matrix  # (6, 6) information
+    b: Vector  # (6,) gradient
+    seen: int  # measurements that could be compared
+    inliers: int  # of these, within three sigmas
+
+
+class Term(Protocol):
+    """A set of measurements of the camera's pose."""
+
+    def linearise(self, T_world_camera: Matrix) -> Normal: ...
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneTerm:
+    """Points (N, 3) seen by the camera lie on the surface of a reference view."""
+
+    points: Points
+    reference: Surface
+    T_reference_world: Matrix
+    noise: DepthNoise
+    gate: float  # metres beyond which a point is taken to see another surface
+    strength: float  # of the information: neighbouring depths err together
+
+    def linearise(self, T_world_camera: Matrix) -> Normal:
+        T = self.T_reference_world @ T_world_camera
+        R, K = T[:3, :3], self.reference.K
+        h, w = self.reference.inverse_depth.shape
+        q = self.points @ R.T + T[:3, 3]
+        z = q[:, 2]
+        ahead = np.maximum(z, 0.05)
+        u = np.rint(q[:, 0] / ahead * K[0, 0] + K[0, 2])
+        v = np.rint(q[:, 1] / ahead * K[1, 1] + K[1, 2])
+        inside = np.flatnonzero((z > 0.05) & (u >= 0) & (v >= 0) & (u < w) & (v < h))
+        planes = self.reference.planes[(v[inside] * w + u[inside]).astype(np.int64)]
+        known = planes[:, 3] != 0
+        inside, planes = inside[known], planes[known].astype(np.float64)
+        normals, q = planes[:, :3], q[inside]
+        r = np.einsum("ij,ij->i", normals, q) - planes[:, 3]
+        near = np.abs(r) < self.gate
+        seen = len(r)
+        if not near.any():
+            return Normal(np.zeros((6, 6)), np.zeros(6), seen, 0)
+        inside, normals, q, r = inside[near], normals[near], q[near], r[near]
+        # Both depths err along their rays; the distance sees that error's part along the normal.
+        along = np.abs(np.einsum("ij,ij->i", normals, q)) / q[:, 2]
+        sigma = np.sqrt(2.0) * self.noise.sigma(q[:, 2]) * along
+        e2 = (r / sigma) ** 2
+        weight = self.strength / (sigma**2 * (1.0 + e2 / CAUCHY**2))
+        m = normals @ R
+        p = self.points[inside]
+        J = np.empty((len(r), 6))
+        J[:, :3] = m
+        J[:, 3] = p[:, 1] * m[:, 2] - p[:, 2] * m[:, 1]
+        J[:, 4] = p[:, 2] * m[:, 0] - p[:, 0] * m[:, 2]
+        J[:, 5] = p[:, 0] * m[:, 1] - p[:, 1] * m[:, 0]
+        JW = J.T * weight
+        return Normal(JW @ J, JW @ r, seen, int(np.count_nonzero(e2 < 9.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class PixelTerm:
+    """World points (N, 3) seen at pixels (N, 2) of the colour camera."""
+
+    points_world: Points
+    pixels: Pixels
+    K_color: Matrix
+    T_color_depth: Matrix
+    sigma: float  # pixels
+    strength: float
+
+    def linearise(self, T_world_camera: Matrix) -> Normal:
+        T = self.T_color_depth @ se3.inverse(T_world_camera)
+        p = self.points_world @ T[:3, :3].T + T[:3, 3]
+        r = project(p, self.K_color) - self.pixels
+        e2 = np.einsum("ij,ij->i", r, r) / self.sigma**2
+        weight = np.where(p[:, 2] > 0.05, self.strength / (self.sigma**2 * (1.0 + e2 / CAUCHY**2)), 0.0)
+        J = reprojection_jacobian(p, self.K_color, self.T_color_depth)
+        JW = J.transpose(2, 0, 1) * weight[:, None]
+        H = np.tensordot(JW, J, axes=((1, 2), (0, 1)))
+        b = np.tensordot(JW, r, axes=((1, 2), (0, 1)))
+        return Normal(H, b, len(r), int(np.count_nonzero(e2 < 9.0)))
+
+
+@dataclass(frozen=True, eq=False)
+class PriorTerm:
+    """The pose is near a prediction."""
+
+    T_world_camera: Matrix
+    information: Matrix
+
+    def linearise(self, T_world_camera: Matrix) -> Normal:
+        x = se3.log(se3.inverse(self.T_world_camera) @ T_world_camera)
+        return Normal(self.information, self.information @ x, 0, 0)
+
+
+def reprojection_jacobian(points_color: Points, K: Matrix, T_color_depth: Matrix) -> NDArray[np.float64]:
+    """d pixel / d x (N, 2, 6) for the perturbation of the depth camera's pose; points (N, 3) in the colour camera."""
+    x, y = points_color[:, 0], points_color[:, 1]
+    z = np.where(points_color[:, 2] > 0.05, points_color[:, 2], 1.0)
+    D = np.zeros((len(z), 2, 3))
+    D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * x / z**2
+    D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z, -K[1, 1] * y / z**2
+    D = D @ T_color_depth[:3, :3]
+    p = (points_color - T_color_depth[:3, 3]) @ T_color_depth[:3, :3]  # in the depth camera
+    J = np.empty((len(z), 2, 6))
+    J[:, :, :3] = -D
+    # d p / d w = [p]x, so each row d of D gives d [p]x = (d × p).
+    J[:, :, 3] = D[:, :, 1] * p[:, None, 2] - D[:, :, 2] * p[:, None, 1]
+    J[:, :, 4] = D[:, :, 2] * p[:, None, 0] - D[:, :, 0] * p[:, None, 2]
+    J[:, :, 5] = D[:, :, 0] * p[:, None, 1] - D[:, :, 1] * p[:, None, 0]
+    return J
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """The pose found, its information (6, 6), prior excluded, and the last state of every term."""
+
+    T_world_camera: Matrix
+    information: Matrix
+    terms: tuple[Normal, ...]
+
+
+def align(T_world_camera: Matrix, terms: Sequence[Term], prior: Term, iterations: int) -> Alignment:
+    """Gauss-Newton from an initial pose until a step is below 0.1 mm and 0.1 mrad."""
+    T = T_world_camera
+    for iteration in range(iterations + 1):
+        parts = tuple(term.linearise(T) for term in terms)
+        information = sum((part.H for part in parts), np.zeros((6, 6)))
+        if iteration == iterations:
+            break
+        anchor = prior.linearise(T)
+        gradient = sum((part.b for part in parts), anchor.b)
+        step = -np.linalg.solve(information + anchor.H, gradient)
+        T = T @ se3.exp(step)
+        if np.abs(step).max() < 1e-4:
+            break
+    return Alignment(se3.orthonormalised(T), information, parts)

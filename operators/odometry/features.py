@@ -1,0 +1,58 @@
+"""Sparse image features: spread corners, their pyramidal Lucas-Kanade tracks, and ORB matches where tracking cannot reach."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Gray = NDArray[np.uint8]
+Pixels = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LK_WINDOW = (15, 15)
+LK_LEVELS = 3
+LK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
+
+
+def detect_corners(gray: Gray, count: int) -> Pixels:
+    """At most count Shi-Tomasi corners (N, 2), spread over the image. Shi and Tomasi, "Good features to track", 1994."""
+    spacing = max(3.0, 0.6 * float(np.sqrt(gray.size / count)))
+    corners = cv2.goodFeaturesToTrack(gray, count, qualityLevel=0.005, minDistance=spacing, blockSize=5)
+    return np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
+
+
+def track_corners(gray_from: Gray, gray_to: Gray, pixels_from: Pixels, guess_to: Pixels) -> tuple[Pixels, Mask]:
+    """Follow pixels (N, 2) from one image into another, starting at a guess. Bouguet, 2000."""
+    if len(pixels_from) == 0:
+        return np.zeros((0, 2)), np.zeros(0, bool)
+    height, width = gray_to.shape
+    inside = (guess_to > -20).all(axis=1) & (guess_to[:, 0] < width + 20) & (guess_to[:, 1] < height + 20)
+    start = np.where(inside[:, None], guess_to, pixels_from).astype(np.float32)
+    moved, found, _ = cv2.calcOpticalFlowPyrLK(
+        gray_from, gray_to, pixels_from.astype(np.float32), start, winSize=LK_WINDOW, maxLevel=LK_LEVELS,
+        criteria=LK_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+    )  # fmt: skip
+    moved = moved.astype(np.float64)
+    seen = (moved >= 0).all(axis=1) & (moved[:, 0] < width) & (moved[:, 1] < height)
+    return moved, (found.ravel() > 0) & seen & inside
+
+
+class OrbMatcher:
+    """Descriptors and mutual nearest matches. Rublee et al., "ORB", 2011."""
+
+    def __init__(self, count: int = 500) -> None:
+        self._orb = cv2.ORB_create(count, scaleFactor=1.3, nlevels=6, edgeThreshold=15, patchSize=31, fastThreshold=10)
+        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+
+    def describe(self, gray: Gray) -> tuple[Pixels, NDArray[np.uint8]]:
+        """Pixels (N, 2) and their descriptors (N, 32)."""
+        points, descriptors = self._orb.detectAndCompute(gray, None)
+        if descriptors is None:
+            return np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
+        return np.array([p.pt for p in points], np.float64), descriptors
+
+    def match(self, descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8]) -> NDArray[np.int64]:
+        """Pairs of indices (M, 2) that are each other's nearest and near."""
+        if len(descriptors_a) == 0 or len(descriptors_b) == 0:
+            return np.zeros((0, 2), np.int64)
+        matches = self._matcher.match(descriptors_a, descriptors_b)
+        return np.array([(m.queryIdx, m.trainIdx) for m in matches if m.distance < 64], np.int64).reshape(-1, 2)

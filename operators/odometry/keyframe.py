@@ -1,0 +1,48 @@
+"""Keyframes: views with a known pose that later frames are measured against."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.odometry import se3
+from operators.odometry.camera import Pixels, Points
+from operators.odometry.features import Gray
+from operators.odometry.se3 import Matrix
+from operators.odometry.surface import Surface
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A frame kept: its image, its surface, its corners with depth, and the pose it was given."""
+
+    stamp: int
+    T_world_camera: Matrix
+    covariance: Matrix  # (6, 6) of that pose, right perturbation
+    gray: Gray
+    surface: Surface
+    pixels: Pixels  # (N, 2) corners in the working colour image
+    points: Points  # (N, 3) the same corners in this view's depth camera
+    orb_points: Points  # (M, 3)
+    orb_descriptors: NDArray[np.uint8]  # (M, 32)
+
+    @cached_property
+    def points_world(self) -> Points:
+        return transformed(self.T_world_camera, self.points)
+
+    @cached_property
+    def T_camera_world(self) -> Matrix:
+        return se3.inverse(self.T_world_camera)
+
+
+def transformed(T: Matrix, points: Points) -> Points:
+    """Points (N, 3) moved by T (4, 4)."""
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+def view_distance(T_a: Matrix, T_b: Matrix, depth: float) -> float:
+    """How differently two cameras see a scene at a depth: baseline over depth plus the angle between them, radians."""
+    T = se3.inverse(T_a) @ T_b
+    cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
+    return float(np.linalg.norm(T[:3, 3]) / depth + np.arccos(cosine))

@@ -1,0 +1,49 @@
+"""Motion model between frames: constant velocity, disturbed by white acceleration, dying out while nothing is measured."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from operators.odometry import se3
+from operators.odometry.se3 import Matrix, Vector
+
+UNKNOWN_SPEED = 1.0  # m/s and rad/s: how fast a hand or a small robot may already move when first seen
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """The last pose and velocity (6,) in the camera's own axes, m/s and rad/s."""
+
+    stamp: int
+    T_world_camera: Matrix
+    velocity: Vector
+    blind_s: float = 0.0  # time since the pose was last measured
+    fresh: bool = True  # the velocity is not measured yet
+
+    def predict(self, stamp: int, decay_s: float) -> Matrix:
+        """T_world_camera at a stamp. The velocity dies out, for a guess carried on for seconds is worse than standing still."""
+        dt = self._seconds(stamp)
+        travel = decay_s * (np.exp(-self.blind_s / decay_s) - np.exp(-(self.blind_s + dt) / decay_s))
+        return self.T_world_camera @ se3.exp(self.velocity * (dt if self.blind_s == 0 else travel))
+
+    def spread(self, stamp: int, acceleration: float, angular_acceleration: float) -> Matrix:
+        """Covariance (6, 6) of that prediction, in the camera's axes."""
+        dt = self._seconds(stamp)
+        unknown = UNKNOWN_SPEED * dt if self.fresh else 0.0
+        # Over a blind stretch the displacement of white acceleration grows with the square of the whole time.
+        reach = 0.5 * ((self.blind_s + dt) ** 2 - self.blind_s**2)
+        return np.diag([(acceleration * reach + unknown) ** 2] * 3 + [(angular_acceleration * reach + unknown) ** 2] * 3)
+
+    def measured(self, stamp: int, T_world_camera: Matrix) -> "Motion":
+        """After a measured pose. What was crossed blindly tells nothing of the velocity now."""
+        if self.blind_s > 0:
+            return Motion(stamp, T_world_camera, np.zeros(6))
+        velocity = se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self._seconds(stamp)
+        return Motion(stamp, T_world_camera, velocity, fresh=False)
+
+    def guessed(self, stamp: int, T_world_camera: Matrix) -> "Motion":
+        """After a frame that measured nothing."""
+        return Motion(stamp, T_world_camera, self.velocity, self.blind_s + self._seconds(stamp), self.fresh)
+
+    def _seconds(self, stamp: int) -> float:
+        return (stamp - self.stamp) * 1e-9

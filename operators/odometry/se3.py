@@ -1,0 +1,78 @@
+"""Rigid motions as (4, 4) matrices, with the right (body) perturbation T <- T exp([v, w]).
+
+A twist is (6,): translation v in metres, then rotation w in radians. Solà et al., "A micro Lie theory", 2018.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+Vector = NDArray[np.float64]
+
+
+def skew(v: Vector) -> Matrix:
+    """The (3, 3) matrix of the cross product v ×."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp(twist: Vector) -> Matrix:
+    """The motion (4, 4) of a twist (6,)."""
+    v, w = twist[:3], twist[3:]
+    angle = float(np.linalg.norm(w))
+    W = skew(w)
+    if angle < 1e-6:
+        a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
+    else:
+        a = np.sin(angle) / angle
+        b = (1.0 - np.cos(angle)) / angle**2
+        c = (1.0 - a) / angle**2
+    T = np.eye(4)
+    T[:3, :3] += a * W + b * (W @ W)
+    T[:3, 3] = (np.eye(3) + b * W + c * (W @ W)) @ v
+    return T
+
+
+def log(T: Matrix) -> Vector:
+    """The twist (6,) of a motion (4, 4), |rotation| < pi."""
+    R, p = T[:3, :3], T[:3, 3]
+    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
+    sine, cosine = float(np.linalg.norm(vee)), (float(np.trace(R)) - 1.0) / 2.0
+    angle = float(np.arctan2(sine, cosine))
+    if angle < 1e-6:
+        w = vee
+    elif sine > 1e-6:
+        w = vee * (angle / sine)
+    else:  # half a turn: the axis is the largest column of R + I
+        column = int(np.argmax(np.diag(R)))
+        axis = R[:, column] + np.eye(3)[column]
+        w = angle * axis / np.linalg.norm(axis)
+    W = skew(w)
+    d = 1.0 / 12.0 if angle < 1e-4 else (1.0 - angle / (2.0 * np.tan(angle / 2.0))) / angle**2
+    return np.concatenate([(np.eye(3) - 0.5 * W + d * (W @ W)) @ p, w])
+
+
+def inverse(T: Matrix) -> Matrix:
+    """The inverse motion, without a general matrix inversion."""
+    out = np.eye(4)
+    out[:3, :3] = T[:3, :3].T
+    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return out
+
+
+def adjoint(T: Matrix) -> Matrix:
+    """(6, 6) such that T exp(x) T^-1 = exp(adjoint(T) x)."""
+    R = T[:3, :3]
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = R
+    out[:3, 3:] = skew(T[:3, 3]) @ R
+    return out
+
+
+def orthonormalised(T: Matrix) -> Matrix:
+    """The nearest rigid motion to a nearly rigid matrix: products of many motions drift off SO(3)."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    out = np.eye(4)
+    out[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    out[:3, 3] = T[:3, 3]
+    return out

@@ -1,0 +1,105 @@
+"""A depth image as a small grid of planar patches: mean points and normals, from its inverse depth.
+
+Inverse depth is affine in the pixel over a plane, n·p = d  =>  1/z = (n/d)·(x, y, 1), so averaging it is exact on
+planes, its noise does not grow with range (Nguyen et al., 2012), and its gradient is the normal.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.odometry.se3 import Matrix
+
+Array32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class DepthNoise:
+    """Standard deviation of a depth: floor + quadratic · z², metres."""
+
+    floor: float = 0.002
+    quadratic: float = 0.002
+
+    def sigma(self, z: NDArray[np.floating]) -> NDArray[np.floating]:
+        return self.floor + self.quadratic * z * z
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Patches of one depth image in its own optical frame."""
+
+    inverse_depth: Array32  # (h, w) 1/m, 0 where there is no patch
+    K: Matrix  # (3, 3) of the grid
+
+    @staticmethod
+    def from_depth(depth: Array32, K: Matrix, near: float, far: float, block: int) -> "Surface":
+        """Average block x block pixels of a (H, W) depth in metres; what lies outside near..far, or is NaN, is no return."""
+        h, w = depth.shape[0] // block, depth.shape[1] // block
+        depth = depth[: h * block, : w * block]
+        valid = cv2.inRange(depth, near, far)  # 255 or 0; a NaN compares false
+        inverse = np.zeros_like(depth)
+        cv2.copyTo(cv2.divide(1.0, depth), valid, inverse)
+        mean = cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA)
+        square = cv2.resize(inverse * inverse, (w, h), interpolation=cv2.INTER_AREA)
+        share = cv2.resize(valid.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) / np.float32(255)
+        enough = share >= 0.5
+        share[~enough] = 1.0
+        mean /= share
+        spread = square / share - mean * mean
+        # A block across an edge averages two surfaces into a point of neither. A steep plane also spreads, less.
+        enough &= spread < (0.04 * mean) ** 2
+        mean[~enough] = 0.0
+        return Surface(mean, scaled_intrinsics(K, 1.0 / block))
+
+    @cached_property
+    def rays(self) -> tuple[Array32, Array32]:
+        """x/z of each column (w,) and y/z of each row (h,)."""
+        h, w = self.inverse_depth.shape
+        x = ((np.arange(w) - self.K[0, 2]) / self.K[0, 0]).astype(np.float32)
+        y = ((np.arange(h) - self.K[1, 2]) / self.K[1, 1]).astype(np.float32)
+        return x, y
+
+    def points(self, stride: int = 1) -> NDArray[np.float64]:
+        """The patch centres (N, 3), every stride-th in both directions."""
+        inverse = self.inverse_depth[::stride, ::stride]
+        x, y = self.rays
+        v, u = np.nonzero(inverse)
+        z = 1.0 / inverse[v, u].astype(np.float64)
+        return np.column_stack([x[::stride][u] * z, y[::stride][v] * z, z])
+
+    @cached_property
+    def planes(self) -> Array32:
+        """(h·w, 4): unit normal n, facing the camera, and d = n·p of each patch; zeros where the surface is not smooth."""
+        q = self.inverse_depth
+        h, w = q.shape
+        x, y = self.rays
+        # q = a·x + b·y + c over a plane; Sobel over 3x3 sums to 8 steps.
+        a = cv2.Sobel(q, cv2.CV_32F, 1, 0, ksize=3) * np.float32(self.K[0, 0] / 8.0)
+        b = cv2.Sobel(q, cv2.CV_32F, 0, 1, ksize=3) * np.float32(self.K[1, 1] / 8.0)
+        smooth_q = cv2.blur(q, (3, 3))
+        c = smooth_q - a * x[None, :] - b * y[:, None]
+        hole = cv2.dilate((q == 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=(1,))
+        rough = np.abs(q - smooth_q) > 0.02 * smooth_q
+        scale = 1.0 / np.sqrt(a * a + b * b + c * c + np.float32(1e-12))
+        grazing = smooth_q * scale < 0.17 * np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
+        bad = (hole > 0) | rough | grazing
+        planes = np.stack([-a * scale, -b * scale, -c * scale, -scale], axis=-1)
+        planes[bad] = 0.0
+        return planes.reshape(h * w, 4)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the grid that has a patch."""
+        return float(np.count_nonzero(self.inverse_depth)) / self.inverse_depth.size
+
+
+def scaled_intrinsics(K: Matrix, scale: float) -> Matrix:
+    """K of an image resized by scale; pixel centres have integer coordinates."""
+    out = K.copy()
+    out[0, 0] *= scale
+    out[1, 1] *= scale
+    out[:2, 2] = (K[:2, 2] + 0.5) * scale - 0.5
+    return out
