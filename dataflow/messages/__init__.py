@@ -1,5 +1,59 @@
 """Message types and their conventions, one module per family."""
 
 from dataflow.messages.base import Message, MessageError, array, message_type, message_types, scalar
+from dataflow.messages.camera import CameraInfo
+from dataflow.messages.clouds import Clusters, PointCloud
+from dataflow.messages.detection import Boxes3D, Detections2D
+from dataflow.messages.diagnostics import Diagnostics, Level
+from dataflow.messages.images import CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.messages.inertial import Imu, MagneticField
+from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes
+from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
+from dataflow.messages.ranging import LaserScan, RadarScan
+from dataflow.messages.scene import Activity, FeatureVector, SceneGraph
+from dataflow.messages.segmentation import SegmentationMap
+from dataflow.messages.tracking import LandmarkSightings, Tracks, TrackState
+from dataflow.messages.wheels import JointState, WheelTicks
 
-__all__ = ["Message", "MessageError", "array", "message_type", "message_types", "scalar"]
+__all__ = [
+    "Activity",
+    "Boxes3D",
+    "CameraInfo",
+    "Clusters",
+    "CompressedDepth",
+    "CompressedImage",
+    "DepthImage",
+    "Detections2D",
+    "Diagnostics",
+    "FeatureVector",
+    "Image",
+    "Imu",
+    "JointState",
+    "LandmarkSightings",
+    "LaserScan",
+    "Level",
+    "MagneticField",
+    "Mesh",
+    "Message",
+    "MessageError",
+    "NavSatFix",
+    "OccupancyGrid",
+    "Odometry",
+    "ParticleSet",
+    "Path",
+    "Planes",
+    "PointCloud",
+    "Pose",
+    "RadarScan",
+    "SceneGraph",
+    "SegmentationMap",
+    "TrackState",
+    "Tracks",
+    "Transforms",
+    "Twist",
+    "WheelTicks",
+    "array",
+    "message_type",
+    "message_types",
+    "scalar",
+]

@@ -1,8 +1,8 @@
 """The base of every message: declared fields, canonical form, immutability and the digest.
 
 A message class declares its fields once; construction validates them and brings them into canonical form
-(C-contiguous little-endian arrays of the declared dtype, scalars of the declared Python type), so that equal values have
-equal digests wherever and however they were made.
+(C-contiguous little-endian arrays of the declared dtype, scalars of the declared Python type), so that equal values
+have equal digests wherever and however they were made.
 """
 
 from __future__ import annotations
@@ -84,7 +84,12 @@ def scalar(
     optional: bool = False,
     choices: Sequence[str] = (),
 ) -> Any:
-    """Declares a header field of a message. `optional` fields may be None (their default)."""
+    """Declares a header field of a message. `default=None` makes it optional: it may be None."""
+    optional = optional or default is None
+    if default is not _MISSING and default is not None:
+        given, default = default, _canonical_scalar(kind, default)
+        if default is None or (choices and default not in choices):
+            raise MessageError(f"default {given!r} is not a {_PYTHON_NAME[kind]}{f' of {choices}' if choices else ''}")
     return ScalarField("", kind, doc, optional, default, tuple(choices))
 
 
@@ -94,9 +99,12 @@ def array(
     doc: str,
     *,
     unit: str = "",
+    default: None = _MISSING,
     optional: bool = False,
 ) -> Any:
     """Declares an array field. `dtype` and `shape` list alternatives with `|`: `array("uint8", "H W 3|H W", ...)`.
+
+    `default=None` makes it optional: it may be None.
 
     Symbols begin with a capital letter; `N` in two fields of one message means the same extent.
     """
@@ -107,7 +115,7 @@ def array(
         if not SYMBOL.fullmatch(extent):
             raise MessageError(f"array shape {shape!r}: {extent!r} is neither a number nor a capitalised symbol")
     dtypes = tuple(np.dtype(d.strip()).newbyteorder("<") for d in dtype.split("|"))
-    return ArrayField("", dtypes, shapes, doc, unit, optional)
+    return ArrayField("", dtypes, shapes, doc, unit, optional or default is None)
 
 
 _registry: dict[str, type[Message]] = {}
@@ -129,7 +137,11 @@ def message_type(schema: str) -> type[Message]:
 
 
 @dataclass_transform(kw_only_default=True, frozen_default=True, field_specifiers=(scalar, array))
-class Message:
+class _Declared:
+    """Tells type checkers that the fields of a class below are the keywords of its constructor."""
+
+
+class Message(_Declared):
     """One immutable value of a stream.
 
     Every message has `stamp`: event time, integer nanoseconds since the epoch. Subclasses declare further fields with
@@ -149,6 +161,8 @@ class Message:
         own = []
         for name, value in list(vars(cls).items()):
             if isinstance(value, (ScalarField, ArrayField)):
+                if name == "stamp" or hasattr(Message, name):
+                    raise MessageError(f"{cls.__name__}.{name}: every message has {name!r} already; use another name")
                 own.append(type(value)(name, *(getattr(value, s) for s in value.__slots__[1:])))
                 delattr(cls, name)
         cls.FIELDS = (*cls.FIELDS, *own)
@@ -185,9 +199,7 @@ class Message:
         """
 
     @classmethod
-    def from_parts(
-        cls, stamp: int, header: Sequence[Scalar | None], arrays: Sequence[npt.NDArray[Any] | None]
-    ) -> Self:
+    def from_parts(cls, stamp: int, header: Sequence[Scalar | None], arrays: Sequence[npt.NDArray[Any] | None]) -> Self:
         """A message around already frozen arrays, in declaration order, without copying them: the decoder's way in.
 
         The arrays must be views of memory that nobody writes to. Everything is validated as in the constructor.
@@ -248,7 +260,7 @@ class Message:
                 shape = data.shape
                 h.update(b"\x01" + data.dtype.str.encode() + struct.pack(f"<B{len(shape)}q", len(shape), *shape))
                 if data.size:
-                    h.update(memoryview(data).cast("B"))
+                    h.update(data.data.cast("B"))
         return h.digest()
 
     def replace(self, **changes: Any) -> Self:
@@ -277,6 +289,16 @@ class Message:
     def __hash__(self) -> int:
         return hash(self.digest())
 
+    def __copy__(self) -> Self:
+        return self
+
+    def __deepcopy__(self, memo: object) -> Self:
+        return self
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled by value and remade by the constructor, so that the arrays come back frozen."""
+        return _remake, (type(self), dict(self.items()))
+
     def __repr__(self) -> str:
         words = [f"stamp={self.stamp}"]
         for f in self.FIELDS:
@@ -286,6 +308,10 @@ class Message:
             elif value is not None:
                 words.append(f"{f.name}={value!r}")
         return f"{type(self).__name__}({', '.join(words)})"
+
+
+def _remake(cls: type[Message], values: dict[str, Any]) -> Message:
+    return cls(**values)
 
 
 def _stamp(schema: str, stamp: Any) -> int:
@@ -301,7 +327,7 @@ def _scalar(schema: str, spec: ScalarField, value: Any) -> Scalar | None:
     if value is _MISSING:
         if spec.required:
             raise MessageError(f"{schema}.{spec.name} is required ({_PYTHON_NAME[spec.kind]}: {spec.doc})")
-        return None if spec.default is _MISSING else spec.default  # type: ignore[no-any-return]
+        return None if spec.default is _MISSING else spec.default
     if value is None:
         if spec.optional:
             return None
@@ -348,9 +374,7 @@ def _is_utf8(text: str) -> bool:
     return True
 
 
-def _array(
-    schema: str, spec: ArrayField, value: Any, extents: dict[str, tuple[int, str]]
-) -> npt.NDArray[Any] | None:
+def _array(schema: str, spec: ArrayField, value: Any, extents: dict[str, tuple[int, str]]) -> npt.NDArray[Any] | None:
     if value is None:
         if spec.required:
             raise MessageError(
@@ -364,6 +388,11 @@ def _array(
     if dtype is None:
         raise MessageError(f"{schema}.{spec.name} must be {spec.dtype_text()}, got an array of {data.dtype}")
     frozen: npt.NDArray[Any] = np.array(data, dtype=dtype, order="C", copy=True)
+    if dtype.kind in "iu" and data.dtype != dtype and not np.array_equal(frozen, data):
+        raise MessageError(
+            f"{schema}.{spec.name} must be {spec.dtype_text()}, got {data.dtype} with values that do not fit: "
+            f"{data.min()} to {data.max()}"
+        )
     frozen.flags.writeable = False
     _check_shape(schema, spec, frozen, extents)
     return frozen
@@ -371,14 +400,16 @@ def _array(
 
 def _from_sequence(schema: str, spec: ArrayField, value: Any) -> npt.NDArray[Any]:
     try:
-        data = np.asarray(value, dtype=spec.dtypes[0])
+        data = np.asarray(value)
+        if data.size == 0 or spec.dtypes[0].kind in "fb" or data.dtype.kind in "iub":
+            data = np.asarray(value, dtype=spec.dtypes[0])
     except (TypeError, ValueError, OverflowError) as error:
         raise MessageError(
             f"{schema}.{spec.name} must be a {spec.dtype_text()} array of shape {spec.shape_text()}: {error}"
         ) from None
-    symbolic = next((s for s in spec.shapes if len(s) == 2 and isinstance(s[1], int)), None)
-    if data.size == 0 and data.ndim == 1 and symbolic is not None:  # [] for "N 3" means (0, 3)
-        data = data.reshape(0, symbolic[1])
+    if data.size == 0 and data.ndim == 1:  # [] for "N 3" means (0, 3)
+        columns = next((s[1] for s in spec.shapes if len(s) == 2 and isinstance(s[1], int)), None)
+        data = data if columns is None else data.reshape(0, columns)
     return data
 
 

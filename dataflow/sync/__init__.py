@@ -1,5 +1,52 @@
 """When operators fire: stamps, frontiers and the aligner. Pure: no clock, no thread, no I/O."""
 
-from dataflow.sync.stamps import FOREVER, NEVER, format_duration, format_stamp, parse_duration
+from dataflow.sync.aligner import Aligner, StreamEnd
+from dataflow.sync.demand import Cycle, Edge, stuck_cycle
+from dataflow.sync.entries import (
+    TICK,
+    Drop,
+    DropReason,
+    Entry,
+    Firing,
+    FiringKind,
+    InputValue,
+    StreamOrderError,
+    Waiting,
+)
+from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, refs_of
+from dataflow.sync.replayer import RecordedAligner
+from dataflow.sync.spec import AlignSpec, BatchSpec, SampledSpec, TriggerSpec
+from dataflow.sync.stamps import FOREVER, NEVER, format_duration, format_stamp, parse_duration, trail
 
-__all__ = ["FOREVER", "NEVER", "format_duration", "format_stamp", "parse_duration"]
+__all__ = [
+    "FOREVER",
+    "NEVER",
+    "TICK",
+    "AlignSpec",
+    "Aligner",
+    "BatchSpec",
+    "Cycle",
+    "Drop",
+    "DropReason",
+    "Edge",
+    "Entry",
+    "Firing",
+    "FiringInputs",
+    "FiringKind",
+    "InputRef",
+    "InputValue",
+    "MessageRef",
+    "RecordedAligner",
+    "RunRef",
+    "SampledSpec",
+    "StreamEnd",
+    "StreamOrderError",
+    "TriggerSpec",
+    "Waiting",
+    "format_duration",
+    "format_stamp",
+    "parse_duration",
+    "refs_of",
+    "stuck_cycle",
+    "trail",
+]

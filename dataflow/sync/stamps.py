@@ -31,14 +31,9 @@ _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _YEAR_9999 = 253_402_300_800 * 10**9
 
 
-def clamp(stamp: int) -> int:
-    """`stamp` limited to the axis from NEVER to FOREVER, so that arithmetic on either end stays on it."""
-    return NEVER if stamp < NEVER else FOREVER if stamp > FOREVER else stamp
-
-
-def before(frontier: int, delay: int) -> int:
-    """`frontier` moved back by `delay` ns; the two ends of the axis stay where they are."""
-    return frontier if frontier in (NEVER, FOREVER) else clamp(frontier - delay)
+def trail(frontier: int, lag: int) -> int:
+    """The frontier of a port that may emit `lag` ns behind the firing; the two ends of the axis stay where they are."""
+    return frontier if frontier in (NEVER, FOREVER) else max(NEVER, frontier - lag)
 
 
 def parse_duration(value: str | int) -> int:
@@ -47,17 +42,23 @@ def parse_duration(value: str | int) -> int:
     Decimals are exact: a duration that is not a whole number of nanoseconds is refused, never rounded.
     """
     if isinstance(value, bool) or not isinstance(value, (str, int)):
-        raise ValueError(f"duration {value!r}: expected a number with a unit, such as '100ms', or nanoseconds as an int")
+        raise ValueError(
+            f"duration {value!r}: expected a number with a unit, such as '100ms', or nanoseconds as an int"
+        )
     if isinstance(value, int):
         nanoseconds = value
     else:
         match = _DURATION.fullmatch(value)
         if match is None:
             hint = " (a bare number needs a unit)" if re.fullmatch(r"\s*-?[\d.]+\s*", value) else ""
-            raise ValueError(f"duration {value!r}: expected a number and a unit, such as '100ms' or '1.5s'{hint}")
+            raise ValueError(
+                f"duration {value!r}: expected a number and a unit, such as '100ms' or '1.5s'{hint}"
+            )
         sign, digits, unit = match.groups()
         if unit not in NANOSECONDS:
-            raise ValueError(f"duration {value!r}: unknown unit {unit!r}; the units are {', '.join(NANOSECONDS)}")
+            raise ValueError(
+                f"duration {value!r}: unknown unit {unit!r}; the units are {', '.join(NANOSECONDS)}"
+            )
         exact = Fraction(digits) * NANOSECONDS[unit]
         if exact.denominator != 1:
             raise ValueError(f"duration {value!r} is not a whole number of nanoseconds")
@@ -70,7 +71,9 @@ def parse_duration(value: str | int) -> int:
 def format_duration(duration: int) -> str:
     """The shortest exact text of `duration` (ns) in one unit: 1_500_000_000 is ``"1.5s"``, 60 s is ``"60s"``."""
     sign, magnitude = ("-", -duration) if duration < 0 else ("", duration)
-    unit = next((u for u in ("s", "ms", "us") if magnitude >= NANOSECONDS[u]), "s" if magnitude == 0 else "ns")
+    unit = next(
+        (u for u in ("s", "ms", "us") if magnitude >= NANOSECONDS[u]), "s" if magnitude == 0 else "ns"
+    )
     whole, rest = divmod(magnitude, NANOSECONDS[unit])
     decimals = f"{rest:0{len(str(NANOSECONDS[unit])) - 1}d}".rstrip("0") if rest else ""
     return f"{sign}{whole}{'.' + decimals if decimals else ''}{unit}"

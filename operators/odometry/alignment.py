@@ -1,7 +1,7 @@
 """Maximum a posteriori pose of a camera from point-to-plane distances, reprojections and a motion prior.
 
-Gauss-Newton on the right perturbation T_world_camera <- T_world_camera exp(x), with Cauchy weights recomputed at every
-step. Point-to-plane with projective association: Chen and Medioni, 1992; Newcombe et al., "KinectFusion", 2011.
+Gauss-Newton on the right perturbation T_world_camera <- T_world_camera exp(x), with Cauchy weights at every step.
+Point-to-plane with projective association: Chen and Medioni, 1992; Newcombe et al., "KinectFusion", 2011.
 """
 
 from collections.abc import Sequence
@@ -11,6 +11,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import invert
 from operators.odometry import se3
 from operators.odometry.camera import Pixels, Points, project
 from operators.odometry.se3 import Matrix, Vector
@@ -94,7 +95,7 @@ class PixelTerm:
     strength: float
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
-        T = self.T_color_depth @ se3.inverse(T_world_camera)
+        T = self.T_color_depth @ invert(T_world_camera)
         p = self.points_world @ T[:3, :3].T + T[:3, 3]
         r = project(p, self.K_color) - self.pixels
         e2 = np.einsum("ij,ij->i", r, r) / self.sigma**2
@@ -114,12 +115,12 @@ class PriorTerm:
     information: Matrix
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
-        x = se3.log(se3.inverse(self.T_world_camera) @ T_world_camera)
+        x = se3.log(invert(self.T_world_camera) @ T_world_camera)
         return Normal(self.information, self.information @ x, 0, 0)
 
 
 def reprojection_jacobian(points_color: Points, K: Matrix, T_color_depth: Matrix) -> NDArray[np.float64]:
-    """d pixel / d x (N, 2, 6) for the perturbation of the depth camera's pose; points (N, 3) in the colour camera."""
+    """d pixel / d x (N, 2, 6), x perturbing the depth camera's pose; points (N, 3) in the colour camera."""
     x, y = points_color[:, 0], points_color[:, 1]
     z = np.where(points_color[:, 2] > 0.05, points_color[:, 2], 1.0)
     D = np.zeros((len(z), 2, 3))
@@ -150,12 +151,12 @@ def align(T_world_camera: Matrix, terms: Sequence[Term], prior: Term, iterations
     T = T_world_camera
     for iteration in range(iterations + 1):
         parts = tuple(term.linearise(T) for term in terms)
-        information = sum((part.H for part in parts), np.zeros((6, 6)))
+        information: Matrix = np.sum([np.zeros((6, 6)), *(part.H for part in parts)], axis=0)
         if iteration == iterations:
             break
         anchor = prior.linearise(T)
-        gradient = sum((part.b for part in parts), anchor.b)
-        step = -np.linalg.solve(information + anchor.H, gradient)
+        gradient: Vector = np.sum([anchor.b, *(part.b for part in parts)], axis=0)
+        step: Vector = -np.asarray(np.linalg.solve(information + anchor.H, gradient), np.float64)
         T = T @ se3.exp(step)
         if np.abs(step).max() < 1e-4:
             break

@@ -1,11 +1,11 @@
-"""The RGB-D camera's geometry: two pinhole cameras and the motion between them. No registration of the images is assumed."""
+"""The RGB-D camera's geometry: two pinhole cameras and the motion between them. The images need no registration."""
 
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.odometry import se3
+from dataflow.messages.geometry import invert
 from operators.odometry.se3 import Matrix
 
 Points = NDArray[np.float64]
@@ -14,7 +14,7 @@ Pixels = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class RgbdCamera:
-    """Undistorted images; K_color and K_depth (3, 3) in pixels of each image, T_depth_color (4, 4) in metres."""
+    """Undistorted; K_color and K_depth (3, 3) in pixels of each image, T_depth_color (4, 4) in metres."""
 
     K_color: Matrix
     K_depth: Matrix
@@ -24,25 +24,33 @@ class RgbdCamera:
         for name, shape in (("K_color", (3, 3)), ("K_depth", (3, 3)), ("T_depth_color", (4, 4))):
             value = np.array(getattr(self, name), np.float64)
             if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(f"RgbdCamera.{name} must be a finite {shape} matrix, got shape {value.shape}")
+                raise ValueError(
+                    f"RgbdCamera.{name} must be a finite {shape} matrix, got shape {value.shape}"
+                )
             object.__setattr__(self, name, value)
         for name in ("K_color", "K_depth"):
             K = getattr(self, name)
             if K[0, 0] <= 0 or K[1, 1] <= 0:
-                raise ValueError(f"RgbdCamera.{name} must have positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
+                raise ValueError(
+                    f"RgbdCamera.{name} must have positive focal lengths, got {K[0, 0]} and {K[1, 1]}"
+                )
         R = self.T_depth_color[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-            raise ValueError("RgbdCamera.T_depth_color must be a rigid motion: its rotation block is not a rotation")
-        object.__setattr__(self, "T_color_depth", se3.inverse(self.T_depth_color))
+            raise ValueError(
+                "RgbdCamera.T_depth_color must be a rigid motion: its rotation block is not a rotation"
+            )
+        object.__setattr__(self, "T_color_depth", invert(self.T_depth_color))
 
     T_color_depth: Matrix = field(init=False)
 
-    def depth_at(self, pixels_color: Pixels, depth: NDArray[np.float32], near: float, far: float) -> tuple[Points, NDArray[np.bool_]]:
+    def depth_at(
+        self, pixels_color: Pixels, depth: NDArray[np.float32], near: float, far: float
+    ) -> tuple[Points, NDArray[np.bool_]]:
         """Intersect the rays of colour pixels (N, 2) with the depth image.
 
-        Returns the points (N, 3) in the depth camera's frame and which of them are known. A ray's range is found by
-        fixed point: project its point into the depth image, read the range there, and move the point to that range.
-        A pixel beside a depth edge is unknown, for which side it saw is a coin's toss.
+        Returns the points (N, 3) in the depth camera's frame and which of them are known. A ray's depth is found
+        by fixed point: project its point into the depth image, read the depth there, move the point to it. A
+        pixel beside a depth edge is unknown, for which side it saw is a coin's toss.
         """
         K, (height, width) = self.K_depth, depth.shape
         rays = unproject(pixels_color, self.K_color) @ self.T_depth_color[:3, :3].T
@@ -70,7 +78,9 @@ class RgbdCamera:
 
 def unproject(pixels: Pixels, K: Matrix) -> Points:
     """Rays (N, 3) with z = 1 through pixels (N, 2)."""
-    return np.column_stack([(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(pixels))])
+    return np.column_stack(
+        [(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(pixels))]
+    )
 
 
 def project(points: Points, K: Matrix) -> Pixels:

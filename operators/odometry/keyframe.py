@@ -6,14 +6,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.odometry import se3
+from dataflow.messages.geometry import invert, transform_points
 from operators.odometry.camera import Pixels, Points
 from operators.odometry.features import Gray
 from operators.odometry.se3 import Matrix
 from operators.odometry.surface import Surface
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class Keyframe:
     """A frame kept: its image, its surface, its corners with depth, and the pose it was given."""
 
@@ -29,20 +29,15 @@ class Keyframe:
 
     @cached_property
     def points_world(self) -> Points:
-        return transformed(self.T_world_camera, self.points)
+        return transform_points(self.T_world_camera, self.points)
 
     @cached_property
     def T_camera_world(self) -> Matrix:
-        return se3.inverse(self.T_world_camera)
-
-
-def transformed(T: Matrix, points: Points) -> Points:
-    """Points (N, 3) moved by T (4, 4)."""
-    return points @ T[:3, :3].T + T[:3, 3]
+        return invert(self.T_world_camera)
 
 
 def view_distance(T_a: Matrix, T_b: Matrix, depth: float) -> float:
-    """How differently two cameras see a scene at a depth: baseline over depth plus the angle between them, radians."""
-    T = se3.inverse(T_a) @ T_b
+    """How differently two cameras see a scene at a depth: baseline / depth + angle between them, radians."""
+    T = invert(T_a) @ T_b
     cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
     return float(np.linalg.norm(T[:3, 3]) / depth + np.arccos(cosine))

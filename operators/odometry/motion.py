@@ -1,9 +1,10 @@
-"""Motion model between frames: constant velocity, disturbed by white acceleration, dying out while nothing is measured."""
+"""Motion between frames: constant velocity disturbed by acceleration, dying out while nothing is measured."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from dataflow.messages.geometry import invert
 from operators.odometry import se3
 from operators.odometry.se3 import Matrix, Vector
 
@@ -21,7 +22,7 @@ class Motion:
     fresh: bool = True  # the velocity is not measured yet
 
     def predict(self, stamp: int, decay_s: float) -> Matrix:
-        """T_world_camera at a stamp. The velocity dies out, for a guess carried on for seconds is worse than standing still."""
+        """T_world_camera at a stamp. A velocity carried on blindly for seconds is worse than standing still."""
         dt = self._seconds(stamp)
         travel = decay_s * (np.exp(-self.blind_s / decay_s) - np.exp(-(self.blind_s + dt) / decay_s))
         return self.T_world_camera @ se3.exp(self.velocity * (dt if self.blind_s == 0 else travel))
@@ -32,13 +33,15 @@ class Motion:
         unknown = UNKNOWN_SPEED * dt if self.fresh else 0.0
         # Over a blind stretch the displacement of white acceleration grows with the square of the whole time.
         reach = 0.5 * ((self.blind_s + dt) ** 2 - self.blind_s**2)
-        return np.diag([(acceleration * reach + unknown) ** 2] * 3 + [(angular_acceleration * reach + unknown) ** 2] * 3)
+        return np.diag(
+            [(acceleration * reach + unknown) ** 2] * 3 + [(angular_acceleration * reach + unknown) ** 2] * 3
+        )
 
     def measured(self, stamp: int, T_world_camera: Matrix) -> "Motion":
         """After a measured pose. What was crossed blindly tells nothing of the velocity now."""
         if self.blind_s > 0:
             return Motion(stamp, T_world_camera, np.zeros(6))
-        velocity = se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self._seconds(stamp)
+        velocity = se3.log(invert(self.T_world_camera) @ T_world_camera) / self._seconds(stamp)
         return Motion(stamp, T_world_camera, velocity, fresh=False)
 
     def guessed(self, stamp: int, T_world_camera: Matrix) -> "Motion":

@@ -52,14 +52,6 @@ def log(T: Matrix) -> Vector:
     return np.concatenate([(np.eye(3) - 0.5 * W + d * (W @ W)) @ p, w])
 
 
-def inverse(T: Matrix) -> Matrix:
-    """The inverse motion, without a general matrix inversion."""
-    out = np.eye(4)
-    out[:3, :3] = T[:3, :3].T
-    out[:3, 3] = -T[:3, :3].T @ T[:3, 3]
-    return out
-
-
 def adjoint(T: Matrix) -> Matrix:
     """(6, 6) such that T exp(x) T^-1 = exp(adjoint(T) x)."""
     R = T[:3, :3]

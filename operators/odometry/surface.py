@@ -1,7 +1,7 @@
 """A depth image as a small grid of planar patches: mean points and normals, from its inverse depth.
 
-Inverse depth is affine in the pixel over a plane, n·p = d  =>  1/z = (n/d)·(x, y, 1), so averaging it is exact on
-planes, its noise does not grow with range (Nguyen et al., 2012), and its gradient is the normal.
+Inverse depth is affine in the pixel over a plane, n·p = d  =>  1/z = (n/d)·(x, y, 1), so averaging it is exact
+on planes, its noise does not grow with range (Nguyen et al., 2012), and its gradient is the normal.
 """
 
 from dataclasses import dataclass
@@ -36,20 +36,20 @@ class Surface:
 
     @staticmethod
     def from_depth(depth: Array32, K: Matrix, near: float, far: float, block: int) -> "Surface":
-        """Average block x block pixels of a (H, W) depth in metres; what lies outside near..far, or is NaN, is no return."""
+        """Average block x block pixels of a (H, W) depth, metres; NaN or outside near..far is no return."""
         h, w = depth.shape[0] // block, depth.shape[1] // block
         depth = depth[: h * block, : w * block]
         valid = cv2.inRange(depth, near, far)  # 255 or 0; a NaN compares false
         inverse = np.zeros_like(depth)
         cv2.copyTo(cv2.divide(1.0, depth), valid, inverse)
-        mean = cv2.resize(inverse, (w, h), interpolation=cv2.INTER_AREA)
-        square = cv2.resize(inverse * inverse, (w, h), interpolation=cv2.INTER_AREA)
-        share = cv2.resize(valid.astype(np.float32), (w, h), interpolation=cv2.INTER_AREA) / np.float32(255)
+        mean, square, share = (
+            _block_mean(x, w, h) for x in (inverse, inverse * inverse, valid / np.float32(255))
+        )
         enough = share >= 0.5
         share[~enough] = 1.0
         mean /= share
         spread = square / share - mean * mean
-        # A block across an edge averages two surfaces into a point of neither. A steep plane also spreads, less.
+        # A block across an edge averages two surfaces into a point of neither; a steep plane spreads less.
         enough &= spread < (0.04 * mean) ** 2
         mean[~enough] = 0.0
         return Surface(mean, scaled_intrinsics(K, 1.0 / block))
@@ -72,7 +72,7 @@ class Surface:
 
     @cached_property
     def planes(self) -> Array32:
-        """(h·w, 4): unit normal n, facing the camera, and d = n·p of each patch; zeros where the surface is not smooth."""
+        """(h·w, 4): unit normal n towards the camera and d = n·p of each patch; zeros where it is not smooth."""
         q = self.inverse_depth
         h, w = q.shape
         x, y = self.rays
@@ -81,7 +81,12 @@ class Surface:
         b = cv2.Sobel(q, cv2.CV_32F, 0, 1, ksize=3) * np.float32(self.K[1, 1] / 8.0)
         smooth_q = cv2.blur(q, (3, 3))
         c = smooth_q - a * x[None, :] - b * y[:, None]
-        hole = cv2.dilate((q == 0).astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=(1,))
+        hole = cv2.dilate(
+            (q == 0).astype(np.uint8),
+            np.ones((3, 3), np.uint8),
+            borderType=cv2.BORDER_CONSTANT,
+            borderValue=(1,),
+        )
         rough = np.abs(q - smooth_q) > 0.02 * smooth_q
         scale = 1.0 / np.sqrt(a * a + b * b + c * c + np.float32(1e-12))
         grazing = smooth_q * scale < 0.17 * np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
@@ -94,6 +99,10 @@ class Surface:
     def coverage(self) -> float:
         """Share of the grid that has a patch."""
         return float(np.count_nonzero(self.inverse_depth)) / self.inverse_depth.size
+
+
+def _block_mean(values: NDArray[np.float32], width: int, height: int) -> Array32:
+    return np.asarray(cv2.resize(values, (width, height), interpolation=cv2.INTER_AREA), np.float32)
 
 
 def scaled_intrinsics(K: Matrix, scale: float) -> Matrix:

@@ -1,0 +1,102 @@
+"""Scores an ONNX detector on a folder in the COCO128 layout with pycocotools, and times it.
+
+python benchmarks/detection.py DATA/models/FastestDet.onnx fastestdet DATA/coco128
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+
+from dataflow.messages import Detections2D, Image
+from operators.detection import OnnxDetector
+
+
+def ground_truth(folder: Path, sizes: dict[str, tuple[int, int]], classes: int) -> COCO:
+    """The labels (class cx cy w h, normalised) of the named images as a COCO object; sizes are (width, height)."""
+    annotations = []
+    for i, (name, (width, height)) in enumerate(sizes.items(), 1):
+        file = folder / "labels" / f"{name}.txt"
+        for line in file.read_text().splitlines() if file.is_file() else ():
+            label, cx, cy, w, h = map(float, line.split())
+            box = [(cx - w / 2) * width, (cy - h / 2) * height, w * width, h * height]
+            annotations.append(
+                {
+                    "id": len(annotations) + 1,
+                    "image_id": i,
+                    "category_id": int(label),
+                    "bbox": box,
+                    "area": box[2] * box[3],
+                    "iscrowd": 0,
+                }
+            )
+    coco = COCO()
+    coco.dataset = {
+        "info": {},
+        "images": [{"id": i, "width": w, "height": h} for i, (w, h) in enumerate(sizes.values(), 1)],
+        "annotations": annotations,
+        "categories": [{"id": c, "name": str(c)} for c in range(classes)],
+    }
+    coco.createIndex()
+    return coco
+
+
+def results(found: dict[str, Detections2D]) -> list[dict[str, object]]:
+    """Detections as pycocotools wants them."""
+    rows: list[dict[str, object]] = []
+    for i, message in enumerate(found.values(), 1):
+        for (x1, y1, x2, y2), score, label in zip(
+            message.boxes.tolist(), message.scores.tolist(), message.class_ids.tolist(), strict=True
+        ):
+            rows.append({"image_id": i, "category_id": label, "bbox": [x1, y1, x2 - x1, y2 - y1], "score": score})
+    return rows
+
+
+def score(folder: Path, found: dict[str, Detections2D]) -> dict[str, float]:
+    """AP at IoU 0.5, AP over 0.5 to 0.95, and recall with 100 boxes an image."""
+    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
+        truth = ground_truth(folder, {name: (m.width, m.height) for name, m in found.items()}, 80)
+        evaluation = COCOeval(truth, truth.loadRes(results(found)), "bbox")
+        evaluation.evaluate()
+        evaluation.accumulate()
+        evaluation.summarize()
+    return {"AP50": evaluation.stats[1], "AP50:95": evaluation.stats[0], "recall@100": evaluation.stats[8]}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("decoder")
+    parser.add_argument("data", type=Path, help="folder with images/ and labels/")
+    parser.add_argument("--score-threshold", type=float, default=0.001)
+    parser.add_argument("--nms-iou", type=float, default=0.45)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+
+    detector = OnnxDetector(
+        model=str(arguments.model),
+        decoder=arguments.decoder,
+        score_threshold=arguments.score_threshold,
+        nms_iou=arguments.nms_iou,
+    )
+    detector.setup()
+    found, seconds = {}, []
+    for i, file in enumerate(sorted((arguments.data / "images").iterdir())):
+        image = Image(stamp=i, frame="camera", data=np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR_RGB), np.uint8))
+        start = time.perf_counter()
+        found[file.stem] = detector.process(image)
+        seconds.append(time.perf_counter() - start)
+    figures = " | ".join(f"{name} {value:.3f}" for name, value in score(arguments.data, found).items())
+    print(f"{len(found)} images | {figures} | median {np.median(seconds) * 1e3:.1f} ms a frame, one thread")
+
+
+if __name__ == "__main__":
+    main()

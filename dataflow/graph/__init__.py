@@ -1,0 +1,22 @@
+"""The graph language: YAML that names operators and wires them; loaded, resolved and checked before anything starts."""
+
+from dataflow.graph.load import load_bundle, load_graph, load_text
+from dataflow.graph.model import Edge, Graph, Live, Network, Node, OperatorImportError, Placement, Stream
+from dataflow.graph.problems import GraphError, Place, Problem
+
+__all__ = [
+    "Edge",
+    "Graph",
+    "GraphError",
+    "Live",
+    "Network",
+    "Node",
+    "OperatorImportError",
+    "Place",
+    "Placement",
+    "Problem",
+    "Stream",
+    "load_bundle",
+    "load_graph",
+    "load_text",
+]

@@ -1,0 +1,292 @@
+"""Which operators there are, and what each declares: for `dataflow operators`, the docs and other tools."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import json
+import pkgutil
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from typing import Any
+
+from pydantic_core import PydanticUndefined
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from dataflow.graph.lookup import is_concrete
+from dataflow.operator import InputPort, Operator, OutputPort, is_source
+from dataflow.sync.stamps import format_duration
+
+ENTRY_POINTS = "dataflow.operators"
+"""The entry-point group by which a package advertises a module or package of operators."""
+BUILT_IN = ("operators",)
+
+_KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """A module that could not be imported, and why."""
+
+    module: str
+    reason: str
+
+    def __str__(self) -> str:
+        return f"{self.module}: {self.reason}"
+
+
+@dataclass(frozen=True, slots=True)
+class Catalogue:
+    """The operators found, by import path, and the modules that failed."""
+
+    operators: Mapping[str, type[Operator]]
+    failures: tuple[Failure, ...] = ()
+    found_in: tuple[str, ...] = field(default=BUILT_IN)
+
+    def find(self, name: str) -> list[str]:
+        """The import paths that `name` may mean: a path, a class name, or the end of either's module."""
+        if name in self.operators:
+            return [name]
+        return [
+            path
+            for path in self.operators
+            if path.endswith((f":{name}", f".{name}")) or path.partition(":")[0] in (name, f"operators.{name}")
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "operators": [describe(path, cls) for path, cls in self.operators.items()],
+            "failures": [{"module": f.module, "reason": f.reason} for f in self.failures],
+        }
+
+
+def discover(packages: Iterable[str] | None = None) -> Catalogue:
+    """Imports the packages (built in and advertised, unless given) with all their modules and lists their operators.
+
+    A module that fails is reported in `failures` and the rest still listed. An operator has the path of the module
+    that defines it, or of a package above that module which exports it, whichever is shorter.
+    """
+    roots = tuple(dict.fromkeys((*BUILT_IN, *_advertised()) if packages is None else packages))
+    failures: list[Failure] = []
+    found: dict[type[Operator], str] = {}
+    for root in roots:
+        for module in _modules(root, failures):
+            for name, value in sorted(vars(module).items()):
+                if not _is_own(value, name, root):
+                    continue
+                path = f"{module.__name__}:{name}"
+                known = found.get(value)
+                if known is None or len(path) < len(known):
+                    found[value] = path
+    paths = sorted((path, cls) for cls, path in found.items())
+    return Catalogue(dict(paths), tuple(failures), roots)
+
+
+def _advertised() -> list[str]:
+    return sorted({entry.module for entry in entry_points(group=ENTRY_POINTS)})
+
+
+def _is_own(value: object, name: str, root: str) -> bool:
+    return (
+        isinstance(value, type)
+        and issubclass(value, Operator)
+        and is_concrete(value)
+        and not name.startswith("_")
+        and not value.__name__.startswith("_")
+        and (value.__module__ == root or value.__module__.startswith(f"{root}."))
+    )
+
+
+def _modules(root: str, failures: list[Failure]) -> Iterator[Any]:
+    package = _import(root, failures)
+    if package is None:
+        return
+    yield package
+    for info in pkgutil.iter_modules(getattr(package, "__path__", [])):
+        if info.name != "__main__":
+            yield from _modules(f"{root}.{info.name}", failures)
+
+
+def _import(name: str, failures: list[Failure]) -> Any:
+    try:
+        return importlib.import_module(name)
+    except Exception as error:  # a module may fail in any way when it runs
+        failures.append(Failure(name, f"{type(error).__name__}: {error}"))
+        return None
+
+
+def describe(use: str, cls: type[Operator]) -> dict[str, Any]:
+    """All that an operator declares, as JSON values."""
+    spec = cls.spec
+    return {
+        "use": use,
+        "name": spec.name,
+        "doc": spec.doc,
+        "source": is_source(cls),
+        "live": bool(getattr(cls, "live", False)),
+        "external": cls.external,
+        "fires": fires(cls),
+        "inputs": [_input(port) for port in spec.inputs.values()],
+        "outputs": [_output(port) for port in spec.outputs.values()],
+        "params": [dict(row) for row in parameters(cls)],
+    }
+
+
+def fires(cls: type[Operator]) -> str:
+    """When the operator fires, in words."""
+    spec = cls.spec
+    if is_source(cls):
+        return "by itself (a device)" if getattr(cls, "live", False) else "by itself (can wait)"
+    ways = []
+    names = " and ".join(port.name for port in spec.triggers)
+    if len(spec.triggers) > 1 and not spec.merge:
+        window = f"within {format_duration(spec.tolerance)}" if spec.tolerance else "at equal stamps"
+        ways.append(f"on {names} joined {window}")
+    elif spec.triggers:
+        ways.append(f"on every message of {names}")
+    if spec.every is not None:
+        ways.append(f"every {format_duration(spec.every)}")
+    return ", and ".join(ways)
+
+
+def _input(port: InputPort) -> dict[str, Any]:
+    return {
+        "name": port.name,
+        "kind": port.kind,
+        "types": [t.SCHEMA or "Message" for t in port.types],
+        "many": port.many,
+        "required": port.kind != "sampled" or port.required,
+        "max_age": port.max_age,
+        "before": port.before,
+        "max": port.max,
+        "doc": port.doc,
+    }
+
+
+def _output(port: OutputPort) -> dict[str, Any]:
+    return {
+        "name": port.name,
+        "types": [t.SCHEMA or "Message" for t in port.types],
+        "static": port.static,
+        "lag": port.lag,
+        "doc": port.doc,
+    }
+
+
+def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
+    """One row per parameter: name, type, default (None when required), bounds, unit, doc."""
+    rows: list[Mapping[str, Any]] = []
+    schema = cls.spec.parameters.model_json_schema()
+    for name, info in cls.spec.parameters.model_fields.items():
+        required = info.is_required()
+        declared = schema["properties"].get(name, {})
+        rows.append(
+            {
+                "name": name,
+                "type": _type_text(info.annotation),
+                "required": required,
+                "default": None if required or info.default is PydanticUndefined else declared.get("default"),
+                "bounds": _bounds(declared),
+                "unit": declared.get("unit", ""),
+                "doc": info.description or "",
+            }
+        )
+    return rows
+
+
+def _type_text(annotation: Any) -> str:
+    return (
+        annotation.__name__
+        if inspect.isclass(annotation) and not hasattr(annotation, "__args__")
+        else (str(annotation).replace("typing.", ""))
+    )
+
+
+_BOUNDS = {
+    "minimum": ">=",
+    "exclusiveMinimum": ">",
+    "maximum": "<=",
+    "exclusiveMaximum": "<",
+    "minLength": "length >=",
+    "maxLength": "length <=",
+    "minItems": "items >=",
+    "maxItems": "items <=",
+    "pattern": "matches",
+}
+
+
+def _bounds(declared: Mapping[str, Any]) -> str:
+    return ", ".join(f"{word} {declared[key]}" for key, word in _BOUNDS.items() if key in declared)
+
+
+def overview(catalogue: Catalogue) -> RenderableType:
+    """A table of all operators: path, what goes in and out, first line of the doc; failures below."""
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in ("operator", "in", "out", "what it does"):
+        table.add_column(heading, overflow="fold")
+    for path, cls in catalogue.operators.items():
+        spec = cls.spec
+        takes = ", ".join(p.type_text() for p in spec.inputs.values())
+        makes = ", ".join(p.type_text() for p in spec.outputs.values())
+        table.add_row(Text(path, "cyan"), takes or "-", makes or "-", spec.doc.partition("\n")[0])
+    if not catalogue.failures:
+        return table
+    return Group(table, *(Text(f"failed to import {failure}", "red") for failure in catalogue.failures))
+
+
+def details(use: str, cls: type[Operator]) -> RenderableType:
+    """One operator in full: doc, when it fires, ports and parameters."""
+    spec = cls.spec
+    parts: list[RenderableType] = [Text.assemble((spec.name, "bold"), "  ", (use, "cyan")), Text(spec.doc)]
+    parts.append(Text(f"fires {fires(cls)}", "dim"))
+    ports = _table("port", "kind", "type", "")
+    for port in spec.inputs.values():
+        ports.add_row(port.name, f"in  {_KIND[port.kind]}", port.type_text(), _notes(_input_notes(port), port.doc))
+    for out in spec.outputs.values():
+        ports.add_row(out.name, "out", out.type_text(), _notes(_output_notes(out), out.doc))
+    parts += [Text(), ports]
+    rows = parameters(cls)
+    if rows:
+        table = _table("parameter", "type", "default", "")
+        for row in rows:
+            unit = f" {row['unit']}" if row["unit"] else ""
+            default = "must be given" if row["required"] else json.dumps(row["default"], ensure_ascii=False) + unit
+            table.add_row(
+                row["name"], row["type"], default, _notes([row["bounds"] + unit] if row["bounds"] else [], row["doc"])
+            )
+        parts += [Text(), table]
+    return Group(*parts)
+
+
+def _table(*headings: str) -> Table:
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in headings:
+        table.add_column(heading, overflow="fold")
+    return table
+
+
+def _notes(notes: Sequence[str], doc: str) -> Text:
+    return Text(f"{doc} ({'; '.join(notes)})" if notes and doc else doc or "; ".join(notes))
+
+
+def _input_notes(port: InputPort) -> list[str]:
+    notes = []
+    if port.kind == "sampled" and not port.required:
+        notes.append("optional")
+    if port.many:
+        notes.append("many streams")
+    if port.before:
+        notes.append("strictly before the firing" if port.before == 1 else f"{format_duration(port.before)} before")
+    if port.max_age is not None:
+        notes.append(f"at most {format_duration(port.max_age)} old")
+    if port.max is not None:
+        notes.append(f"at most {port.max}")
+    return notes
+
+
+def _output_notes(port: OutputPort) -> list[str]:
+    notes = ["static"] if port.static else []
+    return [*notes, f"up to {format_duration(port.lag)} late"] if port.lag else notes

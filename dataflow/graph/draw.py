@@ -1,0 +1,83 @@
+"""A graph for people: as a tree in the terminal, as a Mermaid flowchart, and as an SVG picture."""
+
+from __future__ import annotations
+
+from rich.text import Text
+from rich.tree import Tree
+
+from dataflow.graph.model import Graph, Node
+from dataflow.graph.svg import svg
+from dataflow.operator import InputPort
+
+__all__ = ["mermaid", "svg", "tree"]
+
+_KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
+_ARROW = {"in": "-->", "sampled": "-.->", "batch": "==>"}
+
+
+def tree(graph: Graph) -> Tree:
+    """Hosts, their operators, and of each its inputs (kind, type, streams) and outputs (type)."""
+    hosts = graph.hosts()
+    title = Text.assemble((graph.name, "bold"), f"  {graph.namespace}  ", (_counts(graph), "dim"))
+    root = Tree(title)
+    for host, names in hosts.items():
+        machines = {graph.nodes[name].machine for name in names} - {None}
+        where = f" on {', '.join(sorted(m for m in machines if m))}" if machines else ""
+        branch = root.add(Text.assemble(("host ", "dim"), (host, "cyan"), (where, "dim")))
+        for name in names:
+            node = graph.nodes[name]
+            label = Text.assemble((name, "bold"), "  ", (node.use, "dim"))
+            entry = branch.add(label)
+            for line in _ports(graph, node):
+                entry.add(line)
+    return root
+
+
+def _counts(graph: Graph) -> str:
+    counts = ((len(graph.nodes), "operator"), (len(graph.hosts()), "host"), (len(graph.streams), "stream"))
+    return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts)
+
+
+def _ports(graph: Graph, node: Node) -> list[Text]:
+    lines: list[Text] = []
+    width = max((len(p) for p in (*node.inputs, *node.outputs)), default=0)
+    for name, streams in node.inputs.items():
+        port = node.input_port(name)
+        taken = ", ".join(graph.relative(s) for s in streams) or "(left out)"
+        lines.append(
+            Text.assemble(
+                ("in  ", "green"),
+                f"{name:<{width}}  ",
+                (_input_text(port), "yellow"),
+                " <- ",
+                (taken, "" if streams else "dim"),
+            )
+        )
+    for name, stream in node.outputs.items():
+        made = graph.streams[stream]
+        extra = "  static" if made.static else ""
+        lines.append(
+            Text.assemble(("out ", "blue"), f"{name:<{width}}  ", (" | ".join(made.types), "yellow"), (extra, "dim"))
+        )
+    return lines
+
+
+def _input_text(port: InputPort) -> str:
+    return f"{_KIND[port.kind]}[{port.type_text()}]"
+
+
+def mermaid(graph: Graph) -> str:
+    """A Mermaid flowchart: a subgraph per shared host; triggers solid, Sampled dotted, Batch thick."""
+    ids = {name: f"n{i}" for i, name in enumerate(graph.nodes)}
+    lines = ["flowchart LR"]
+    for number, (host, names) in enumerate(graph.hosts().items()):
+        boxes = [f'{ids[name]}["<b>{name}</b><br/>{graph.nodes[name].use.rpartition(":")[2]}"]' for name in names]
+        if len(names) == 1:
+            lines.append(f"    {boxes[0]}")
+        else:
+            lines += [f'    subgraph h{number} ["host {host}"]', *(f"        {box}" for box in boxes), "    end"]
+    for edge in graph.edges():
+        arrow = _ARROW[graph.nodes[edge.consumer].input_port(edge.input).kind]
+        label = f"{edge.port}: {' or '.join(graph.streams[edge.stream].types)}"
+        lines.append(f'    {ids[edge.producer]} {arrow}|"{label}"| {ids[edge.consumer]}')
+    return "\n".join([*lines, ""])

@@ -1,0 +1,94 @@
+"""Loads and checks a graph: from a file, from text, or from the bundle that a recording carries."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from dataflow.graph.expand import Expander
+from dataflow.graph.model import Bundle, Graph
+from dataflow.graph.problems import Place, Problems
+from dataflow.graph.resolve import Resolver
+
+BUNDLE_FORMAT = "dataflow-graph/1"
+
+
+def load_graph(path: str | Path, *, settings: Sequence[str] = ()) -> Graph:
+    """The graph of a YAML file, checked wholly. `settings` are `--set` words, such as `"detector.threshold=0.3"`.
+
+    Imports the operators it names. Raises `GraphError` with everything that is wrong.
+    """
+    file = Path(path)
+    return _load(file.name, _reader(file.parent), os.environ.get, settings, lambda key: _shown(file.parent, key))
+
+
+def load_text(
+    text: str, *, file: str = "graph.yaml", files: Mapping[str, str] | None = None, settings: Sequence[str] = ()
+) -> Graph:
+    """The graph of a YAML text. `files` holds the texts of nested graphs by path; nothing is read from disk."""
+    texts = {file: text, **(files or {})}
+    return _load(file, lambda key: _from(texts, key), os.environ.get, settings, str)
+
+
+def load_bundle(bundle: str) -> Graph:
+    """The graph that `Graph.bundle()` packed, without its files and environment. Raises `GraphError`."""
+    try:
+        data = json.loads(bundle)
+        if data["format"] != BUNDLE_FORMAT:
+            raise ValueError(f"its format is {data['format']!r}, this version reads {BUNDLE_FORMAT!r}")
+        packed = Bundle(
+            str(data["file"]),
+            {str(key): str(text) for key, text in data["files"].items()},
+            tuple(str(word) for word in data["settings"]),
+            {str(name): None if word is None else str(word) for name, word in data["environment"].items()},
+        )
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        problems = Problems()
+        problems.add(Place("bundle", 1, 1), f"not a graph bundle: {type(error).__name__}: {error}")
+        problems.check()
+        raise AssertionError from error
+    return _load(packed.file, lambda key: _from(packed.files, key), packed.environment.get, packed.settings, str)
+
+
+def _load(
+    file: str,
+    read: Callable[[str], str],
+    variable: Callable[[str], str | None],
+    settings: Sequence[str],
+    shown: Callable[[str], str],
+) -> Graph:
+    problems = Problems()
+    texts: dict[str, str] = {}
+    environment: dict[str, str | None] = {}
+
+    def noted_read(key: str) -> str:
+        texts[key] = read(key)
+        return texts[key]
+
+    def noted_variable(name: str) -> str | None:
+        environment[name] = variable(name)
+        return environment[name]
+
+    expansion = Expander(noted_read, shown, noted_variable, settings, problems).expand(file)
+    if expansion is None:
+        problems.check()
+        raise AssertionError("a graph without a shape has a problem")
+    graph = Resolver(expansion, problems).resolve(Bundle(file, texts, tuple(settings), environment))
+    problems.check()
+    return graph
+
+
+def _reader(folder: Path) -> Callable[[str], str]:
+    return lambda key: (folder / key).read_text(encoding="utf-8")
+
+
+def _from(texts: Mapping[str, str], key: str) -> str:
+    if key not in texts:
+        raise FileNotFoundError(2, f"not among {', '.join(texts)}")
+    return texts[key]
+
+
+def _shown(folder: Path, key: str) -> str:
+    return os.path.normpath(folder / key)

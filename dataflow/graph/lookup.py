@@ -1,0 +1,108 @@
+"""Finds the operator class behind a `use:` path, and explains a path that leads nowhere."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import pkgutil
+import sys
+import traceback
+from dataclasses import dataclass
+from types import ModuleType
+
+from dataflow.graph.problems import did_you_mean, nearest
+from dataflow.operator import Operator, Source
+
+
+@dataclass(frozen=True, slots=True)
+class NotFound:
+    """Why there is no operator behind a path."""
+
+    message: str
+    hint: str = ""
+
+
+def find_operator(use: str) -> type[Operator] | NotFound:
+    """The class that `use` (`"operators.cloud:CloudBuilder"`) names, or what is wrong with the path."""
+    module_name, colon, name = use.partition(":")
+    if not (colon and name.isidentifier() and all(part.isidentifier() for part in module_name.split("."))):
+        return NotFound(
+            f"{use!r} names no operator", "write 'package.module:Class', or the path of a graph file (*.yaml)"
+        )
+    module = import_module(module_name)
+    if isinstance(module, NotFound):
+        return module
+    found = getattr(module, name, None)
+    if found is None:
+        return NotFound(
+            f"module {module_name!r} has no operator {name!r}",
+            did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
+        )
+    if not (isinstance(found, type) and issubclass(found, Operator)):
+        what = f"the class {name}" if isinstance(found, type) else f"a {type(found).__name__}"
+        return NotFound(
+            f"{use!r} is {what}, not an Operator",
+            did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
+        )
+    if not is_concrete(found):
+        return NotFound(
+            f"{use!r} is abstract: it declares no ports of its own",
+            did_you_mean(name, operator_names(module), f"operators in {module_name!r}"),
+        )
+    return found
+
+
+def import_module(name: str) -> ModuleType | NotFound:
+    """The module, imported; or which part of its path is missing, or how its code fails."""
+    if name in sys.modules:
+        return sys.modules[name]
+    parent, _, last = name.rpartition(".")
+    if parent:
+        package = import_module(parent)
+        if isinstance(package, NotFound):
+            return package
+    try:
+        return importlib.import_module(name)
+    except ModuleNotFoundError as error:
+        if error.name != name:
+            return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _where(error, name))
+        if parent and not hasattr(sys.modules[parent], "__path__"):
+            return NotFound(f"no module {name!r}: {parent!r} is a single module", "")
+        unknown_place = "is its package installed, or its folder on the path?"
+        return NotFound(f"no module {name!r}", _nearest_module(last, parent) or unknown_place)
+    except Exception as error:  # the module's own code may fail in any way
+        return NotFound(f"module {name!r} fails to import: {type(error).__name__}: {error}", _where(error, name))
+
+
+def operator_names(module: ModuleType) -> list[str]:
+    """Names of the usable operators that a module offers, its imports included."""
+    return sorted(
+        name
+        for name, value in vars(module).items()
+        if isinstance(value, type) and issubclass(value, Operator) and is_concrete(value) and not name.startswith("_")
+    )
+
+
+def is_concrete(cls: type[Operator]) -> bool:
+    """True when the class declares ports of its own, so that it can be made."""
+    return cls not in (Operator, Source) and "spec" in vars(cls)
+
+
+def _nearest_module(name: str, parent: str) -> str:
+    path = sys.modules[parent].__path__ if parent else None
+    candidates = [info.name for info in pkgutil.iter_modules(path) if not info.name.startswith("_")]
+    if parent:
+        return did_you_mean(name, candidates, f"modules in {parent!r}").replace("mean '", f"mean '{parent}.")
+    near = nearest(name, candidates)
+    return "" if near is None else f"did you mean {near!r}?"
+
+
+def _where(error: Exception, module: str) -> str:
+    """The deepest frame of the module's own code, or of the last code that failed."""
+    frames = traceback.extract_tb(error.__traceback__)
+    if isinstance(error, SyntaxError) and error.filename:
+        return f"raised at {error.filename}:{error.lineno}"
+    spec = importlib.util.find_spec(module) if "." not in module or module.rpartition(".")[0] in sys.modules else None
+    own = [frame for frame in frames if spec is not None and frame.filename == spec.origin]
+    frame = (own or [f for f in frames if "importlib" not in f.filename] or list(frames))[-1]
+    return f"raised at {frame.filename}:{frame.lineno}"

@@ -1,0 +1,330 @@
+"""The resolved graph: what a graph file means once every name, stream, parameter and policy in it is settled.
+
+Everything here is plain data that travels between processes as JSON (`Graph.to_json`, `Graph.from_json`); a node's
+operator class is imported only when somebody asks for it, so a host imports its own operators and no others.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from dataflow.operator import InputPort, Operator, OperatorSpec, OutputPort
+
+QueuePolicy = Literal["newest", "oldest", "block"]
+StalePolicy = Literal["use", "drop"]
+Placement = Literal["graph", "one_host", "host_each"]
+
+
+class OperatorImportError(ImportError):
+    """An operator that cannot be had from its import path: says which part of the path fails and why."""
+
+
+def import_operator(use: str) -> type[Operator]:
+    """The class behind `"operators.cloud:CloudBuilder"`; raises `OperatorImportError`."""
+    module_name, _, name = use.partition(":")
+    try:
+        module = sys.modules.get(module_name) or importlib.import_module(module_name)
+    except Exception as error:  # a module may fail in any way when it runs
+        raise OperatorImportError(f"cannot import {module_name!r}: {type(error).__name__}: {error}") from error
+    found = getattr(module, name, None)
+    if not (isinstance(found, type) and issubclass(found, Operator)):
+        raise OperatorImportError(f"module {module_name!r} has no operator {name!r}")
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Restart:
+    """How often a failed operator is started again in a live run, and how long to wait before each attempt (ns)."""
+
+    max: int = 0
+    backoff: int = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Live:
+    """How an operator behaves in a live run; replay and verify ignore all of it.
+
+    - `queue`, `size`: at most `size` undecided messages on each stream of a trigger; beyond that the oldest is dropped
+      (`newest` is kept), the arriving one is dropped (`oldest` is kept), or the producer waits (`block`).
+    - `wait`: per input, how long (ns) a decision waits for that input's frontier before it is forced; None: for ever.
+    - `deadline`: longest one firing may take (ns) before the operator counts as hung; None: no limit.
+    - `memory`: bytes of resident memory at which its host is restarted; None: no limit.
+    - `on_stale`: whether messages of an input whose producer died still serve firings or count as absent.
+    """
+
+    queue: QueuePolicy
+    size: int
+    wait: Mapping[str, int | None]
+    deadline: int | None = None
+    restart: Restart = Restart()
+    memory: int | None = None
+    on_stale: StalePolicy = "use"
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """One operator of the resolved graph.
+
+    - `name`: full name; the names of nested graphs come first: `"front/cloud"`.
+    - `use`: import path of the class; `operator` imports it.
+    - `params`: every parameter, defaults included, as validated; plain JSON values.
+    - `inputs`: input port → names of the streams it takes, sorted; an optional input left out has none.
+    - `outputs`: output port → stream name.
+    - `process`, `machine`: labels as the graph gives them, or None.
+    - `tolerance`, `every`: nanoseconds; the class's own, or the graph's `sync:`.
+    - `source`, `external`: as the class declares.
+    - `file`, `line`: where the graph names the operator.
+    """
+
+    name: str
+    use: str
+    params: Mapping[str, Any]
+    inputs: Mapping[str, tuple[str, ...]]
+    outputs: Mapping[str, str]
+    live: Live
+    process: str | None = None
+    machine: str | None = None
+    tolerance: int = 0
+    every: int | None = None
+    source: bool = False
+    external: bool = False
+    file: str = ""
+    line: int = 0
+
+    @property
+    def operator(self) -> type[Operator]:
+        """The operator class, imported on first use; raises `OperatorImportError`."""
+        return import_operator(self.use)
+
+    @property
+    def spec(self) -> OperatorSpec:
+        """What the class declares. Mind `tolerance` and `every`, which the graph may change: the node's count."""
+        return self.operator.spec
+
+    @property
+    def host(self) -> str:
+        """Label of the host it runs in unless the placement is overridden: its `process:` label, or its own name."""
+        return self.process or self.name
+
+    def input_port(self, name: str) -> InputPort:
+        return self.spec.inputs[name]
+
+    def output_port(self, name: str) -> OutputPort:
+        return self.spec.outputs[name]
+
+    def make(self) -> Operator:
+        """A new operator object with this node's parameters."""
+        return self.operator(**self.params)
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One stream: the node and port that make it, and what its consumers need to know without importing the class.
+
+    `types` are schema names (a port may declare a union); `lag` is in nanoseconds.
+    """
+
+    name: str
+    node: str
+    port: str
+    types: tuple[str, ...]
+    static: bool = False
+    lag: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """Which streams a recording holds. `thin`: not all of them; firing records are always written."""
+
+    streams: tuple[str, ...]
+    thin: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What the viewer leaves out: stream names."""
+
+    hide: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """Where hosts listen and connect beyond loopback. The default opens nothing.
+
+    `listen` and `connect` are Zenoh endpoints (`"tcp/192.168.1.2:7447"`); `tls` and `access_control` are handed to
+    Zenoh's own configuration (`transport/link/tls`, `access_control`) as they are.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    shared_memory: bool = True
+    scouting: bool = False
+    tls: Mapping[str, Any] = field(default_factory=dict)
+    access_control: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def loopback_only(self) -> bool:
+        return not (self.listen or self.connect or self.scouting)
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """One stream into one input."""
+
+    stream: str
+    producer: str
+    port: str
+    consumer: str
+    input: str
+
+
+@dataclass(frozen=True, slots=True)
+class Bundle:
+    """Everything that a graph was loaded from, so that it can be loaded again where the files are not.
+
+    `files` maps a path relative to the root file's folder (the root file itself by its name) to its text; `settings`
+    are the `--set` words; `environment` holds the variables that `${env:NAME}` asked for (None: not set).
+    """
+
+    file: str
+    files: Mapping[str, str]
+    settings: tuple[str, ...] = ()
+    environment: Mapping[str, str | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """A resolved, wholly checked graph. `nodes` is in a deterministic topological order (feedback edges aside)."""
+
+    name: str
+    namespace: str
+    nodes: Mapping[str, Node]
+    streams: Mapping[str, Stream]
+    record: Record
+    sources_bundle: Bundle
+    seed: int = 0
+    threads: int = 1
+    view: View = View()
+    network: Network = Network()
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    """Exported outputs of nested graphs: alias key → stream name."""
+
+    @property
+    def text(self) -> str:
+        """The YAML text; nested files follow, each under a comment line with its path."""
+        bundle = self.sources_bundle
+        nested = (f"# file: {path}\n{text}" for path, text in sorted(bundle.files.items()) if path != bundle.file)
+        return "\n".join((bundle.files[bundle.file], *nested))
+
+    def bundle(self) -> str:
+        """JSON that `load_bundle` turns into this very graph again, without its files."""
+        return json.dumps({"format": "dataflow-graph/1", **asdict(self.sources_bundle)}, indent=1, ensure_ascii=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """The resolved graph as JSON values; `Graph.from_json` rebuilds it without importing operators."""
+        return {
+            "name": self.name,
+            "namespace": self.namespace,
+            "seed": self.seed,
+            "threads": self.threads,
+            "nodes": [asdict(node) for node in self.nodes.values()],
+            "streams": [asdict(stream) for stream in self.streams.values()],
+            "aliases": dict(self.aliases),
+            "record": asdict(self.record),
+            "view": asdict(self.view),
+            "network": asdict(self.network),
+            "bundle": asdict(self.sources_bundle),
+        }
+
+    @classmethod
+    def from_json(cls, data: Mapping[str, Any]) -> Graph:
+        """The graph that `to_json` described; it was checked when it was loaded and is not checked again."""
+        network, bundle = data["network"], data["bundle"]
+        nodes = [_node_from_json(values) for values in data["nodes"]]
+        streams = [Stream(**{**values, "types": tuple(values["types"])}) for values in data["streams"]]
+        return cls(
+            name=data["name"],
+            namespace=data["namespace"],
+            seed=data["seed"],
+            threads=data["threads"],
+            nodes={node.name: node for node in nodes},
+            streams={stream.name: stream for stream in streams},
+            aliases=dict(data["aliases"]),
+            record=Record(tuple(data["record"]["streams"]), data["record"]["thin"]),
+            view=View(tuple(data["view"]["hide"])),
+            network=Network(
+                **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},
+            ),
+            sources_bundle=Bundle(**{**bundle, "settings": tuple(bundle["settings"])}),
+        )
+
+    def producer(self, stream: str) -> tuple[Node, str]:
+        """The node and output port that make `stream`; raises KeyError for an unknown stream."""
+        made = self.streams[stream]
+        return self.nodes[made.node], made.port
+
+    def consumers(self, stream: str) -> tuple[tuple[Node, str], ...]:
+        """(node, input port) of everything that takes `stream`, in graph order."""
+        return tuple(
+            (node, port) for node in self.nodes.values() for port, taken in node.inputs.items() if stream in taken
+        )
+
+    def edges(self) -> Iterator[Edge]:
+        """Every stream into every input, in graph order."""
+        for node in self.nodes.values():
+            for port, taken in node.inputs.items():
+                for stream in taken:
+                    made = self.streams[stream]
+                    yield Edge(stream, made.node, made.port, node.name, port)
+
+    def sources(self) -> tuple[Node, ...]:
+        """The operators without inputs that produce by themselves: devices, datasets, simulators, logs."""
+        return tuple(node for node in self.nodes.values() if node.source)
+
+    def sinks(self) -> tuple[Node, ...]:
+        """The operators without outputs."""
+        return tuple(node for node in self.nodes.values() if not node.outputs)
+
+    def hosts(self, placement: Placement | Mapping[str, str] = "graph") -> dict[str, tuple[str, ...]]:
+        """Host label → the nodes it runs, both in graph order.
+
+        `placement`: as the graph's `process:` labels say, all in one host, one host each, or an explicit mapping from
+        node name to label (nodes left out keep the graph's label). Raises ValueError for an unknown node or word.
+        """
+        if isinstance(placement, str) and placement not in ("graph", "one_host", "host_each"):
+            raise ValueError(f"placement {placement!r}: expected graph, one_host, host_each or a mapping")
+        if not isinstance(placement, str) and (unknown := sorted(placement.keys() - self.nodes.keys())):
+            raise ValueError(f"placement names no operator of the graph: {', '.join(unknown)}")
+        grouped: dict[str, list[str]] = {}
+        for node in self.nodes.values():
+            match placement:
+                case "one_host":
+                    label = "all"
+                case "host_each":
+                    label = node.name
+                case "graph":
+                    label = node.host
+                case _:
+                    label = placement.get(node.name, node.host)
+            grouped.setdefault(label, []).append(node.name)
+        return {label: tuple(names) for label, names in grouped.items()}
+
+    def relative(self, stream: str) -> str:
+        """`stream` without the namespace, for people."""
+        return stream.removeprefix(f"{self.namespace}/")
+
+
+def _node_from_json(values: Mapping[str, Any]) -> Node:
+    live = values["live"]
+    return Node(
+        **{
+            **values,
+            "inputs": {port: tuple(streams) for port, streams in values["inputs"].items()},
+            "live": Live(**{**live, "restart": Restart(**live["restart"])}),
+        }
+    )

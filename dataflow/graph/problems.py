@@ -1,0 +1,112 @@
+"""What is wrong with a graph, said like a compiler: place, message, the line with a caret, the nearest right word."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from rich.cells import cell_len
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Place:
+    """A span of one source line: 1-based line and column, width in characters."""
+
+    file: str
+    line: int
+    column: int
+    width: int = 1
+
+    def __str__(self) -> str:
+        return f"{self.file}:{self.line}:{self.column}"
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """One fault of a graph: where, what, and (`hint`) what would be right.
+
+    `source` is the text of the line; `related` holds further places that matter, each with a word about it.
+    """
+
+    file: str
+    line: int
+    column: int
+    message: str
+    hint: str = ""
+    source: str = ""
+    width: int = 1
+    related: tuple[tuple[Place, str], ...] = ()
+
+    def __str__(self) -> str:
+        lines = [f"{self.file}:{self.line}:{self.column}: {self.message}"]
+        if self.source.strip():
+            shown = self.source.replace("\t", " ")
+            number = f"{self.line:>5}"
+            indent = " " * cell_len(shown[: self.column - 1])
+            caret = "^" * max(1, cell_len(shown[self.column - 1 : self.column - 1 + self.width]))
+            lines += [f"{number} | {shown}", f"{' ' * len(number)} | {indent}{caret}"]
+        lines += [f"      {place}: {word}" for place, word in self.related]
+        lines += [f"      {line}" for line in self.hint.splitlines()]
+        return "\n".join(lines)
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "file": self.file,
+            "line": self.line,
+            "column": self.column,
+            "message": self.message,
+            "hint": self.hint,
+            "related": [
+                {"file": place.file, "line": place.line, "column": place.column, "message": word}
+                for place, word in self.related
+            ],
+        }
+
+
+class GraphError(ValueError):
+    """A graph that cannot run; `problems` holds everything that is wrong with it, in file order."""
+
+    def __init__(self, problems: Sequence[Problem]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(map(str, self.problems)))
+
+
+@dataclass(slots=True)
+class Problems:
+    """Collects faults while a graph is read, so that all of them are reported together."""
+
+    texts: dict[str, Sequence[str]] = field(default_factory=dict)
+    """Shown file name → its lines."""
+    found: list[Problem] = field(default_factory=list)
+
+    def add(self, place: Place, message: str, hint: str = "", related: Iterable[tuple[Place, str]] = ()) -> None:
+        lines = self.texts.get(place.file, ())
+        source = lines[place.line - 1] if 0 < place.line <= len(lines) else ""
+        problem = Problem(place.file, place.line, place.column, message, hint, source, place.width, tuple(related))
+        if problem not in self.found:
+            self.found.append(problem)
+
+    def check(self) -> None:
+        """Raises `GraphError` when anything was found."""
+        if self.found:
+            order = {file: index for index, file in enumerate(self.texts)}
+            raise GraphError(sorted(self.found, key=lambda p: (order.get(p.file, len(order)), p.line, p.column)))
+
+
+def nearest(word: str, choices: Iterable[str]) -> str | None:
+    """The choice that `word` most likely meant, or None when nothing is near."""
+    folded: dict[str, str] = {}
+    for choice in choices:
+        folded.setdefault(choice.casefold(), choice)
+    close = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.6)
+    return folded[close[0]] if close else None
+
+
+def did_you_mean(word: str, choices: Iterable[str], what: str = "") -> str:
+    """`did you mean 'camera/image'?`, or the list of all choices when none is near."""
+    known = list(choices)
+    if (near := nearest(word, known)) is not None:
+        return f"did you mean {near!r}?"
+    return f"{what}: {', '.join(known) or 'none'}" if what else ""

@@ -1,0 +1,56 @@
+"""The `--set` words of the command line: one parameter of an operator or of the graph, given from outside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from dataflow.graph import document
+from dataflow.graph.document import UNKNOWN, Entry, Leaf, Table, Tree
+from dataflow.graph.problems import Place, Problems
+
+
+@dataclass(slots=True)
+class Setting:
+    """One word: `owner` is the operator's full name (empty: the graph itself), `path` the parameter and keys inside."""
+
+    owner: str
+    path: tuple[str, ...]
+    value: Tree
+    place: Place
+    used: bool = False
+
+
+def read_settings(words: Sequence[str], problems: Problems) -> list[Setting]:
+    """`operator.param=value` and `param=value` words; values are YAML. Faults stand in the file `--set`."""
+    file = "--set"
+    lines = list(words)
+    if lines:
+        problems.texts[file] = lines
+    settings = []
+    for index, word in enumerate(words):
+        name, equals, text = word.partition("=")
+        place = Place(file, index + 1, 1, max(1, len(name)))
+        *owner, last = name.strip().split(".") if "." in name else ("", name.strip())
+        if not equals or not last:
+            hint = "write operator.param=value, or param=value for the graph's own"
+            problems.add(place, f"{word!r} sets nothing", hint)
+            continue
+        padded = "\n" * index + " " * (len(name) + 1) + text
+        value = document.parse(padded, file, problems, lines)
+        if value is None:
+            value = Leaf(None, place) if not any(p.file == file for p in problems.found) else Leaf(UNKNOWN, place)
+        head, *inner = owner
+        settings.append(Setting(head, (*inner, last), value, place))
+    return settings
+
+
+def put(table: Table, path: tuple[str, ...], setting: Setting) -> Table:
+    """`table` with the setting's value at `path`."""
+    head, *rest = path
+    key = Leaf(head, setting.place, head)
+    value = setting.value
+    if rest:
+        inner = table.get(head)
+        value = put(inner if isinstance(inner, Table) else Table({}, setting.place), tuple(rest), setting)
+    return Table({**table.entries, head: Entry(key, value)}, table.place)

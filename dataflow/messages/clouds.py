@@ -1,0 +1,53 @@
+"""Point clouds and their partition into clusters."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from dataflow.messages.arrays import F32, F64, I32, I64, U8, U16
+from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.checks import within_length
+
+
+class PointCloud(Message):
+    """Points from a lidar, a depth camera or a map."""
+
+    frame: str = scalar("str", "frame of the points")
+    points: F32 = array("float32", "N 3", "x, y, z of each point; NaN where there was no return", unit="m")
+    colors: U8 | None = array("uint8", "N 3", "RGB of each point", default=None)
+    intensities: F32 | None = array("float32", "N", "strength of the return, in the sensor's own scale", default=None)
+    rings: U16 | None = array("uint16", "N", "laser channel of a spinning lidar, from 0", default=None)
+    time_offsets: F32 | None = array(
+        "float32", "N", "when each point was measured, relative to the stamp", unit="s", default=None
+    )
+    normals: F32 | None = array("float32", "N 3", "unit surface normals; NaN where not estimated", default=None)
+
+    @property
+    def count(self) -> int:
+        """Number of points."""
+        return len(self.points)
+
+
+class Clusters(Message):
+    """A partition of a point cloud into clusters: the cloud of the same stamp, or the one the operator documents."""
+
+    frame: str = scalar("str", "frame of the centroids and bounds")
+    labels: I32 = array("int32", "P", "cluster of each point of the cloud, -1 for none")
+    centroids: F64 = array("float64", "N 3", "mean of each cluster's points", unit="m")
+    lower: F64 | None = array("float64", "N 3", "smallest x, y, z of each cluster", unit="m", default=None)
+    upper: F64 | None = array("float64", "N 3", "largest x, y, z of each cluster", unit="m", default=None)
+    ids: I64 | None = array("int64", "N", "identity of each cluster over time", default=None)
+
+    def validate(self) -> None:
+        count = len(self.centroids)
+        within_length(self, "labels", count, f"be -1 or index the {count} clusters of centroids", none=-1)
+
+    @property
+    def count(self) -> int:
+        """Number of clusters."""
+        return len(self.centroids)
+
+    def indices(self, cluster: int) -> npt.NDArray[np.int64]:
+        """Indices (M,) of the cloud's points in one cluster, ascending."""
+        return np.flatnonzero(self.labels == cluster)

@@ -1,0 +1,79 @@
+"""What a detector found: boxes in the image and in space."""
+
+from __future__ import annotations
+
+from dataflow.messages.arrays import F32, F64, I32, I64
+from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.checks import ordered_boxes, positive, table_indices, unit_quaternions, within
+
+
+class Detections2D(Message):
+    """Objects found in one image."""
+
+    frame: str = scalar("str", "optical frame of the camera")
+    width: int = scalar("int", "columns of the image, pixels")
+    height: int = scalar("int", "rows of the image, pixels")
+    class_names: tuple[str, ...] = scalar(
+        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
+    )
+    boxes: F32 = array(
+        "float32", "N 4", "(x1, y1, x2, y2), the outer edges; (0, 0) is the image's top left corner", unit="px"
+    )
+    scores: F32 = array("float32", "N", "confidence, [0, 1]")
+    class_ids: I32 = array("int32", "N", "index into `class_names`")
+    ids: I64 | None = array("int64", "N", "identity of each object over time (tracker, simulator)", default=None)
+    visible: F32 | None = array("float32", "N", "share of the object that is not hidden, [0, 1]", default=None)
+    pixel_counts: I64 | None = array("int64", "N", "visible pixels of each object", unit="px", default=None)
+
+    def validate(self) -> None:
+        positive(self, "width", "height")
+        ordered_boxes(self, "boxes")
+        within(self, 0.0, 1.0, "scores", "visible")
+        table_indices(self, "class_ids", "class_names")
+
+    @property
+    def count(self) -> int:
+        """Number of objects."""
+        return len(self.boxes)
+
+    def labels(self) -> tuple[str, ...]:
+        """Class name of each object, or its class id as text where classes have no names."""
+        return _labels(self.class_ids, self.class_names)
+
+
+class Boxes3D(Message):
+    """Objects found in space, as oriented boxes."""
+
+    frame: str = scalar("str", "frame of the boxes")
+    class_names: tuple[str, ...] = scalar(
+        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
+    )
+    centers: F64 = array("float64", "N 3", "middle of each box", unit="m")
+    sizes: F64 = array("float64", "N 3", "full extents along the box's own x, y and z", unit="m")
+    orientations: F64 = array("float64", "N 4", "unit quaternions (x, y, z, w) that map the box's axes to `frame`")
+    scores: F32 = array("float32", "N", "confidence, [0, 1]")
+    class_ids: I32 = array("int32", "N", "index into `class_names`")
+    ids: I64 | None = array("int64", "N", "identity of each object over time (tracker, simulator)", default=None)
+    velocities: F64 | None = array("float64", "N 3", "velocity of the centres, in `frame`", unit="m/s", default=None)
+    covariances: F64 | None = array("float64", "N 3 3", "of the centres", unit="m²", default=None)
+    visible: F32 | None = array("float32", "N", "share of the object that is not hidden, [0, 1]", default=None)
+    point_counts: I64 | None = array("int64", "N", "points of the cloud in each box", unit="points", default=None)
+
+    def validate(self) -> None:
+        within(self, 0.0, float("inf"), "sizes")
+        unit_quaternions(self, "orientations")
+        within(self, 0.0, 1.0, "scores", "visible")
+        table_indices(self, "class_ids", "class_names")
+
+    @property
+    def count(self) -> int:
+        """Number of objects."""
+        return len(self.centers)
+
+    def labels(self) -> tuple[str, ...]:
+        """Class name of each object, or its class id as text where classes have no names."""
+        return _labels(self.class_ids, self.class_names)
+
+
+def _labels(class_ids: I32, class_names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(class_names[i] if class_names else str(i) for i in class_ids.tolist())

@@ -1,0 +1,108 @@
+"""Images and depth images, raw and compressed."""
+
+from __future__ import annotations
+
+from dataflow.messages.arrays import F32, U8
+from dataflow.messages.base import Message, MessageError, array, scalar
+from dataflow.messages.checks import finite, not_empty, positive
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+FORMATS = ("jpeg", "png", "webp")
+
+
+class Image(Message):
+    """A colour or grey image, as the camera's optical frame sees it; the stamp is the middle of the exposure."""
+
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    data: U8 = array("uint8", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")
+
+    def validate(self) -> None:
+        not_empty(self, "data")
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.data.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.data.shape[1])
+
+    @property
+    def is_color(self) -> bool:
+        """Whether there are three channels."""
+        return self.data.ndim == 3
+
+
+class CompressedImage(Message):
+    """A colour or grey image as an encoded file."""
+
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    format: str = scalar("str", "how the bytes are encoded", choices=FORMATS)
+    data: U8 = array("uint8", "N", "the bytes of the encoded file")
+
+    def validate(self) -> None:
+        head = self.data[:12].tobytes()
+        found = _signature(head)
+        if found != self.format:
+            raise MessageError(
+                f"CompressedImage.data must hold a {self.format} file, got {len(self.data)} bytes that begin with "
+                f"{head.hex(' ')}" + (f", which is {found}" if found else "")
+            )
+
+
+class DepthImage(Message):
+    """Distance along the optical axis (z, not range) per pixel."""
+
+    frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)")
+    data: F32 = array("float32", "H W", "depth; 0 or NaN where there was no return; at least one pixel", unit="m")
+
+    def validate(self) -> None:
+        not_empty(self, "data")
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.data.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.data.shape[1])
+
+
+class CompressedDepth(Message):
+    """A depth image as a 16-bit grey PNG; the pixel value 0 is no return.
+
+    A value v > 0 stands for the depth `scale * v + offset` metres where `quantizer` is linear (a depth camera's own
+    units, usually millimetres: scale 0.001), and for `scale / (v - offset)` where it is inverse (equal steps of inverse
+    depth, as ROS's `compressedDepth` has them: scale is its quantisation parameter A, offset its B).
+    """
+
+    frame: str = scalar("str", "optical frame of the depth camera (z forward, x right, y down)")
+    quantizer: str = scalar("str", "how pixel values relate to depth", default="linear", choices=("linear", "inverse"))
+    scale: float = scalar("float", "metres per unit (linear), or metres times units (inverse); above 0")
+    offset: float = scalar("float", "metres (linear), or units (inverse)", default=0.0)
+    data: U8 = array("uint8", "N", "the bytes of a PNG file with one 16-bit channel")
+
+    def validate(self) -> None:
+        positive(self, "scale")
+        finite(self, "offset")
+        head = self.data[:26].tobytes()
+        if not head.startswith(PNG_SIGNATURE) or head[24:26] != b"\x10\x00":
+            raise MessageError(
+                f"CompressedDepth.data must hold a PNG file with one 16-bit channel, got {len(self.data)} bytes that "
+                f"begin with {head.hex(' ')}"
+            )
+
+
+def _signature(head: bytes) -> str | None:
+    """The format of an encoded image by its first 12 bytes."""
+    if head.startswith(b"\xff\xd8\xff"):
+        return "jpeg"
+    if head.startswith(PNG_SIGNATURE):
+        return "png"
+    if head[:4] == b"RIFF" and head[8:12] == b"WEBP":
+        return "webp"
+    return None

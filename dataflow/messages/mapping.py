@@ -1,0 +1,89 @@
+"""Maps of the surroundings: occupancy grids, meshes, planes."""
+
+from __future__ import annotations
+
+from dataflow.messages.arrays import F32, F64, I8, I32, I64, U8, U32
+from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.checks import (
+    positive,
+    together,
+    unit_quaternions,
+    unit_vectors,
+    within,
+    within_length,
+)
+from dataflow.messages.geometry import transform_matrix
+
+
+class OccupancyGrid(Message):
+    """A grid of occupancy in a plane. Cell (row, column) covers x in [column, column + 1] * resolution and y in [row,
+    row + 1] * resolution of the grid's own frame: row 0 is at the origin, y grows with the row."""
+
+    frame: str = scalar("str", "frame in which the origin is expressed")
+    resolution: float = scalar("float", "side of a cell, metres")
+    cells: I8 = array("int8", "H W", "occupancy from 0 (free) to 100 (occupied), -1 for unknown", unit="%")
+    position: F64 = array("float64", "3", "outer corner of cell (0, 0) in `frame`", unit="m")
+    orientation: F64 | None = array(
+        "float64",
+        "4",
+        "unit quaternion (x, y, z, w) of the grid's axes in `frame`; None for parallel axes",
+        default=None,
+    )
+
+    def validate(self) -> None:
+        positive(self, "resolution")
+        unit_quaternions(self, "orientation")
+        within_length(self, "cells", 101, "be -1 or lie in 0..100", none=-1)
+
+    def matrix(self) -> F64:
+        """`T_frame_grid` (4, 4)."""
+        return transform_matrix(self.position, (0.0, 0.0, 0.0, 1.0) if self.orientation is None else self.orientation)
+
+
+class Mesh(Message):
+    """A triangle mesh."""
+
+    frame: str = scalar("str", "frame of the vertices")
+    vertices: F32 = array("float32", "V 3", "corners", unit="m")
+    triangles: U32 = array("uint32", "T 3", "indices into the vertices, counter-clockwise seen from outside")
+    colors: U8 | None = array("uint8", "V 3", "RGB of each vertex", default=None)
+    normals: F32 | None = array("float32", "V 3", "unit normal of each vertex", default=None)
+
+    def validate(self) -> None:
+        count = len(self.vertices)
+        within_length(self, "triangles", count, f"index the {count} vertices")
+
+
+class Planes(Message):
+    """Planes found in a cloud: walls, floors, table tops. A point p lies on plane i where n·p + d = 0."""
+
+    frame: str = scalar("str", "frame of the planes")
+    coefficients: F64 = array("float64", "N 4", "(nx, ny, nz, d), n of unit length", unit="m (d)")
+    centers: F64 | None = array(
+        "float64", "N 3", "middle of the part of each plane that was seen", unit="m", default=None
+    )
+    orientations: F64 | None = array(
+        "float64",
+        "N 4",
+        "unit quaternions (x, y, z, w): z is the normal, x and y span the rectangle seen",
+        default=None,
+    )
+    extents: F64 | None = array(
+        "float64", "N 2", "full size of the rectangle seen, along its x and y", unit="m", default=None
+    )
+    inlier_counts: I64 | None = array("int64", "N", "points of the cloud on each plane", unit="points", default=None)
+    labels: I32 | None = array("int32", "P", "plane of each point of the cloud, -1 for none", default=None)
+
+    def validate(self) -> None:
+        count = len(self.coefficients)
+        if count:
+            unit_vectors(self, "coefficients", self.coefficients[:, :3])
+        unit_quaternions(self, "orientations")
+        together(self, "centers", "orientations", "extents")
+        within(self, 0.0, float("inf"), "extents")
+        within_length(self, "labels", count, f"be -1 or index the {count} planes of coefficients", none=-1)
+
+    @property
+    def count(self) -> int:
+        """Number of planes."""
+        return len(self.coefficients)

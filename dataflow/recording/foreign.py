@@ -1,0 +1,82 @@
+"""Decoders for recordings of other programs that hold Foxglove schemas, as protobuf or as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.json_format import ParseDict, ParseError
+
+from dataflow.messages import DepthImage, Image
+from dataflow.messages.base import Message
+from dataflow.recording.codecs import ForeignDecoder, SchemaText, build, register_decoder
+from dataflow.recording.errors import RecordingError
+from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
+from dataflow.recording.json_codec import decode_object
+
+DEPTH_ENCODINGS = ("32FC1",)
+_PREFERRED = {"foxglove.PoseInFrame": "Pose", "foxglove.RawImage": "Image"}
+"""The message type of a Foxglove schema that serves several."""
+
+
+def _stamp(proto: Any, log_time: int) -> int:
+    """The time that the message carries, or the log time where it carries none."""
+    if "timestamp" in proto.DESCRIPTOR.fields_by_name:
+        return stamp_of(proto.timestamp) if proto.HasField("timestamp") else log_time
+    stamps = [stamp_of(t.timestamp) for t in proto.transforms if t.HasField("timestamp")]
+    return max(stamps, default=log_time)
+
+
+def _message(schema: FoxgloveSchema, proto: Any, log_time: int) -> Message:
+    if isinstance(proto, RawImage):
+        depth = proto.encoding in DEPTH_ENCODINGS
+        schema = FOXGLOVE_SCHEMAS[DepthImage if depth else Image]
+    return build(schema.message, _stamp(proto, log_time), schema.decode(proto))
+
+
+def _protobuf(schema: FoxgloveSchema) -> ForeignDecoder:
+    return ForeignDecoder(lambda _: lambda data, log_time: _message(schema, schema.parse(data), log_time))
+
+
+def _json(schema: FoxgloveSchema) -> ForeignDecoder:
+    def bind(_: SchemaText) -> Callable[[bytes, int], Message]:
+        return lambda data, log_time: _message(schema, _from_json(schema, data), log_time)
+
+    return ForeignDecoder(bind)
+
+
+def _from_json(schema: FoxgloveSchema, data: bytes) -> Any:
+    value = decode_object(data)
+    proto = schema.proto()
+    try:
+        ParseDict(_with_proto_times(value), proto, ignore_unknown_fields=True)
+    except ParseError as error:
+        raise RecordingError(f"not a {schema.name}: {error}") from error
+    return proto
+
+
+def _with_proto_times(value: Any) -> Any:
+    """Foxglove's JSON times {"sec", "nsec"} as protobuf's JSON mapping wants them (RFC 3339 text)."""
+    if isinstance(value, list):
+        return [_with_proto_times(v) for v in value]
+    if not isinstance(value, dict):
+        return value
+    if value.keys() == {"sec", "nsec"}:
+        return _rfc3339(value["sec"], value["nsec"])
+    return {key: _with_proto_times(v) for key, v in value.items()}
+
+
+def _rfc3339(seconds: Any, nanoseconds: Any) -> str:
+    from google.protobuf.timestamp_pb2 import Timestamp
+
+    try:
+        return str(Timestamp(seconds=seconds, nanos=nanoseconds).ToJsonString())
+    except (TypeError, ValueError) as error:
+        raise RecordingError(f"time {seconds!r} s {nanoseconds!r} ns: {error}") from error
+
+
+for _schema in FOXGLOVE_SCHEMAS.values():
+    if _PREFERRED.get(_schema.name, _schema.message.SCHEMA) == _schema.message.SCHEMA:
+        register_decoder("protobuf", _schema.name, _protobuf(_schema))
+        register_decoder("json", _schema.name, _json(_schema))

@@ -1,0 +1,57 @@
+"""What is where in a recording: topics, channel kinds, metadata names. `docs/recordings.md` describes it for others."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from typing import Final
+
+FORMAT: Final = "1"
+RECORDING: Final = "recording"
+DIGESTS: Final = "digests"
+RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})
+COMPANION_SUFFIX: Final = "/@companion"
+SEQUENCE_SPAN: Final = 2**32
+
+
+class Kind(StrEnum):
+    """What a channel holds, in its metadata under `kind`."""
+
+    STREAM = "stream"
+    COMPANION = "companion"
+    FIRINGS = "firings"
+    EVENTS = "events"
+
+
+EVENT_SCHEMA: Final = json.dumps(
+    {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Event",
+        "description": "something that happened to the run: a gap in a stream, a new incarnation, a fault",
+        "type": "object",
+        "properties": {
+            "timestamp": {
+                "type": "object",
+                "title": "time",
+                "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+            },
+            "event": {"type": "string", "description": "kind of event"},
+            "stamp": {"type": "string", "description": "event time, nanoseconds since the epoch"},
+            "data": {"type": "object", "properties": {}, "description": "what is particular to the kind"},
+        },
+        "required": ["timestamp", "event", "stamp", "data"],
+    },
+    indent=1,
+).encode()
+
+
+def firings_topic(namespace: str, operator: str) -> str:
+    return _internal(namespace, f"firings/{operator}")
+
+
+def events_topic(namespace: str) -> str:
+    return _internal(namespace, "events")
+
+
+def _internal(namespace: str, rest: str) -> str:
+    return f"{namespace}/@/{rest}" if namespace else f"@/{rest}"

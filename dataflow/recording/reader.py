@@ -1,0 +1,473 @@
+"""Reads recordings: our own, torn ones too, and other programs' MCAP files."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import numpy.typing as npt
+from mcap.records import Channel
+
+from dataflow.messages.base import Message, MessageError, message_types
+from dataflow.messages.digest import StreamDigest
+from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest, foreign_decoder
+from dataflow.recording.errors import RecordingError
+from dataflow.recording.index import Entries, McapFile, RawMessage
+from dataflow.recording.json_codec import decode_object
+from dataflow.recording.layout import DIGESTS, Kind
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """One message of a recording and its place in its stream."""
+
+    stream: str
+    message: Message
+    seq: int
+    incarnation: int
+
+    @property
+    def stamp(self) -> int:
+        return self.message.stamp
+
+
+@dataclass(frozen=True, slots=True)
+class RawRecord:
+    """One message as it stands in the file, decoded or not."""
+
+    stream: str
+    schema: str
+    encoding: str
+    log_time: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Something that happened to the run."""
+
+    name: str
+    stamp: int
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInfo:
+    """What a recording knows of one stream without decoding it.
+
+    - `schema`, `encoding`: of the file, such as foxglove.RawImage and protobuf.
+    - `message_type`: the class that its messages are read as; None where this program has none.
+    - `first`, `last`: smallest and largest log time (our own recordings: stamp), ns; None for an empty stream.
+    - `bytes`: message data before compression, companions included.
+    - `declared_otherwise`: the type's declaration has changed since the recording was made.
+    - `metadata`: of the stream's channel.
+    """
+
+    name: str
+    schema: str
+    encoding: str
+    message_type: type[Message] | None
+    count: int
+    first: int | None
+    last: int | None
+    static: bool
+    bytes: int
+    incarnations: int
+    declared_otherwise: bool
+    metadata: Mapping[str, str]
+
+
+Decode = Callable[[RawMessage, memoryview | None], Message]
+BLOCK = 4096
+
+
+@dataclass(slots=True)
+class _Channel:
+    """One MCAP channel of a stream: an incarnation, or a part of one."""
+
+    record: Channel
+    incarnation: int
+    base: int
+    entries: Entries
+    companion: Entries | None
+    decode: Decode | None
+    stamps: npt.NDArray[np.int64] | None = None
+    """By entry; of foreign channels only known after a pass."""
+
+
+class _Entry(NamedTuple):
+    """One message in the merged sequence: its entry in a channel, and its rank in the stream."""
+
+    stamp: int
+    channel: _Channel
+    position: int
+    rank: int
+
+
+@dataclass(slots=True)
+class _Stream:
+    info: StreamInfo
+    own: bool
+    channels: list[_Channel] = field(default_factory=list)
+
+
+_EMPTY = Entries(*(np.empty(0, np.int64) for _ in range(3)))
+
+
+class Recording:
+    """A recording opened for reading: a context manager, with random access. Not thread-safe.
+
+    Opens our own recordings and anybody's MCAP. A file without an index (torn by `kill -9`, or foreign) is indexed by a
+    pass over it. Raises `RecordingError` for a file that is no MCAP or is damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._file = McapFile(self.path)
+        try:
+            self._streams = self._find_streams()
+        except BaseException:
+            self._file.close()
+            raise
+        self.streams: Mapping[str, StreamInfo] = {name: s.info for name, s in self._streams.items()}
+        self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
+
+    @property
+    def torn(self) -> bool:
+        """Whether the file has no proper end: its writer died. Everything up to the last whole chunk is readable."""
+        return self._file.torn
+
+    @property
+    def lost_bytes(self) -> int:
+        """Bytes of the unfinished record at the end of a torn file."""
+        return self._file.lost_bytes
+
+    @property
+    def library(self) -> str:
+        """The program that wrote the file, as it calls itself."""
+        return str(self._file.header.library)
+
+    @property
+    def profile(self) -> str:
+        """The MCAP profile, such as `ros2`; empty for none."""
+        return str(self._file.header.profile)
+
+    def messages(
+        self,
+        streams: Sequence[str] | None = None,
+        start: int | None = None,
+        end: int | None = None,
+    ) -> Iterator[Recorded]:
+        """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream), whatever their order in the file.
+
+        Static streams come first and whole, whatever `start` and `end`. Each stream keeps its own order, incarnation
+        after incarnation: where stamps jump back between two, so does the merged sequence. Memory holds the index and
+        at most 256 MiB of decompressed chunks. Without `streams`, those that have no message type are left out.
+
+        Raises `RecordingError` for an unknown stream, one without a message type, and data that does not decode.
+        """
+        chosen = self._choose(streams)
+        static = [s for s in chosen if s.info.static]
+        moving = [s for s in chosen if not s.info.static]
+        yield from self._merge(static, None, None)
+        yield from self._merge(moving, start, end)
+
+    def raw(
+        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
+    ) -> Iterator[RawRecord]:
+        """Undecoded messages of any streams with start ≤ log time ≤ end, merged by (log time, stream)."""
+        chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
+        for stream, entry in self._positions(chosen, start, end, log_time=True):
+            entries = entry.channel.entries
+            raw = self._file.read(int(entries.chunks[entry.position]), int(entries.offsets[entry.position]))
+            info = stream.info
+            yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
+
+    def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
+        """(operator, payload) of every batch of firing records, of one operator or of all, in file order."""
+        channels = {
+            c.id: c.metadata["operator"]
+            for c in self._channels_of(Kind.FIRINGS)
+            if operator is None or c.metadata["operator"] == operator
+        }
+        for raw in self._in_file_order(list(channels)):
+            yield channels[raw.channel], bytes(raw.data)
+
+    def firing_batches(self) -> Mapping[str, int]:
+        """Number of batches of firing records by operator."""
+        counts: dict[str, int] = {}
+        for channel in self._channels_of(Kind.FIRINGS):
+            name = channel.metadata["operator"]
+            counts[name] = counts.get(name, 0) + len(self._entries(channel.id))
+        return dict(sorted(counts.items()))
+
+    def events(self) -> Iterator[Event]:
+        """Events of the run, in file order."""
+        for raw in self._in_file_order([c.id for c in self._channels_of(Kind.EVENTS)]):
+            value = decode_object(raw.data)
+            try:
+                yield Event(value["event"], int(value["stamp"]), value["data"])
+            except (KeyError, TypeError, ValueError) as error:
+                raise RecordingError(f"{self.path}: an event at {raw.log_time} cannot be read: {error!r}") from error
+
+    def digests(self, streams: Sequence[str] | None = None) -> Mapping[str, str]:
+        """The stream digests, computed from the decoded messages: xxh3-128 over the message digests, in stream order."""
+        found: dict[str, str] = {}
+        for stream in sorted(self._choose(streams), key=lambda s: s.info.name):
+            digest = StreamDigest()
+            for recorded in self._merge([stream], None, None):
+                digest.update(recorded.message.digest())
+            found[stream.info.name] = digest.hexdigest()
+        return found
+
+    def written_digests(self) -> Mapping[str, str]:
+        """The stream digests that the writer noted when it closed the file; empty for torn and foreign files."""
+        return self.metadata.get(DIGESTS, {})
+
+    def close(self) -> None:
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # ------------------------------------------------------------------------------------------------- streams
+
+    def _find_streams(self) -> dict[str, _Stream]:
+        sizes = self._file.message_bytes()
+        grouped: dict[str, list[Channel]] = {}
+        companions: dict[tuple[str, str, str], Channel] = {}
+        for channel in self._file.channels.values():
+            kind = channel.metadata.get("kind")
+            if kind == Kind.COMPANION:
+                companions[_key(channel, channel.metadata.get("companion_of", ""))] = channel
+            elif kind not in (Kind.FIRINGS, Kind.EVENTS):
+                grouped.setdefault(channel.topic, []).append(channel)
+        found = {name: self._find_stream(name, channels, companions, sizes) for name, channels in grouped.items()}
+        return dict(sorted(found.items()))
+
+    def _find_stream(
+        self,
+        name: str,
+        records: list[Channel],
+        companions: Mapping[tuple[str, str, str], Channel],
+        sizes: Mapping[int, int],
+    ) -> _Stream:
+        first = records[0]
+        own = first.metadata.get("kind") == Kind.STREAM
+        message_type = message_types().get(first.metadata.get("message_type", "")) if own else None
+        codec = codec_for(message_type) if message_type is not None else None
+        channels: list[_Channel] = []
+        size = 0
+        for record in records:
+            size += sizes.get(record.id, 0)
+            companion = companions.get(_key(record, name)) if own else None
+            if companion is not None:
+                size += sizes.get(companion.id, 0)
+            channels.append(self._own_channel(record, companion, codec) if own else self._foreign_channel(record))
+        channels.sort(key=lambda c: (c.incarnation, c.base))
+        if not own:
+            message_type = self._peek(name, channels)
+        times = [c.entries.times for c in channels if len(c.entries)]
+        schema = self._schema(first)
+        info = StreamInfo(
+            name=name,
+            schema=schema.name,
+            encoding=first.message_encoding,
+            message_type=message_type,
+            count=sum(len(c.entries) for c in channels),
+            first=min((int(t.min()) for t in times), default=None),
+            last=max((int(t.max()) for t in times), default=None),
+            static=first.metadata.get("static") == "true" and own,
+            bytes=size,
+            incarnations=len({c.incarnation for c in channels if len(c.entries)}),
+            declared_otherwise=own
+            and message_type is not None
+            and first.metadata.get("declaration", "") != declaration_digest(message_type),
+            metadata=first.metadata,
+        )
+        return _Stream(info, own, channels)
+
+    def _own_channel(self, record: Channel, companion: Channel | None, codec: Codec | None) -> _Channel:
+        def decode(raw: RawMessage, extra: memoryview | None) -> Message:
+            assert codec is not None
+            return codec.decode(raw.log_time, raw.data, extra)
+
+        entries = self._entries(record.id)
+        return _Channel(
+            record,
+            incarnation=_number(record.metadata.get("incarnation", "0")),
+            base=_number(record.metadata.get("sequence_base", "0")),
+            entries=entries,
+            companion=None if companion is None else self._entries(companion.id),
+            decode=None if codec is None else decode,
+            stamps=entries.times,
+        )
+
+    def _foreign_channel(self, record: Channel) -> _Channel:
+        decoder = foreign_decoder(record.message_encoding, self._schema(record))
+
+        def decode(raw: RawMessage, extra: memoryview | None) -> Message:
+            assert decoder is not None
+            return decoder(bytes(raw.data), raw.log_time)
+
+        return _Channel(record, 0, 0, self._entries(record.id), None, None if decoder is None else decode)
+
+    def _peek(self, name: str, channels: list[_Channel]) -> type[Message] | None:
+        """The type of a foreign stream's first message; None when it does not decode."""
+        for channel in channels:
+            if channel.decode is None or not len(channel.entries):
+                continue
+            try:
+                return type(self._decode(name, channel, 0)[0])
+            except RecordingError:
+                channel.decode = None
+        return None
+
+    def _entries(self, channel: int) -> Entries:
+        return self._file.entries.get(channel, _EMPTY)
+
+    def _schema(self, channel: Channel) -> SchemaText:
+        schema = self._file.schemas.get(channel.schema_id)
+        return SchemaText("", "", b"") if schema is None else SchemaText(schema.name, schema.encoding, schema.data)
+
+    def _channels_of(self, kind: Kind) -> list[Channel]:
+        return [c for c in self._file.channels.values() if c.metadata.get("kind") == kind]
+
+    def _stream(self, name: str) -> _Stream:
+        found = self._streams.get(name)
+        if found is None:
+            raise RecordingError(
+                f"{self.path} holds no stream {name!r}; it holds {', '.join(self._streams) or 'no streams'}"
+            )
+        return found
+
+    def _choose(self, names: Sequence[str] | None) -> list[_Stream]:
+        if names is None:
+            return [s for s in self._streams.values() if s.info.message_type is not None]
+        chosen = [self._stream(name) for name in dict.fromkeys(names)]
+        for stream in chosen:
+            if stream.info.message_type is None and stream.info.count:
+                kind = stream.info.metadata.get("message_type")
+                raise RecordingError(
+                    f"{self.path}: stream {stream.info.name!r} holds {stream.info.encoding} messages of "
+                    f"{kind or stream.info.schema or 'no schema'}, for which no message type is declared here; "
+                    + ("import the module that declares it, or " if kind else "")
+                    + "read it with raw()"
+                )
+        return chosen
+
+    # ------------------------------------------------------------------------------------------------- messages
+
+    def _merge(self, streams: list[_Stream], start: int | None, end: int | None) -> Iterator[Recorded]:
+        for stream, entry in self._positions(streams, start, end, log_time=False):
+            message, sequence = self._decode(stream.info.name, entry.channel, entry.position)
+            seq = entry.channel.base + sequence if stream.own else entry.rank
+            yield Recorded(stream.info.name, message, seq, entry.channel.incarnation)
+
+    def _positions(
+        self, streams: list[_Stream], start: int | None, end: int | None, *, log_time: bool
+    ) -> Iterator[tuple[_Stream, _Entry]]:
+        """The merged sequence: always the stream whose next message has the smallest (stamp, stream)."""
+        ordered = sorted(streams, key=lambda s: s.info.name)
+        cursors = [self._cursor(stream, start, end, log_time=log_time) for stream in ordered]
+        heads = [next(cursor, None) for cursor in cursors]
+        heap = [(head.stamp, i) for i, head in enumerate(heads) if head is not None]
+        heapq.heapify(heap)
+        while heap:
+            _, i = heap[0]
+            head = heads[i]
+            assert head is not None
+            yield ordered[i], head
+            following = heads[i] = next(cursors[i], None)
+            if following is None:
+                heapq.heappop(heap)
+            else:
+                heapq.heapreplace(heap, (following.stamp, i))
+
+    def _cursor(self, stream: _Stream, start: int | None, end: int | None, *, log_time: bool) -> Iterator[_Entry]:
+        """The entries of one stream in its own order: incarnation after incarnation, by stamp in each."""
+        groups = [[c] for c in stream.channels] if stream.own else [stream.channels]
+        rank = 0
+        for group in groups:
+            times = np.concatenate([c.entries.times if log_time else self._stamps(stream, c) for c in group])
+            chunks = np.concatenate([c.entries.chunks for c in group])
+            offsets = np.concatenate([c.entries.offsets for c in group])
+            owners = np.concatenate([np.full(len(c.entries), i) for i, c in enumerate(group)])
+            positions = np.concatenate([np.arange(len(c.entries)) for c in group])
+            order = np.lexsort((offsets, chunks, times))
+            low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
+            high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
+            for at in range(low, high, BLOCK):
+                block = order[at : min(at + BLOCK, high)]
+                rows = zip(times[block].tolist(), owners[block].tolist(), positions[block].tolist(), strict=True)
+                for i, (time, owner, position) in enumerate(rows, at):
+                    yield _Entry(time, group[owner], position, rank + i)
+            rank += len(order)
+
+    def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:
+        """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass."""
+        if channel.stamps is None:
+            count = len(channel.entries)
+            decoded = (self._decode(stream.info.name, channel, i)[0].stamp for i in range(count))
+            channel.stamps = np.fromiter(decoded, np.int64, count)
+        return channel.stamps
+
+    def _decode(self, stream: str, channel: _Channel, position: int) -> tuple[Message, int]:
+        """The message of an entry and its number in the file."""
+        raw = self._file.read(int(channel.entries.chunks[position]), int(channel.entries.offsets[position]))
+        try:
+            if channel.decode is None:
+                raise RecordingError(f"no decoder for {channel.record.message_encoding} of this schema")
+            return channel.decode(raw, self._companion(channel, raw)), raw.sequence
+        except (RecordingError, MessageError) as error:
+            raise RecordingError(
+                f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {error}"
+            ) from error
+
+    def _companion(self, channel: _Channel, raw: RawMessage) -> memoryview | None:
+        """The companion's data of a message: the entry of the same time and number."""
+        entries = channel.companion
+        if entries is None:
+            return None
+        at = int(np.searchsorted(entries.times, raw.log_time))
+        if at == len(entries) or entries.times[at] != raw.log_time:
+            return None
+        found = self._file.read(int(entries.chunks[at]), int(entries.offsets[at]))
+        return found.data if found.sequence == raw.sequence else None
+
+    def _in_file_order(self, channels: list[int]) -> Iterator[RawMessage]:
+        known = [self._entries(c) for c in channels]
+        if not known:
+            return
+        chunks = np.concatenate([e.chunks for e in known])
+        offsets = np.concatenate([e.offsets for e in known])
+        for i in np.lexsort((offsets, chunks)):
+            yield self._file.read(int(chunks[i]), int(offsets[i]))
+
+
+def _key(channel: Channel, stream: str) -> tuple[str, str, str]:
+    """What a channel and its companion have in common."""
+    return stream, channel.metadata.get("incarnation", "0"), channel.metadata.get("sequence_base", "0")
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isdecimal() else 0
+
+
+def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, str]]:
+    """Metadata by name; of one name and key the latest counts."""
+    merged: dict[str, dict[str, str]] = {}
+    for name, mapping in records:
+        merged.setdefault(name, {}).update(mapping)
+    return merged

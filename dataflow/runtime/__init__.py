@@ -1,0 +1,1 @@
+"""Running graphs: hosts as processes, their supervisor, firing records, replay."""

@@ -1,0 +1,199 @@
+"""Firing records: what every operator did, complete enough to drive it again and to compare what it made.
+
+A record is one call of an operator: its stamp, the exact messages given to each input, what came out of each port and
+how it ended. Records are gathered in batches of one operator and written to its stream `<namespace>/@/firings/<operator>`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import msgpack
+
+from dataflow.sync import FiringInputs, InputRef, MessageRef, RunRef
+
+FORMAT = 1
+Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore"]
+Outcome = Literal["ok", "error", "torn"]
+KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore")
+OUTCOMES: tuple[Outcome, ...] = ("ok", "error", "torn")
+
+
+class FiringRecordError(ValueError):
+    """A batch of firing records that cannot be read: says which operator and what is wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Emission:
+    """What came out of one port: its place in the stream, its stamp and its digest (16 bytes)."""
+
+    seq: int
+    stamp: int
+    digest: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class DropRecord:
+    """A message that an operator did not use, and why; `because` names the input that was missing, if any."""
+
+    input: str
+    stream: str
+    incarnation: int
+    seq: int
+    stamp: int
+    reason: str
+    because: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FiringRecord:
+    """One call of an operator.
+
+    `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were given,
+    by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those decided since the previous record. `detail` holds what is particular to the kind:
+    parameters and file hashes for `setup`, the name and value for `param`, the error's text for the outcome `error`.
+    `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
+    """
+
+    operator: str
+    incarnation: int
+    index: int
+    kind: Kind
+    stamp: int
+    tick: bool = False
+    inputs: Mapping[str, InputRef] = field(default_factory=dict)
+    stale: frozenset[str] = frozenset()
+    late: frozenset[str] = frozenset()
+    outputs: tuple[Emission | None, ...] = ()
+    outcome: Outcome = "ok"
+    drops: tuple[DropRecord, ...] = ()
+    detail: Mapping[str, Any] = field(default_factory=dict)
+    wall_start: int = 0
+    duration: int = 0
+
+    def firing(self) -> FiringInputs:
+        """What an aligner that is driven by records needs. Only for the kinds fire, tick and finish."""
+        kind = self.kind
+        if kind not in ("fire", "tick", "finish"):
+            raise FiringRecordError(f"{self.operator}: record {self.index} is a {kind!r}, which no message made")
+        return FiringInputs(self.stamp, kind, self.tick, self.inputs, self.stale, self.late)
+
+
+def encode_batch(records: list[FiringRecord], *, last: bool = False) -> bytes:
+    """A batch of consecutive records of one operator as msgpack. `last` marks the operator's final batch."""
+    if not records:
+        raise FiringRecordError("a batch holds at least one firing record")
+    names = list(dict.fromkeys(name for record in records for name in record.inputs))
+    streams: dict[str, int] = {}
+
+    def stream_index(name: str) -> int:
+        return streams.setdefault(name, len(streams))
+
+    rows = [
+        [
+            KINDS.index(r.kind),
+            r.stamp,
+            r.tick,
+            [_encode_ref(r.inputs.get(name), stream_index) for name in names],
+            sorted(r.stale),
+            sorted(r.late),
+            [None if e is None else [e.seq, e.stamp - r.stamp, e.digest] for e in r.outputs],
+            OUTCOMES.index(r.outcome),
+            [[d.input, stream_index(d.stream), d.incarnation, d.seq, d.stamp, d.reason, d.because] for d in r.drops],
+            dict(r.detail),
+            r.wall_start,
+            r.duration,
+        ]
+        for r in records
+    ]
+    first = records[0]
+    batch = {
+        "format": FORMAT,
+        "operator": first.operator,
+        "incarnation": first.incarnation,
+        "first": first.index,
+        "last": last,
+        "inputs": names,
+        "streams": list(streams),
+        "rows": rows,
+    }
+    data: bytes = msgpack.packb(batch, use_bin_type=True)
+    return data
+
+
+@dataclass(frozen=True, slots=True)
+class Batch:
+    """A decoded batch of consecutive firing records of one operator."""
+
+    operator: str
+    incarnation: int
+    last: bool
+    records: tuple[FiringRecord, ...]
+
+
+def decode_batch(data: bytes) -> Batch:
+    """Raises `FiringRecordError` for anything that `encode_batch` did not write."""
+    try:
+        batch = msgpack.unpackb(data, raw=False)
+        if batch["format"] != FORMAT:
+            raise FiringRecordError(f"firing records of format {batch['format']!r}; this version reads {FORMAT}")
+        operator, incarnation, first = batch["operator"], batch["incarnation"], batch["first"]
+        names, streams = batch["inputs"], batch["streams"]
+        records = tuple(
+            _record(operator, incarnation, first + offset, row, names, streams) for offset, row in enumerate(batch["rows"])
+        )
+    except FiringRecordError:
+        raise
+    except (ValueError, TypeError, KeyError, IndexError, msgpack.UnpackException) as error:
+        raise FiringRecordError(f"not a batch of firing records: {type(error).__name__}: {error}") from error
+    return Batch(operator, incarnation, bool(batch["last"]), records)
+
+
+def _record(operator: str, incarnation: int, index: int, row: list[Any], names: list[str], streams: list[str]) -> FiringRecord:
+    kind, stamp, tick, inputs, stale, late, outputs, outcome, drops, detail, wall_start, duration = row
+    return FiringRecord(
+        operator=operator,
+        incarnation=incarnation,
+        index=index,
+        kind=KINDS[kind],
+        stamp=stamp,
+        tick=bool(tick),
+        inputs={name: _decode_ref(ref, streams) for name, ref in zip(names, inputs, strict=True)},
+        stale=frozenset(stale),
+        late=frozenset(late),
+        outputs=tuple(None if e is None else Emission(e[0], stamp + e[1], e[2]) for e in outputs),
+        outcome=OUTCOMES[outcome],
+        drops=tuple(DropRecord(i, streams[s], *rest) for i, s, *rest in drops),
+        detail=detail,
+        wall_start=wall_start,
+        duration=duration,
+    )
+
+
+def _encode_ref(ref: InputRef, stream_index: Callable[[str], int]) -> list[Any] | None:
+    """nil, [0, stream, incarnation, seq], [1, runs of (stream, incarnation, first, more)...], [2, messages...]."""
+    match ref:
+        case None:
+            return None
+        case MessageRef():
+            return [0, stream_index(ref.stream), ref.incarnation, ref.seq]
+        case tuple():
+            return [1, *([stream_index(r.stream), r.incarnation, r.first_seq, r.last_seq - r.first_seq] for r in ref)]
+        case _:
+            return [2, *([stream_index(m.stream), m.incarnation, m.seq] for m in ref.values())]
+
+
+def _decode_ref(data: list[Any] | None, streams: list[str]) -> InputRef:
+    if data is None:
+        return None
+    tag, *rest = data
+    if tag == 0:
+        stream, incarnation, seq = rest
+        return MessageRef(streams[stream], incarnation, seq)
+    if tag == 1:
+        return tuple(RunRef(streams[s], i, first, first + more) for s, i, first, more in rest)
+    if tag == 2:
+        return {streams[s]: MessageRef(streams[s], i, seq) for s, i, seq in rest}
+    raise FiringRecordError(f"an input reference of kind {tag!r}; 0, 1 and 2 are known")

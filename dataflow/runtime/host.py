@@ -1,0 +1,539 @@
+"""A host: one process that runs one or more operators on one thread, between its inbox and its emitter.
+
+Zenoh's threads and the control thread only append to the inbox. The main thread takes from it, feeds the aligners, runs
+the firings that are decided, lets feeds admit what the window allows, and waits (bounded) when there is nothing to do.
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dataflow.graph.model import Graph, Node
+from dataflow.messages.base import Message
+from dataflow.recording import Recording
+from dataflow.runtime.control import Channel, ChannelClosed
+from dataflow.runtime.feed import Feed, LogFeed, Window
+from dataflow.runtime.firings import FiringRecord, encode_batch
+from dataflow.runtime.keys import firings_key
+from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner
+from dataflow.runtime.threads import limit_threads
+from dataflow.sync import NEVER, Entry
+from dataflow.transport import Bus, DecodeError, Envelope, Kind, NetworkConfig, TapServer, decode, encode
+
+IDLE_WAIT = 0.1
+REPORT_EVERY = 0.004
+PROBE_EVERY = 0.01
+BATCH_RECORDS = 64
+BATCH_SECONDS = 0.25
+PROMISE_EVERY = 8
+
+
+@dataclass(frozen=True, slots=True)
+class HostConfig:
+    """What the supervisor tells a host to be. Travels as plain values.
+
+    `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
+    are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`: whether a recorder
+    takes the firing records.
+    """
+
+    label: str
+    graph: dict[str, Any]
+    nodes: list[str]
+    publish: dict[str, int]
+    subscribe: list[str]
+    listen: list[str]
+    connect: list[str]
+    replay: dict[str, Any] | None = None
+    window: tuple[int, int] = (256, 64 << 20)
+    rate: float | None = None
+    paranoid: bool = False
+    firings: bool = False
+
+
+class HostFailure(RuntimeError):
+    """A failure of the host itself, not of one of its operators."""
+
+
+class Outlet:
+    """The emitter of all operators of a host: to local aligners by reference, to other hosts and taps as envelopes."""
+
+    def __init__(self, host: Host) -> None:
+        self.host = host
+        self.sent = 0
+        self._held: list[tuple[str, Envelope | bytes]] | None = []
+        self._logs: dict[str, list[FiringRecord]] = {}
+        self._flushed = time.monotonic()
+
+    def release(self) -> None:
+        """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
+        held, self._held = self._held or [], None
+        for stream, envelope in held:
+            self._send(stream, envelope)
+
+    def _send(self, stream: str, envelope: Envelope | bytes) -> None:
+        publisher = self.host.remote.get(stream)
+        if publisher is None:
+            return
+        if self._held is not None:
+            self._held.append((stream, envelope))
+            return
+        self.sent += self.host.config.publish[stream]
+        if isinstance(envelope, bytes):
+            publisher.put_bytes(envelope)
+        else:
+            publisher.put(envelope)
+
+    def message(self, stream: str, entry: Entry) -> None:
+        for runner in self.host.consumers.get(stream, ()):
+            runner.push(stream, entry)
+        message: Message = entry.value
+        envelope = Envelope(
+            Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
+        )
+        if stream in self.host.static:
+            self.host.bus.declare_static(stream, encode(envelope))
+        self._send(stream, envelope)
+        if self.host.taps.active:
+            self.host.taps.offer(stream, envelope)
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        for runner in self.host.consumers.get(stream, ()):
+            runner.advance(stream, frontier)
+        if stream in self.host.remote:
+            self._send(stream, Envelope(Kind.FRONTIER, stream, 0, 0, frontier))
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        for runner in self.host.consumers.get(stream, ()):
+            runner.end(stream, final_stamp, reason)
+        final = NEVER if final_stamp is None else final_stamp
+        self._send(stream, Envelope(Kind.END, stream, 0, 0, final, reason=reason))
+
+    def record(self, record: FiringRecord) -> None:
+        if self.host.config.firings:
+            log = self._logs.setdefault(record.operator, [])
+            log.append(record)
+            if len(log) >= BATCH_RECORDS or record.kind == "finish":
+                self.flush(record.operator, last=record.kind == "finish")
+
+    def flush(self, operator: str, *, last: bool = False) -> None:
+        log = self._logs.get(operator)
+        if log:
+            self._send(firings_key(self.host.graph.namespace, operator), encode_batch(log, last=last))
+            log.clear()
+
+    def flush_due(self) -> None:
+        """Sends the batches that have waited long enough."""
+        if time.monotonic() - self._flushed >= BATCH_SECONDS:
+            self.flush_all()
+
+    def flush_all(self) -> None:
+        self._flushed = time.monotonic()
+        for operator in self._logs:
+            self.flush(operator)
+
+
+class Host:
+    """Runs its operators until they end, it is told to leave, or something fails."""
+
+    def __init__(self, config: HostConfig, channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None:
+        self.config, self.channel, self.inbox = config, channel, inbox
+        self.graph = Graph.from_json(config.graph)
+        self.static = frozenset(name for name, stream in self.graph.streams.items() if stream.static)
+        self.received = 0
+        self.malformed = 0
+        self.consumers: dict[str, list[OperatorRunner]] = {}
+        self.remote: dict[str, Any] = {}
+        self.outlet = Outlet(self)
+        self.runners: list[OperatorRunner] = []
+        self.sources: list[SourceRunner] = []
+        self.feeds: list[Feed] = []
+        self.live: list[SourceRunner] = []
+        self.window = Window(*config.window)
+        self._expected: dict[str, tuple[int, int]] = {}
+        self._probed: set[str] = set()
+        self._probing = False
+        self._released = False
+        self._start: tuple[int, float] | None = None
+        self._reported: dict[str, int] = {}
+        self._report_due = 0.0
+        self._ended = False
+        self._stopping = threading.Event()
+        self._left = False
+        self._since_promise = 0
+        self._step_done = 0
+
+    # Life
+
+    def open(self) -> None:
+        """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
+        network = self.graph.network
+        self.bus = Bus(
+            NetworkConfig(
+                listen=tuple(self.config.listen),
+                connect=tuple(self.config.connect),
+                shared_memory=network.shared_memory,
+            )
+        )
+        self.taps = TapServer(self.bus, self.graph.namespace)
+        for stream in self.config.publish:
+            self.remote[stream] = self.bus.publisher(stream)
+        for stream in self.config.subscribe:
+            self.bus.subscribe(stream, self._receiver(stream))
+        self.channel.send("joined")
+        for name in self.config.nodes:
+            self._make(self.graph.nodes[name])
+        if self.config.replay is not None:
+            self._make_log(self.config.replay)
+        limit_threads(self.graph.threads)
+        for runner in (*self.sources, *self.runners):
+            runner.operator_alive = self.bus.alive(self.graph.namespace, runner.node.name)
+        for maker in (*self.sources, *self.runners):
+            maker.setup()
+        for feed in self.feeds:
+            if isinstance(feed, LogFeed):
+                feed.setup()
+        first = [stamp for feed in self.feeds if (stamp := feed.look_ahead()) is not None]
+        lengths = [n for source in self.sources if (n := source.source.length()) is not None]
+        self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
+
+    def _receiver(self, stream: str) -> Callable[[Any], None]:
+        put = self.inbox.put
+
+        def receive(payload: Any) -> None:
+            put(("envelope", stream, payload))
+
+        return receive
+
+    def _make(self, node: Node) -> None:
+        if node.source:
+            source = SourceRunner(node, self.outlet, seed=self.graph.seed)
+            self.sources.append(source)
+            if source.source.live:
+                self.live.append(source)
+            else:
+                self.feeds.append(source)
+            return
+        runner = OperatorRunner(
+            node, self.outlet, static=self.static, seed=self.graph.seed, paranoid=self.config.paranoid
+        )
+        self.runners.append(runner)
+        for stream in {s for streams in node.inputs.values() for s in streams}:
+            self.consumers.setdefault(stream, []).append(runner)
+
+    def _make_log(self, replay: Mapping[str, Any]) -> None:
+        recording = Recording(replay["path"])
+        nodes = {self.graph.streams[s].node for s in replay["streams"]}
+        self.feeds.append(
+            LogFeed(
+                recording,
+                {s: self.graph.streams[s].node for s in replay["streams"]},
+                self.outlet,
+                ports={n: tuple(self.graph.nodes[n].outputs.values()) for n in nodes},
+                finals=replay["finals"],
+                start=replay["start"],
+                end=replay["end"],
+            )
+        )
+
+    def run(self) -> None:
+        """The main loop; returns when the supervisor has let the host go."""
+        while not self._left:
+            if self._probing:
+                self._probe()
+            self._take(self._wait_time())
+            worked = self._work()
+            self.outlet.flush_due()
+            self._report(idle=not worked)
+
+    def _wait_time(self) -> float:
+        if self._probing:
+            return PROBE_EVERY
+        due = self._next_due()
+        return IDLE_WAIT if due is None else max(0.0, min(IDLE_WAIT, due))
+
+    def _take(self, timeout: float) -> None:
+        """Handles everything in the inbox; waits up to `timeout` for the first."""
+        try:
+            item = self.inbox.get(timeout=timeout) if timeout > 0 else self.inbox.get_nowait()
+            while True:
+                self._handle(item)
+                item = self.inbox.get_nowait()
+        except queue.Empty:
+            return
+
+    def _handle(self, item: tuple[Any, ...]) -> None:
+        match item:
+            case ("envelope", stream, payload):
+                self._receive(stream, payload)
+            case ("control", kind, fields):
+                self._control(kind, fields)
+            case ("source", runner, step):
+                self._from_live(runner, step)
+            case ("source_failed", failure):
+                raise failure
+
+    # Streams
+
+    def _receive(self, stream: str, payload: Any) -> None:
+        try:
+            envelope = decode(payload)
+        except DecodeError as error:
+            self.malformed += 1
+            raise HostFailure(f"stream {stream!r} carried a malformed envelope: {error}") from error
+        if envelope.kind is Kind.PROBE:
+            if stream not in self._probed:
+                self._probed.add(stream)
+                self.channel.send("seen", stream=stream)
+            return
+        self.received += 1
+        runners = self.consumers.get(stream, ())
+        match envelope.kind:
+            case Kind.MESSAGE:
+                self._check_gap(stream, envelope)
+                message = envelope.message
+                assert message is not None
+                entry = Entry(
+                    envelope.stamp, message, envelope.seq, envelope.incarnation, message.digest(), stream
+                )
+                for runner in runners:
+                    runner.push(stream, entry)
+            case Kind.FRONTIER:
+                for runner in runners:
+                    runner.advance(stream, envelope.stamp)
+            case Kind.END:
+                for runner in runners:
+                    runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
+
+    def _check_gap(self, stream: str, envelope: Envelope) -> None:
+        incarnation, expected = self._expected.get(stream, (envelope.incarnation, envelope.seq))
+        if (envelope.incarnation, envelope.seq) != (incarnation, expected) and incarnation == envelope.incarnation:
+            raise HostFailure(
+                f"stream {stream!r} lost messages on its way to host {self.config.label!r}: "
+                f"number {expected} was due, {envelope.seq} came"
+            )
+        self._expected[stream] = (envelope.incarnation, envelope.seq + 1)
+
+    # Work
+
+    def _work(self) -> bool:
+        """Runs what is decided; then, when nothing is, admits from the feeds. True when anything was done."""
+        worked = False
+        while self.inbox.empty():
+            if any([runner.step() for runner in reversed(self.runners)]):
+                worked = True
+            elif self._admit():
+                worked = True
+            else:
+                self._keep_promises()
+                if not any([runner.step() for runner in reversed(self.runners)]):
+                    break
+            self._report(idle=False)
+        if not self._ended and self._released:
+            self._end_if_done()
+        return worked
+
+    def _admit(self) -> bool:
+        if not self._released or self._stopping.is_set():
+            return False
+        due = self._oldest()
+        if due is None or self.window.full or self._too_early(due[0]):
+            return False
+        stamp, feed = due
+        messages, nbytes = feed.admit()
+        self.window.add(stamp, messages, nbytes)
+        self._since_promise += 1
+        if self._since_promise >= PROMISE_EVERY:
+            self._keep_promises()
+        if feed.look_ahead() is None:
+            feed.finish(getattr(feed, "END_REASON", "end of source"))
+        return True
+
+    def _keep_promises(self) -> None:
+        self._since_promise = 0
+        for feed in self.feeds:
+            if not feed.ended:
+                feed.promise()
+
+    def _oldest(self) -> tuple[int, Feed] | None:
+        """The feed whose next step has the oldest stamp, in graph order at a tie."""
+        best: tuple[int, Feed] | None = None
+        for feed in self.feeds:
+            if feed.ended:
+                continue
+            stamp = feed.look_ahead()
+            if stamp is None:
+                feed.finish("end of source")
+            elif best is None or stamp < best[0]:
+                best = (stamp, feed)
+        return best
+
+    def _too_early(self, stamp: int) -> bool:
+        return self._start is not None and self._due_in(stamp) > 0
+
+    def _due_in(self, stamp: int) -> float:
+        assert self._start is not None
+        first, at = self._start
+        assert self.config.rate is not None
+        return at + (stamp - first) * 1e-9 / self.config.rate - time.time()
+
+    def _next_due(self) -> float | None:
+        """Seconds until the next paced step; None when nothing waits for the clock."""
+        if self._start is None or not self._released or self.window.full:
+            return None
+        stamps = [s for feed in self.feeds if not feed.ended and (s := feed.look_ahead()) is not None]
+        return self._due_in(min(stamps)) if stamps else None
+
+    # Live sources
+
+    def _start_live(self, runner: SourceRunner) -> None:
+        def read() -> None:
+            try:
+                while not self._stopping.is_set():
+                    step = runner.pull()
+                    self.inbox.put(("source", runner, step))
+                    if step is None:
+                        return
+            except OperatorFailure as failure:
+                self.inbox.put(("source_failed", failure))
+
+        threading.Thread(target=read, name=f"source {runner.node.name}", daemon=True).start()
+
+    def _from_live(self, runner: SourceRunner, step: dict[str, Message] | None) -> None:
+        if runner.ended:
+            return
+        if step is None:
+            runner.finish()
+            return
+        if self.window.full:
+            runner.overflow += 1
+            return
+        messages, nbytes = runner.emit(step)
+        runner.promise()
+        self.window.add(runner.last, messages, nbytes)
+
+    # Progress
+
+    def _report(self, *, idle: bool) -> None:
+        now = time.monotonic()
+        if not idle and now < self._report_due:
+            return
+        done = {r.node.name: r.done for r in self.runners if self._reported.get(r.node.name) != r.done}
+        firings = sum(r.firings for r in self.runners) + sum(f.firings for f in self.feeds)
+        if not done and firings == self._step_done:
+            return
+        self._report_due = now + REPORT_EVERY
+        self._reported.update(done)
+        self._step_done = firings
+        self.channel.send("progress", done=done, counts=self._counts())
+
+    def _counts(self) -> dict[str, list[int]]:
+        """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
+        counts = {}
+        for source in self.sources:
+            counts[source.node.name] = [source.firings, source.ports.emitted, source.overflow, source.busy_ns, source.last]
+        for runner in self.runners:
+            drops = sum(runner.aligner.drops.values())
+            counts[runner.node.name] = [runner.firings, runner.ports.emitted, drops, runner.busy_ns, runner.done]
+        for feed in self.feeds:
+            if isinstance(feed, LogFeed):
+                counts["@log"] = [feed.firings, sum(n for _, n, _ in feed.counts()), 0, feed.busy_ns, feed.last]
+        return counts
+
+    def _end_if_done(self) -> None:
+        if all(f.ended for f in self.feeds) and all(s.ended for s in self.live) and all(r.ended for r in self.runners):
+            self._ended = True
+            self.outlet.flush_all()
+            self._report(idle=True)
+            self.channel.send("ended", report=self._final_report())
+
+    def _final_report(self) -> dict[str, Any]:
+        streams: dict[str, list[Any]] = {}
+        for maker in (*self.sources, *self.runners):
+            for state in maker.ports.states.values():
+                assert state.digest is not None
+                streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
+        for feed in self.feeds:
+            if isinstance(feed, LogFeed):
+                streams |= {name: [count, digest] for name, count, digest in feed.counts()}
+        return {
+            "streams": streams,
+            "counts": self._counts(),
+            "drops": {
+                r.node.name: [[i, why, n] for (i, why), n in sorted(r.aligner.drops.items())] for r in self.runners
+            },
+            "summaries": {r.node.name: dict(s) for r in self.runners if (s := r.operator.summary())},
+            "transport": self.bus.counters(),
+        }
+
+    # Control
+
+    def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
+        match kind:
+            case "probe":
+                self._probing = True
+            case "go":
+                self._probing = False
+                self._released = True
+                self.outlet.release()
+                if self.config.rate is not None and fields["first"] is not None:
+                    self._start = (fields["first"], fields["at"])
+                for runner in self.live:
+                    self._start_live(runner)
+            case "covered":
+                self.window.cover(fields["frontier"])
+            case "grow":
+                self.window.grow()
+            case "poll":
+                self.outlet.flush_all()
+                idle = self.inbox.empty() and self._next_due() is None and all(s.ended for s in self.live)
+                full = self.window.full and any(not f.ended for f in self.feeds)
+                self.channel.send(
+                    "state", round=fields["round"], idle=idle, sent=self.outlet.sent, received=self.received, full=full,
+                    waiting=self._waiting(),
+                )
+            case "stop":
+                self._stopping.set()
+                for feed in self.feeds:
+                    feed.finish("interrupted")
+                for source in self.live:
+                    source.finish("interrupted")
+            case "leave":
+                self._left = True
+            case "lost":
+                raise ChannelClosed("the supervisor is gone")
+
+    def _waiting(self) -> dict[str, list[Any]]:
+        """Per operator that is not done: the stamp it cannot decide, and the inputs (with frontiers) that hold it up."""
+        waiting: dict[str, list[Any]] = {}
+        for runner in self.runners:
+            if not runner.ended:
+                held = runner.aligner.waiting()
+                waiting[runner.node.name] = [None, {}] if held is None else [held.stamp, dict(held.needs)]
+        return waiting
+
+    def _probe(self) -> None:
+        for publisher in self.remote.values():
+            publisher.probe()
+
+    def close(self) -> None:
+        """Closes every operator and the network; the first error is raised when all are closed."""
+        self._stopping.set()
+        first: Exception | None = None
+        for maker in (*self.sources, *self.runners):
+            try:
+                maker.operator.close()
+            except Exception as error:
+                first = first or OperatorFailure(maker.node.name, "close()", error)
+        for feed in self.feeds:
+            if isinstance(feed, LogFeed):
+                feed.close()
+        self.taps.close()
+        self.bus.close()
+        if first is not None:
+            raise first

@@ -1,0 +1,8 @@
+"""The runtime's own keys. They lie in verbatim chunks, which no wildcard matches."""
+
+from __future__ import annotations
+
+
+def firings_key(namespace: str, operator: str) -> str:
+    """Where an operator's firing records travel and are recorded."""
+    return f"{namespace}/@/firings/{operator}"

@@ -1,0 +1,65 @@
+"""The recorder: whole streams and firing records into one MCAP file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dataflow.graph.model import Graph
+from dataflow.messages.base import Message
+from dataflow.recording import RecordingWriter
+from dataflow.runtime.sink import stream_types
+
+ENDS = "dataflow:ends"
+OUTCOME = "dataflow:outcome"
+
+
+class RecorderSink:
+    """Writes everything it is given; how streams ended and how the run ended go into metadata when it closes."""
+
+    def __init__(self, path: Path, graph: Graph, streams: list[str], options: Mapping[str, Any]) -> None:
+        self.path = path
+        self.graph = graph
+        self.writer = RecordingWriter(
+            path,
+            metadata=options["metadata"],
+            namespace=graph.namespace,
+            compression=options["compression"],
+            overwrite=options["overwrite"],
+        )
+        self._added: set[str] = set()
+        self._ends: dict[str, dict[str, Any]] = {}
+        self.messages = 0
+        for stream in streams:
+            types = stream_types(graph, stream)
+            if len(types) == 1:
+                self._add(stream, types[0])
+
+    def _add(self, stream: str, message_type: type[Message]) -> None:
+        made = self.graph.streams[stream]
+        extra = {"operator": made.node, "port": made.port}
+        self.writer.add_stream(stream, message_type, static=made.static, extra=extra)
+        self._added.add(stream)
+
+    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
+        if stream not in self._added:
+            self._add(stream, type(message))
+        self.messages += 1
+        self.writer.write(stream, message, seq=seq, incarnation=incarnation)
+
+    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
+        self.writer.write_firings(operator, stamp, payload)
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self._ends[stream] = {"final": final_stamp, "reason": reason}
+
+    def flush(self) -> None:
+        self.writer.flush()
+
+    def close(self, outcome: str) -> Mapping[str, Any]:
+        self.writer.add_metadata(ENDS, {stream: json.dumps(end) for stream, end in sorted(self._ends.items())})
+        self.writer.add_metadata(OUTCOME, {"outcome": outcome})
+        self.writer.close()
+        return {"path": str(self.path), "messages": self.messages, "bytes": self.path.stat().st_size}

@@ -1,0 +1,77 @@
+"""Plans a replay: recorded streams replace the sources that made them, everything else runs again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from dataflow.graph import load_bundle
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.runtime.plan import LogPlan
+from dataflow.runtime.recorder import ENDS
+
+GRAPH = "dataflow:graph"
+
+
+class ReplayError(ValueError):
+    """A recording that cannot drive a graph: says which stream is missing and what would help."""
+
+
+def recorded_graph(recording: Recording) -> Graph:
+    """The graph that made a recording. Raises `ReplayError` when it does not hold one."""
+    bundle = recording.metadata.get(GRAPH, {}).get("bundle")
+    if bundle is None:
+        raise ReplayError(f"{recording.path} does not hold the graph that made it: name one with --graph")
+    return load_bundle(bundle)
+
+
+def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
+    """What a recording must hold so that its graph can be loaded again."""
+    return {GRAPH: {"name": graph.name, "bundle": graph.bundle(), "text": graph.text}}
+
+
+def plan_replay(
+    recording: Recording, graph: Graph, *, start: float | None = None, end: float | None = None
+) -> LogPlan:
+    """Which recorded streams stand in for which sources. `start`, `end`: seconds from the recording's first message."""
+    streams: list[str] = []
+    for node in graph.sources():
+        outputs = tuple(node.outputs.values())
+        recorded = [s for s in outputs if s in recording.streams]
+        if not recorded:
+            raise ReplayError(
+                f"{recording.path}: no stream of source {node.name!r} is in the recording "
+                f"(looked for {', '.join(outputs)}; it holds {', '.join(recording.streams) or 'none'})"
+            )
+        missing = [s for s in outputs if s not in recording.streams and graph.consumers(s)]
+        if missing:
+            raise ReplayError(
+                f"{recording.path}: stream {missing[0]!r} of source {node.name!r} was not recorded, "
+                f"but {graph.consumers(missing[0])[0][0].name!r} takes it; record it, or leave that operator out"
+            )
+        for stream in recorded:
+            info = recording.streams[stream]
+            wanted = graph.streams[stream].types
+            if info.message_type is None or info.message_type.SCHEMA not in wanted:
+                raise ReplayError(
+                    f"{recording.path}: stream {stream!r} holds {info.schema}, the graph's source emits "
+                    f"{' | '.join(wanted)}"
+                )
+        streams += recorded
+    if not streams:
+        raise ReplayError(f"graph {graph.name!r} has no sources to replace")
+    first = min((i.first for s in streams if (i := recording.streams[s]).first is not None and not i.static), default=0)
+    return LogPlan(
+        Path(recording.path),
+        tuple(sorted(streams)),
+        finals=_finals(recording.metadata.get(ENDS, {}), streams),
+        start=None if start is None else first + round(start * 1e9),
+        end=None if end is None else first + round(end * 1e9),
+    )
+
+
+def _finals(ends: Mapping[str, str], streams: list[str]) -> dict[str, int]:
+    known = {s: json.loads(ends[s]) for s in streams if s in ends}
+    return {s: end["final"] for s, end in known.items() if end["final"] is not None}

@@ -1,0 +1,392 @@
+"""Runs one operator: its aligner decides, `process()` works, what comes out is checked, numbered and recorded.
+
+A runner is single-threaded and knows nothing of processes and keys: messages are pushed in by stream name, and what is
+emitted goes to an `Emitter`. Hosts, tests (`dataflow.testing.play`) and re-execution all drive this one class.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from dataflow.graph.model import Node
+from dataflow.messages.base import Message
+from dataflow.messages.digest import StreamDigest
+from dataflow.operator import Context, Operator, OperatorSpec, OutputError, OutputPort, Outputs, Source, outputs_of
+from dataflow.runtime.align import align_spec
+from dataflow.runtime.firings import DropRecord, Emission, FiringRecord, Kind
+from dataflow.runtime.seeding import firing_seed, seed_generators
+from dataflow.sync import FOREVER, NEVER, Aligner, Entry, Firing, InputValue, refs_of
+
+
+class OperatorFailure(RuntimeError):
+    """An operator raised or broke its contract. Carries its name, the firing and the operator's own traceback."""
+
+    def __init__(self, operator: str, when: str, error: BaseException) -> None:
+        self.operator, self.when = operator, when
+        self.summary = f"{type(error).__name__}: {error}"
+        self.traceback = "".join(traceback.format_exception(error))
+        super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
+
+
+class InputMutated(RuntimeError):
+    """An operator changed the memory of a message it was given."""
+
+
+class Emitter(Protocol):
+    """Where a runner's output goes. Calls come in stream order."""
+
+    def message(self, stream: str, entry: Entry) -> None:
+        """A message was emitted; `entry.value` is the message."""
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        """No later message of the stream has a stamp ≤ `frontier`."""
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        """The stream has ended."""
+
+    def record(self, record: FiringRecord) -> None:
+        """A firing was made; called after its messages were emitted."""
+
+
+@dataclass(slots=True)
+class PortState:
+    """One output port: its stream, the next sequence number, its last stamp and what it has promised."""
+
+    port: OutputPort
+    stream: str
+    incarnation: int = 0
+    seq: int = 0
+    last: int = NEVER
+    promised: int = NEVER
+    digest: StreamDigest | None = None
+
+    def __post_init__(self) -> None:
+        self.digest = self.digest or StreamDigest()
+
+
+class OutputPorts:
+    """The output ports of one operator: rule 5 of the time model, sequence numbers and frontiers."""
+
+    def __init__(self, node: Node, spec: OperatorSpec, emitter: Emitter) -> None:
+        self.node, self.emitter = node, emitter
+        self.states = {name: PortState(port, node.outputs[name]) for name, port in spec.outputs.items()}
+        self.emitted = 0
+
+    def emit(self, messages: Mapping[str, Message], firing: int) -> tuple[Emission | None, ...]:
+        """Publishes what one firing emitted. Raises `OutputError` for a stamp that the port may not carry."""
+        for name, message in messages.items():
+            state = self.states[name]
+            earliest = firing - state.port.lag
+            if message.stamp < earliest:
+                allowed = f"at or after the firing's {firing}" + (
+                    f" less its lag of {state.port.lag} ns" if state.port.lag else ""
+                )
+                raise OutputError(f"{self.node.name}.{name} emitted stamp {message.stamp}; it must lie {allowed}")
+            if message.stamp <= state.last:
+                raise OutputError(
+                    f"{self.node.name}.{name} emitted stamp {message.stamp} after {state.last}: "
+                    "the stamps of a stream strictly increase"
+                )
+        emissions: list[Emission | None] = []
+        for name, state in self.states.items():
+            emitted = messages.get(name)
+            if emitted is None:
+                emissions.append(None)
+                continue
+            digest = emitted.digest()
+            assert state.digest is not None
+            state.digest.update(digest)
+            entry = Entry(emitted.stamp, emitted, state.seq, state.incarnation, digest, state.stream)
+            state.last = state.promised = emitted.stamp
+            emissions.append(Emission(state.seq, emitted.stamp, digest))
+            state.seq += 1
+            self.emitted += 1
+            self.emitter.message(state.stream, entry)
+        return tuple(emissions)
+
+    def promise(self, frontier: int) -> None:
+        """Raises the frontier of every dynamic port to `frontier` less its lag, where that is news."""
+        for state in self.states.values():
+            if state.port.static or frontier in (NEVER, FOREVER):
+                continue
+            trailing = frontier - state.port.lag
+            if trailing > state.promised:
+                state.promised = trailing
+                self.emitter.frontier(state.stream, trailing)
+
+    def end(self, final: int | None, reason: str) -> None:
+        """Ends every dynamic port at `final`, or at what it emitted or promised later."""
+        for state in self.states.values():
+            if state.promised != FOREVER:
+                reached = max(NEVER if final is None else final, state.promised)
+                state.promised = FOREVER
+                self.emitter.end(state.stream, None if reached == NEVER else reached, reason)
+
+
+class Recorder:
+    """Numbers the firing records of one operator and hands them on."""
+
+    def __init__(self, operator: str, emitter: Emitter, incarnation: int = 0) -> None:
+        self.operator, self.emitter, self.incarnation, self.index = operator, emitter, incarnation, 0
+
+    def add(self, kind: Kind, stamp: int, started: int, **fields: Any) -> None:
+        duration = time.time_ns() - started
+        self.emitter.record(
+            FiringRecord(
+                self.operator, self.incarnation, self.index, kind, stamp, wall_start=started, duration=duration, **fields
+            )
+        )
+        self.index += 1
+
+
+def set_up(operator: Operator, ports: OutputPorts, records: Recorder, node: Node, seed: int) -> None:
+    """`setup()`, then the static outputs; both are recorded. Raises `OperatorFailure`."""
+    started = time.time_ns()
+    try:
+        operator.rng = seed_generators(firing_seed(seed, node.name, NEVER))
+        operator.setup()
+        statics = dict(operator.static_outputs())
+        for name, message in statics.items():
+            port = operator.spec.outputs.get(name)
+            if port is None or not port.static:
+                raise OutputError(f"{node.name}: static_outputs() gave {name!r}, which is no static output port")
+            if not isinstance(message, port.types):
+                raise OutputError(f"{node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
+        emissions = ports.emit(statics, NEVER)
+        for state in ports.states.values():
+            if state.port.static:
+                ports.emitter.end(state.stream, None, "static")
+                state.promised = FOREVER
+    except Exception as error:
+        raise OperatorFailure(node.name, "setup()", error) from error
+    detail = {"params": dict(node.params), "files": dict(operator.files)}
+    records.add("setup", NEVER + 1, started, outputs=emissions, detail=detail)
+
+
+class OperatorRunner:
+    """One operator that has inputs, from `setup()` to its end."""
+
+    def __init__(
+        self,
+        node: Node,
+        emitter: Emitter,
+        *,
+        static: frozenset[str],
+        seed: int = 0,
+        paranoid: bool = False,
+        operator: Operator | None = None,
+    ) -> None:
+        self.node, self.seed, self.paranoid = node, seed, paranoid
+        self.operator = node.make() if operator is None else operator
+        self.spec = self.operator.spec
+        self.ports = OutputPorts(node, self.spec, emitter)
+        self.records = Recorder(node.name, emitter)
+        self.aligner = Aligner(align_spec(node, self.spec, static))
+        self.firings = 0
+        self.done = NEVER
+        self.ended = False
+        self.busy_ns = 0
+
+    def setup(self) -> None:
+        set_up(self.operator, self.ports, self.records, self.node, self.seed)
+
+    def push(self, stream: str, entry: Entry) -> None:
+        self.aligner.push(stream, entry)
+
+    def advance(self, stream: str, frontier: int) -> None:
+        self.aligner.advance(stream, frontier)
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self.aligner.end(stream, final_stamp, reason)
+
+    def step(self) -> bool:
+        """Makes the next firing if it is decided; False when there is none. Raises `OperatorFailure`."""
+        if self.ended:
+            return False
+        firing = self.aligner.poll()
+        if firing is None:
+            frontier = self.aligner.output_frontier()
+            self.ports.promise(frontier)
+            self.done = max(self.done, frontier)
+            return False
+        self.ports.promise(firing.stamp - 1)
+        self._fire(firing)
+        if firing.kind == "finish":
+            self.ended, self.done = True, FOREVER
+            self.ports.end(self.aligner.final_stamp(), "end of input")
+        return True
+
+    def _fire(self, firing: Firing) -> None:
+        started = time.time_ns()
+        kind: Kind = firing.kind
+        try:
+            self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, firing.stamp))
+            returned = self._call(firing)
+            messages = outputs_of(self.operator, returned)
+            if self.paranoid:
+                self._check_unchanged(firing)
+            emissions = self.ports.emit(messages, firing.stamp)
+        except Exception as error:
+            failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
+            self._record(kind, firing, started, (), failure.summary)
+            raise failure from error
+        self.firings += 1
+        self._record(kind, firing, started, emissions, None)
+        self.busy_ns += time.time_ns() - started
+
+    def _call(self, firing: Firing) -> Outputs:
+        if firing.kind == "finish":
+            return self.operator.finish()
+        arguments: dict[str, Any] = {
+            name: value_of(firing.inputs.get(name, () if port.kind == "batch" else None))
+            for name, port in self.spec.inputs.items()
+        }
+        if "context" in self.spec.process_takes:
+            arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
+        return self.operator.process(**arguments)
+
+    def _record(
+        self, kind: Kind, firing: Firing, started: int, outputs: tuple[Emission | None, ...], error: str | None
+    ) -> None:
+        self.records.add(
+            kind,
+            firing.stamp,
+            started,
+            tick=firing.tick,
+            inputs=refs_of(firing).inputs,
+            stale=firing.stale,
+            late=firing.late,
+            outputs=outputs,
+            outcome="ok" if error is None else "error",
+            drops=tuple(
+                DropRecord(d.input, d.stream, d.incarnation, d.seq, d.stamp, d.reason, d.because)
+                for d in self.aligner.take_drops()
+            ),
+            detail={} if error is None else {"error": error},
+        )
+
+    def _check_unchanged(self, firing: Firing) -> None:
+        for name, given in firing.inputs.items():
+            for entry in entries_of(given):
+                message: Message = entry.value
+                if message.compute_digest() != message.digest():
+                    raise InputMutated(
+                        f"{self.node.name} changed the memory of its input {name!r} "
+                        f"({message.SCHEMA} at stamp {message.stamp}); messages are immutable: copy before writing"
+                    )
+
+
+class SourceRunner:
+    """One source: `stream()` is read one step at a time, with one step of look-ahead."""
+
+    def __init__(self, node: Node, emitter: Emitter, *, seed: int = 0, operator: Source | None = None) -> None:
+        self.node, self.seed = node, seed
+        self.operator = node.make() if operator is None else operator
+        assert isinstance(self.operator, Source)
+        self.source: Source = self.operator
+        self.ports = OutputPorts(node, self.operator.spec, emitter)
+        self.records = Recorder(node.name, emitter)
+        self.firings = 0
+        self.ended = False
+        self.busy_ns = 0
+        self.overflow = 0
+        self.last = NEVER
+        self._steps = iter(())  # type: ignore[var-annotated]
+        self._next: dict[str, Message] | None = None
+
+    def setup(self) -> None:
+        set_up(self.operator, self.ports, self.records, self.node, self.seed)
+        try:
+            self._steps = iter(self.source.stream())
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "stream()", error) from error
+
+    def look_ahead(self) -> int | None:
+        """The stamp of the next step, or None at the end. Raises `OperatorFailure`."""
+        if self._next is None and not self.ended:
+            started = time.time_ns()
+            self._next = self.pull()
+            self.busy_ns += time.time_ns() - started
+        return None if self._next is None else step_stamp(self._next)
+
+    def pull(self) -> dict[str, Message] | None:
+        """Reads the source's next non-empty step; for live sources called on the reader's own thread."""
+        try:
+            for step in self._steps:
+                messages = outputs_of(self.operator, step)
+                if messages:
+                    stamps = {m.stamp for m in messages.values()}
+                    if len(stamps) != 1:
+                        raise OutputError(
+                            f"{self.node.name} yielded stamps {sorted(stamps)} together; one step of stream() has one stamp"
+                        )
+                    return messages
+        except Exception as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+        return None
+
+    def admit(self) -> tuple[int, int]:
+        """Emits the step that was looked at; returns how many messages and bytes it was."""
+        assert self._next is not None
+        step, self._next = self._next, None
+        return self.emit(step)
+
+    def promise(self) -> None:
+        """Every port is known up to the last step, so sparse ports hold nobody up."""
+        self.ports.promise(self.last)
+
+    def emit(self, step: Mapping[str, Message]) -> tuple[int, int]:
+        started = time.time_ns()
+        stamp = step_stamp(step)
+        if stamp <= self.last:
+            error = OutputError(f"{self.node.name} yielded stamp {stamp} after {self.last}: stamps strictly increase")
+            raise OperatorFailure(self.node.name, "stream()", error)
+        self.last = stamp
+        try:
+            emissions = self.ports.emit(step, stamp)
+        except OutputError as error:
+            raise OperatorFailure(self.node.name, "stream()", error) from error
+        self.firings += 1
+        self.records.add("fire", stamp, started, outputs=emissions)
+        return len(step), sum(m.nbytes() for m in step.values())
+
+    def finish(self, reason: str = "end of source") -> None:
+        """Ends the streams; the source is done."""
+        if not self.ended:
+            self.ended = True
+            self.records.add("finish", self.last, time.time_ns(), outputs=(None,) * len(self.ports.states))
+            self.ports.end(None if self.last == NEVER else self.last, reason)
+
+
+def step_stamp(step: Mapping[str, Message]) -> int:
+    return next(iter(step.values())).stamp
+
+
+def entries_of(given: InputValue) -> Sequence[Entry]:
+    """All entries an input was given, in the order `process()` sees them."""
+    match given:
+        case None:
+            return ()
+        case Entry():
+            return (given,)
+        case Mapping():
+            return tuple(given.values())
+        case _:
+            return given
+
+
+def value_of(given: InputValue) -> Any:
+    """What `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
+    match given:
+        case None:
+            return None
+        case Entry():
+            return given.value
+        case Mapping():
+            return {stream: entry.value for stream, entry in given.items()}
+        case _:
+            return tuple(entry.value for entry in given)

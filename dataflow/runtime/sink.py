@@ -1,0 +1,231 @@
+"""A sink host: a process that takes whole streams losslessly, in arrival order, without aligning them.
+
+The recorder is one, and so is the writer of a viewer file. What they have taken counts towards the flow control of
+feeds, so neither can be outrun.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from dataflow.graph.model import Graph
+from dataflow.messages.base import Message, message_type
+from dataflow.runtime.control import Channel, ChannelClosed
+from dataflow.runtime.firings import decode_batch
+from dataflow.runtime.keys import firings_key
+from dataflow.sync import FOREVER, NEVER
+from dataflow.transport import Bus, DecodeError, Kind, NetworkConfig, decode
+from dataflow.transport.codec import MAGIC
+
+IDLE_WAIT = 0.1
+REPORT_EVERY = 0.01
+FLUSH_EVERY = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class SinkConfig:
+    """What the supervisor tells a sink host to be: `kind` is "record" or "view", `options` belong to the kind."""
+
+    label: str
+    kind: str
+    graph: dict[str, Any]
+    streams: list[str]
+    firings: list[str]
+    connect: list[str]
+    options: dict[str, Any]
+
+
+class StreamSink(Protocol):
+    """What a sink host feeds."""
+
+    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None: ...
+
+    def firings(self, operator: str, stamp: int, payload: bytes) -> None: ...
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
+
+    def flush(self) -> None: ...
+
+    def close(self, outcome: str) -> Mapping[str, Any]:
+        """Completes the output; `outcome` is "complete" or says why the run ended. Returns facts about what was written."""
+
+
+class SinkFailure(RuntimeError):
+    """A stream reached the sink damaged, or the sink could not store it."""
+
+
+class SinkHost:
+    """Takes streams until all have ended or the supervisor says so."""
+
+    def __init__(
+        self,
+        config: SinkConfig,
+        channel: Channel,
+        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        make_sink: Callable[[SinkConfig, Graph], StreamSink],
+    ) -> None:
+        self.config, self.channel, self.inbox = config, channel, inbox
+        self.graph = Graph.from_json(config.graph)
+        self.make_sink = make_sink
+        self.frontiers = {s: NEVER for s in config.streams}
+        self.firings_open = {firings_key(self.graph.namespace, o): o for o in config.firings}
+        self.sink: StreamSink | None = None
+        self.received = 0
+        self.written = 0
+        self._expected: dict[str, tuple[int, int]] = {}
+        self._probed: set[str] = set()
+        self._done = NEVER
+        self._report_due = 0.0
+        self._flush_due = 0.0
+        self._busy_ns = 0
+        self._ended = False
+        self._left = False
+        self._outcome = "the supervisor is gone"
+
+    def open(self) -> None:
+        self.bus = Bus(
+            NetworkConfig(
+                listen=(), connect=tuple(self.config.connect), shared_memory=self.graph.network.shared_memory
+            )
+        )
+        for key in (*self.frontiers, *self.firings_open):
+            self.bus.subscribe(key, self._receiver(key))
+        self.channel.send("joined")
+        self.sink = self.make_sink(self.config, self.graph)
+        self.channel.send("ready", first=None, steps=None)
+
+    def _receiver(self, key: str) -> Callable[[Any], None]:
+        put = self.inbox.put
+
+        def receive(payload: Any) -> None:
+            put(("envelope", key, payload))
+
+        return receive
+
+    def run(self) -> None:
+        assert self.sink is not None
+        while not self._left:
+            idle = False
+            try:
+                item = self.inbox.get(timeout=IDLE_WAIT)
+            except queue.Empty:
+                idle = True
+            else:
+                self._handle(item)
+            now = time.monotonic()
+            if now >= self._flush_due:
+                self._flush_due = now + FLUSH_EVERY
+                self.sink.flush()
+            if idle or self.inbox.empty() or now >= self._report_due:
+                self._report(now)
+
+    def _handle(self, item: tuple[Any, ...]) -> None:
+        match item:
+            case ("envelope", key, payload):
+                started = time.perf_counter_ns()
+                self._receive(key, payload)
+                self._busy_ns += time.perf_counter_ns() - started
+            case ("control", kind, fields):
+                self._control(kind, fields)
+
+    def _receive(self, key: str, payload: Any) -> None:
+        assert self.sink is not None
+        if key in self.firings_open and bytes(payload[: len(MAGIC)]) != MAGIC:
+            self.received += 1
+            data = bytes(payload)
+            batch = decode_batch(data)
+            self.sink.firings(batch.operator, batch.records[-1].stamp, data)
+            if batch.last:
+                self.firings_open.pop(key)
+            return
+        try:
+            envelope = decode(payload)
+        except DecodeError as error:
+            raise SinkFailure(f"stream {key!r} carried a malformed envelope: {error}") from error
+        match envelope.kind:
+            case Kind.PROBE:
+                if key not in self._probed:
+                    self._probed.add(key)
+                    self.channel.send("seen", stream=key)
+                return
+            case Kind.MESSAGE:
+                incarnation, expected = self._expected.get(key, (envelope.incarnation, envelope.seq))
+                if incarnation == envelope.incarnation and expected != envelope.seq:
+                    raise SinkFailure(f"stream {key!r} lost messages: number {expected} was due, {envelope.seq} came")
+                self._expected[key] = (envelope.incarnation, envelope.seq + 1)
+                assert envelope.message is not None
+                self.sink.message(key, envelope.message, envelope.seq, envelope.incarnation)
+                self.written += 1
+                self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
+            case Kind.FRONTIER:
+                self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
+            case Kind.END:
+                self.frontiers[key] = FOREVER
+                self.sink.end(key, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
+        self.received += 1
+
+    def _report(self, now: float) -> None:
+        dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
+        done = min(dynamic, default=FOREVER)
+        if done != self._done:
+            self._done = done
+            self._report_due = now + REPORT_EVERY
+            self.channel.send("progress", done={self.config.label: done}, counts=self._counts())
+        if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
+            self._ended = True
+            self.channel.send("ended", report={"counts": self._counts()})
+
+    def _counts(self) -> dict[str, list[int]]:
+        return {self.config.label: [0, self.written, 0, self._busy_ns, self._done]}
+
+    def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
+        match kind:
+            case "poll":
+                self.channel.send(
+                    "state",
+                    round=fields["round"],
+                    idle=self.inbox.empty(),
+                    sent=0,
+                    received=self.received,
+                    full=False,
+                    waiting={},
+                )
+            case "leave":
+                self._outcome = fields["outcome"]
+                self._left = True
+            case "lost":
+                raise ChannelClosed("the supervisor is gone")
+
+    def close(self) -> Mapping[str, Any]:
+        facts: Mapping[str, Any] = {}
+        if self.sink is not None:
+            facts = self.sink.close(self._outcome)
+        self.bus.close()
+        return facts
+
+
+def recorder(config: SinkConfig, graph: Graph) -> StreamSink:
+    """The sink that writes an MCAP recording; options: `path`, `metadata`, `compression`."""
+    from dataflow.runtime.recorder import RecorderSink
+
+    return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)
+
+
+def viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
+    """The sink that writes a viewer file; options: `path`."""
+    from dataflow.runtime.viewer import ViewerFileSink
+
+    return ViewerFileSink(config.options["path"], graph, config.streams)
+
+
+SINKS: Mapping[str, Callable[[SinkConfig, Graph], StreamSink]] = {"record": recorder, "view": viewer_file}
+
+
+def stream_types(graph: Graph, stream: str) -> tuple[type[Message], ...]:
+    """The message classes that a stream may carry."""
+    return tuple(message_type(schema) for schema in graph.streams[stream].types)

@@ -1,0 +1,507 @@
+"""The supervisor: starts the hosts, holds the sources until every edge is known to work, watches, and tears down.
+
+It carries no data. Feeds learn from it how far the whole graph is done (flow control); it learns from the control
+channels, at once, when a process dies.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import IO, Any
+
+from dataflow.runtime.control import Channel, ChannelClosed, ready
+from dataflow.runtime.plan import RunPlan, expected_probes, host_plans
+from dataflow.runtime.threads import environment
+from dataflow.sync import FOREVER, NEVER
+from dataflow.transport import registry, reserve_endpoints
+from dataflow.transport.network import Reservation
+
+TICK = 0.05
+QUIET = 0.3
+LEAVE_TIMEOUT = 10.0
+MAX_WINDOW_DOUBLINGS = 12
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorCounts:
+    """Progress of one operator: counts so far, nanoseconds of work, and the stamp it has reached."""
+
+    firings: int = 0
+    emitted: int = 0
+    dropped: int = 0
+    busy_ns: int = 0
+    done: int = NEVER
+
+
+@dataclass(slots=True)
+class Status:
+    """What a progress display needs; updated in place while the graph runs."""
+
+    phase: str = "starting"
+    started: float = 0.0
+    operators: dict[str, OperatorCounts] = field(default_factory=dict)
+    host_of: dict[str, str] = field(default_factory=dict)
+    first: int | None = None
+    steps: int | None = None
+    notes: list[str] = field(default_factory=list)
+
+    @property
+    def covered(self) -> int:
+        return min((c.done for c in self.operators.values()), default=NEVER)
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """What a run came to.
+
+    `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples;
+    `summaries` holds what metrics sinks report; `wall` is in seconds from the release of the sources.
+    """
+
+    graph: str
+    streams: Mapping[str, tuple[int, str]]
+    operators: Mapping[str, OperatorCounts]
+    drops: Mapping[str, tuple[tuple[str, str, int], ...]]
+    summaries: Mapping[str, Mapping[str, Any]]
+    transport: Mapping[str, Mapping[str, int]]
+    files: Mapping[str, Mapping[str, Any]]
+    first: int | None
+    last: int | None
+    wall: float
+    interrupted: bool
+    notes: tuple[str, ...]
+
+    def digests(self) -> dict[str, str]:
+        return {stream: digest for stream, (_, digest) in sorted(self.streams.items())}
+
+
+class RunFailed(RuntimeError):
+    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words."""
+
+    def __init__(self, message: str, details: str = "", operator: str | None = None) -> None:
+        super().__init__(message)
+        self.details, self.operator = details, operator
+
+
+@dataclass(slots=True)
+class _Process:
+    label: str
+    nodes: tuple[str, ...]
+    process: subprocess.Popen[bytes]
+    channel: Channel
+    config: dict[str, Any]
+    kind: str
+    words: list[str] = field(default_factory=list)
+    reader: threading.Thread | None = None
+    joined: bool = False
+    ready: bool = False
+    unseen: set[str] = field(default_factory=set)
+    done: dict[str, int] = field(default_factory=dict)
+    report: dict[str, Any] | None = None
+    closed: dict[str, Any] | None = None
+    state: dict[str, Any] | None = None
+    gone: bool = False
+
+    def describe(self) -> str:
+        what = ", ".join(self.nodes)
+        return f"host {self.label!r}" + (f" (operators {what})" if what and what != self.label else "")
+
+
+class Supervisor:
+    """Runs one plan. `stop()` may be called from a signal handler; `status` may be read at any time."""
+
+    def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
+        self.plan = plan
+        self.status = Status()
+        self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
+        self._plans = host_plans(plan)
+        self._processes: dict[str, _Process] = {}
+        self._covered = NEVER
+        self._heard = time.monotonic()
+        self._round = 0
+        self._previous: tuple[int, int] | None = None
+        self._doublings = 0
+        self._stop_asked = 0
+        self._stop_sent = False
+        self._released_at = 0.0
+        self._asked_at = 0.0
+        self._reserved: Reservation | None = None
+        self._endpoints: dict[str, str] = {}
+
+    def stop(self) -> None:
+        """Asks for an orderly end: sources stop, everything drains. A second call ends at once."""
+        self._stop_asked += 1
+
+    def run(self) -> RunReport:
+        """Runs to the end. Raises `RunFailed` with the first cause; no process is left in either case."""
+        self.status.started = time.time()
+        try:
+            self._start()
+            self._barrier()
+            with self._registered():
+                self._release()
+                self._watch()
+            return self._finish()
+        except RunFailed as failure:
+            self._abandon(str(failure).splitlines()[0])
+            raise
+        except BaseException:
+            self._abandon("the supervisor was interrupted")
+            raise
+        finally:
+            if self._reserved is not None:
+                self._reserved.close()
+            self._reap()
+
+    # Start
+
+    def _start(self) -> None:
+        graph = self.plan.graph
+        self._reserved = reserve_endpoints(len(self._plans))
+        endpoints = dict(zip(self._plans, self._reserved.endpoints, strict=True))
+        for label, host in self._plans.items():
+            connect = [endpoints[up] for up in host.upstream]
+            common = {"label": label, "graph": graph.to_json(), "connect": connect}
+            if host.sink is not None:
+                config = common | {
+                    "kind": host.sink,
+                    "streams": list(host.streams),
+                    "firings": list(graph.nodes) if host.sink == "record" else [],
+                    "options": dict(host.options),
+                }
+            else:
+                config = common | {
+                    "nodes": list(host.nodes),
+                    "publish": dict(host.publish),
+                    "subscribe": list(host.subscribe),
+                    "listen": [endpoints[label], *(graph.network.listen if label == next(iter(self._plans)) else ())],
+                    "replay": self._log_config() if host.has_log else None,
+                    "window": list(self.plan.window),
+                    "rate": self.plan.rate,
+                    "paranoid": self.plan.paranoid,
+                    "firings": self.plan.record is not None,
+                }
+            self._spawn(label, host.nodes, "sink" if host.sink else "host", config)
+            for node in host.nodes or ((label,) if host.sink or host.has_log else ()):
+                self.status.operators[node] = OperatorCounts()
+                self.status.host_of[node] = label
+        for label, keys in expected_probes(self.plan, self._plans).items():
+            self._processes[label].unseen = keys
+        self._endpoints = endpoints
+
+    def _log_config(self) -> dict[str, Any]:
+        log = self.plan.log
+        assert log is not None
+        return {
+            "path": str(log.path),
+            "streams": list(log.streams),
+            "finals": dict(log.finals),
+            "start": log.start,
+            "end": log.end,
+        }
+
+    def _spawn(self, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]) -> None:
+        channel, descriptor = Channel.pair()
+        try:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dataflow.runtime.process", str(descriptor)],
+                pass_fds=(descriptor,),
+                env=environment(self.plan.graph.threads),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                process_group=0,
+            )
+        finally:
+            os.close(descriptor)
+        spawned = _Process(label, nodes, process, channel, config, kind)
+        self._processes[label] = spawned
+        assert process.stdout is not None
+        spawned.reader = threading.Thread(target=self._read_words, args=(spawned, process.stdout), daemon=True)
+        spawned.reader.start()
+        with contextlib.suppress(ChannelClosed):  # a process that dies this early is noticed by the barrier
+            channel.send(kind, **config)
+
+    def _read_words(self, process: _Process, stream: IO[bytes]) -> None:
+        for line in stream:
+            text = line.decode(errors="replace").rstrip()
+            process.words.append(text)
+            del process.words[:-50]
+            self._on_output(process.label, text)
+
+    def _barrier(self) -> None:
+        """Every host ready, and every edge proven by a probe that arrived."""
+        deadline = time.monotonic() + self.plan.start_timeout
+        probing = False
+        while True:
+            self._receive(TICK)
+            if self._stop_asked:
+                raise RunFailed("interrupted while starting")
+            processes = self._processes.values()
+            if all(p.ready for p in processes):
+                if not probing:
+                    probing = True
+                    self._reserved.close()
+                    self._send_all("probe")
+                if not any(p.unseen for p in processes):
+                    return
+            if time.monotonic() > deadline:
+                late = [p.describe() for p in processes if not p.ready]
+                if late:
+                    raise RunFailed(
+                        f"not ready within {self.plan.start_timeout:g} s: {'; '.join(late)}", self._last_words()
+                    )
+                silent = [f"{k} → {p.label}" for p in processes for k in sorted(p.unseen)]
+                raise RunFailed(f"no connection within {self.plan.start_timeout:g} s on: {', '.join(silent)}")
+
+    @contextlib.contextmanager
+    def _registered(self) -> Iterator[None]:
+        graph = self.plan.graph
+        endpoints = [self._endpoints[label] for label, p in self._processes.items() if p.kind == "host"]
+        with registry.register(graph.name, graph.namespace, endpoints):
+            yield
+
+    def _release(self) -> None:
+        self.status.phase = "running"
+        self._released_at = time.monotonic()
+        self._heard = time.monotonic()
+        self._send_all("go", first=self.status.first, at=time.time())
+
+    # Watch
+
+    def _watch(self) -> None:
+        while not all(p.report is not None for p in self._processes.values()):
+            self._receive(TICK)
+            if self._stop_asked and not self._stop_sent:
+                self._stop_sent = True
+                self.status.phase = "stopping"
+                self._send_all("stop")
+            if self._stop_asked > 1:
+                raise RunFailed("stopped before everything was drained")
+            quiet = time.monotonic() - self._heard
+            if quiet > self.plan.stall_timeout:
+                stuck = [p.describe() for p in self._processes.values() if p.report is None]
+                raise RunFailed(
+                    f"no progress for {self.plan.stall_timeout:g} s; still busy: {'; '.join(stuck)}", self._last_words()
+                )
+            if quiet > QUIET:
+                self._poll_quiescence()
+
+    def _poll_quiescence(self) -> None:
+        """Two rounds with everything idle, every envelope received and nothing new prove that nothing will happen."""
+        processes = list(self._processes.values())
+        states = [p.state for p in processes]
+        if any(s is not None and s["round"] == self._round for s in states):
+            if not all(s is not None and s["round"] == self._round for s in states):
+                return  # answers are under way; the stall timeout bounds this wait
+            answered = [s for s in states if s is not None]
+            totals = (sum(s["sent"] for s in answered), sum(s["received"] for s in answered))
+            settled = all(s["idle"] for s in answered) and totals[0] == totals[1]
+            if settled and totals == self._previous:
+                self._on_quiescence(processes)
+                self._previous = None
+            else:
+                self._previous = totals if settled else None
+        elif self._round and not any(s is None for s in states) and self._awaiting():
+            return
+        self._round += 1
+        self._asked_at = time.monotonic()
+        self._send_all("poll", round=self._round)
+
+    def _awaiting(self) -> bool:
+        return time.monotonic() - self._asked_at < 1.0
+
+    def _on_quiescence(self, processes: list[_Process]) -> None:
+        full = [p for p in processes if p.state is not None and p.state["full"]]
+        if full and self._doublings < MAX_WINDOW_DOUBLINGS:
+            self._doublings += 1
+            self.status.notes.append(
+                f"the graph looks further ahead than the window: doubled to "
+                f"{self.plan.window[0] << self._doublings} messages"
+            )
+            for process in full:
+                self._send(process, "grow")
+            self._heard = time.monotonic()
+            return
+        waiting = {
+            node: held
+            for p in processes
+            if p.state is not None
+            for node, held in p.state["waiting"].items()
+        }
+        lines = [
+            f"  {node} waits at stamp {stamp} for " + (", ".join(f"{i} (≥ {f})" for i, f in needs.items()) or "input")
+            for node, (stamp, needs) in waiting.items()
+        ]
+        raise RunFailed("the graph is stuck: nothing is on its way and no operator can fire", "\n".join(lines))
+
+    def _receive(self, timeout: float) -> None:
+        living = {p.channel: p for p in self._processes.values() if not p.gone}
+        for channel in ready(living, timeout):
+            process = living[channel]
+            try:
+                kind, fields = channel.receive()
+            except ChannelClosed:
+                self._on_death(process)
+            else:
+                self._on_message(process, kind, fields)
+
+    def _on_message(self, process: _Process, kind: str, fields: dict[str, Any]) -> None:
+        match kind:
+            case "joined":
+                process.joined = True
+            case "ready":
+                process.ready = True
+                first, steps = fields["first"], fields["steps"]
+                if first is not None:
+                    self.status.first = first if self.status.first is None else min(first, self.status.first)
+                if steps is not None:
+                    self.status.steps = max(steps, self.status.steps or 0)
+            case "seen":
+                process.unseen.discard(fields["stream"])
+            case "progress":
+                self._heard = time.monotonic()
+                process.done |= fields["done"]
+                self._count(fields["counts"])
+                self._cover()
+            case "state":
+                process.state = fields
+            case "ended":
+                self._heard = time.monotonic()
+                process.report = fields["report"]
+                self._count(fields["report"]["counts"])
+                process.done = dict.fromkeys(process.done, FOREVER)
+                self._cover()
+            case "closed":
+                process.closed = fields["facts"]
+            case "failed":
+                operator = fields["operator"]
+                raise RunFailed(
+                    f"operator {operator!r} failed in {fields['when']}: {fields['summary']}"
+                    if operator
+                    else f"{process.describe()} failed: {fields['summary']}",
+                    fields["traceback"],
+                    operator,
+                )
+
+    def _count(self, counts: Mapping[str, list[int]]) -> None:
+        for name, values in counts.items():
+            self.status.operators[name] = OperatorCounts(*values)
+
+    def _cover(self) -> None:
+        """Tells the feeds how far everything is done."""
+        expected = [
+            process.done.get(name, NEVER)
+            for process in self._processes.values()
+            if process.report is None
+            for name in self._consumers(process)
+        ]
+        covered = min(expected, default=FOREVER)
+        if covered > self._covered:
+            self._covered = covered
+            for process in self._processes.values():
+                if process.kind == "host" and process.report is None:
+                    self._send(process, "covered", frontier=covered)
+
+    def _consumers(self, process: _Process) -> tuple[str, ...]:
+        if process.kind == "sink":
+            return (process.label,)
+        return tuple(n for n in process.nodes if not self.plan.graph.nodes[n].source)
+
+    def _on_death(self, process: _Process) -> None:
+        process.gone = True
+        try:
+            code = process.process.wait(timeout=LEAVE_TIMEOUT)
+        except subprocess.TimeoutExpired:
+            process.process.kill()
+            code = process.process.wait(timeout=LEAVE_TIMEOUT)
+        if process.closed is not None:
+            return
+        if process.reader is not None:
+            process.reader.join(timeout=1.0)
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with code {code}"
+        at = [f"{n} had reached stamp {f}" for n, f in process.done.items() if f not in (NEVER, FOREVER)]
+        phase = f" while {self.status.phase}" + (f" ({'; '.join(at)})" if at else "")
+        raise RunFailed(f"{process.describe()} {how}{phase}", "\n".join(process.words[-20:]))
+
+    # End
+
+    def _finish(self) -> RunReport:
+        wall = time.monotonic() - self._released_at
+        self.status.phase = "closing"
+        outcome = "interrupted" if self._stop_sent else "complete"
+        self._send_all("leave", outcome=outcome)
+        self._await_closed()
+        reports = {p.label: p.report or {} for p in self._processes.values()}
+        streams = {s: (n, d) for r in reports.values() for s, (n, d) in r.get("streams", {}).items()}
+        reached = [c.done for c in self.status.operators.values() if c.done not in (NEVER, FOREVER)]
+        return RunReport(
+            graph=self.plan.graph.name,
+            streams=dict(sorted(streams.items())),
+            operators=dict(self.status.operators),
+            drops={
+                node: tuple((i, why, n) for i, why, n in drops)
+                for r in reports.values()
+                for node, drops in r.get("drops", {}).items()
+                if drops
+            },
+            summaries={node: s for r in reports.values() for node, s in r.get("summaries", {}).items()},
+            transport={label: r["transport"] for label, r in reports.items() if "transport" in r},
+            files={p.label: p.closed or {} for p in self._processes.values() if p.kind == "sink"},
+            first=self.status.first,
+            last=max(reached, default=None),
+            wall=wall,
+            interrupted=self._stop_sent,
+            notes=tuple(self.status.notes),
+        )
+
+    def _await_closed(self) -> None:
+        deadline = time.monotonic() + LEAVE_TIMEOUT
+        while not all(p.gone for p in self._processes.values()):
+            self._receive(TICK)
+            if time.monotonic() > deadline:
+                late = [p.describe() for p in self._processes.values() if not p.gone]
+                raise RunFailed(f"did not close within {LEAVE_TIMEOUT:g} s: {'; '.join(late)}", self._last_words())
+
+    def _abandon(self, outcome: str) -> None:
+        """After a failure: lets every process close what it has open, for a bounded time."""
+        self._send_all("leave", outcome=f"failed: {outcome}")
+        deadline = time.monotonic() + LEAVE_TIMEOUT
+        while time.monotonic() < deadline and not all(p.gone for p in self._processes.values()):
+            try:
+                self._receive(TICK)
+            except RunFailed as later:  # a consequence; the first cause is already on its way to the user
+                self.status.notes.append(f"then: {later}")
+
+    def _reap(self) -> None:
+        for process in self._processes.values():
+            if process.process.poll() is None:
+                process.process.kill()
+            process.process.wait(timeout=LEAVE_TIMEOUT)
+            if process.reader is not None:
+                process.reader.join(timeout=1.0)
+            if process.process.stdout is not None:
+                process.process.stdout.close()
+            process.channel.close()
+
+    # Talking
+
+    def _send(self, process: _Process, kind: str, **fields: Any) -> None:
+        if not process.gone:
+            with contextlib.suppress(ChannelClosed):  # its death is noticed, with its cause, by _receive
+                process.channel.send(kind, **fields)
+
+    def _send_all(self, kind: str, **fields: Any) -> None:
+        for process in self._processes.values():
+            self._send(process, kind, **fields)
+
+    def _last_words(self) -> str:
+        return "\n".join(f"[{p.label}] {line}" for p in self._processes.values() for line in p.words[-5:])

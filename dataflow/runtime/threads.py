@@ -1,0 +1,36 @@
+"""Fixes the thread counts of the numerical libraries: results must not depend on how many cores there are."""
+
+from __future__ import annotations
+
+import os
+import sys
+from typing import Any
+
+_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "BLIS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "VECLIB_MAXIMUM_THREADS",
+    "TBB_NUM_THREADS",
+)
+
+
+def environment(threads: int) -> dict[str, str]:
+    """The environment of a host process: thread counts, and hashing that is the same in every process."""
+    return {
+        **os.environ,
+        **dict.fromkeys(_VARIABLES, str(threads)),
+        "PYTHONHASHSEED": "0",
+        "DATAFLOW_THREADS": str(threads),
+    }
+
+
+def limit_threads(threads: int) -> None:
+    """Limits the libraries that are loaded and have a switch of their own. Called after the operators' imports."""
+    modules: dict[str, Any] = sys.modules
+    if (cv2 := modules.get("cv2")) is not None:
+        cv2.setNumThreads(threads)
+    if (torch := modules.get("torch")) is not None:
+        torch.set_num_threads(threads)

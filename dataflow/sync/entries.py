@@ -1,0 +1,79 @@
+"""What goes into an aligner and what comes out: entries, firings and drops."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+FiringKind = Literal["fire", "tick", "finish"]
+DropReason = Literal["unmatched", "no_sample", "stale", "unused", "late"]
+
+TICK = "@tick"
+"""The input named by the drop of a tick, which belongs to no declared input."""
+
+
+class StreamOrderError(ValueError):
+    """A stream broke its own promise: a stamp that does not increase, or one at or below its frontier."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A message as the aligner sees it. Identity is (stream, incarnation, seq); `value` is carried, never looked at.
+
+    stamp: event time, ns. seq: gapless within an incarnation of the stream. digest: of the message's content.
+    """
+
+    stamp: int
+    value: Any = field(compare=False, repr=False, default=None)
+    seq: int = 0
+    incarnation: int = 0
+    digest: bytes = b""
+    stream: str = ""
+
+
+InputValue = Entry | None | tuple[Entry, ...] | Mapping[str, Entry]
+"""Of an input: an entry or None; a tuple for a Batch; for a `many` trigger or Sampled a map from stream to entry."""
+
+
+@dataclass(frozen=True, slots=True)
+class Firing:
+    """One call of `process()` (or of `finish()`): a stamp plus the exact messages given to each input.
+
+    kind: "fire" for trigger messages, "tick" for a tick alone, "finish" for the last one, which has no inputs.
+    tick: whether a tick lies at this stamp. stale: the Sampled inputs from which a message was withheld as older than
+    `max_age`. late: the Sampled and Batch inputs holding a message that an earlier firing should have had.
+    """
+
+    stamp: int
+    kind: FiringKind
+    tick: bool = False
+    inputs: Mapping[str, InputValue] = field(default_factory=dict)
+    stale: frozenset[str] = frozenset()
+    late: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class Drop:
+    """A message (or tick, whose input is `TICK`) that no firing took.
+
+    unmatched: a join found no partner. no_sample, stale: the required Sampled input `because` was absent or too old.
+    unused: a Batch message cut off by `max` or `max_age`, or after the last firing. late: it came after a forced
+    decision, or a restarted stream went back over stamps it had already used.
+    """
+
+    input: str
+    stream: str
+    stamp: int
+    seq: int
+    incarnation: int
+    reason: DropReason
+    because: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Waiting:
+    """The first undecided stamp, and for each input that holds it up the frontier which would settle that input."""
+
+    stamp: int
+    needs: Mapping[str, int]

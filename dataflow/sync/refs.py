@@ -1,0 +1,85 @@
+"""A firing by reference: which messages each input had, without their content. Firing records embed this."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+from dataflow.sync.entries import Entry, Firing, FiringKind, InputValue
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRef:
+    """One message: its stream, the stream's incarnation, and its number there."""
+
+    stream: str
+    incarnation: int
+    seq: int
+
+
+@dataclass(frozen=True, slots=True)
+class RunRef:
+    """Consecutive messages of one stream, from `first_seq` to `last_seq`, both included."""
+
+    stream: str
+    incarnation: int
+    first_seq: int
+    last_seq: int
+
+    def __iter__(self) -> Iterator[MessageRef]:
+        return (
+            MessageRef(self.stream, self.incarnation, seq) for seq in range(self.first_seq, self.last_seq + 1)
+        )
+
+
+InputRef = MessageRef | None | tuple[RunRef, ...] | Mapping[str, MessageRef]
+"""Of an input: a message or None; runs for a Batch; for a `many` trigger or Sampled a map from stream to message."""
+
+
+@dataclass(frozen=True, slots=True)
+class FiringInputs:
+    """Everything about a firing that `process()` could see, with messages by reference."""
+
+    stamp: int
+    kind: FiringKind
+    tick: bool = False
+    inputs: Mapping[str, InputRef] = field(default_factory=dict)
+    stale: frozenset[str] = frozenset()
+    late: frozenset[str] = frozenset()
+
+
+def refs_of(firing: Firing) -> FiringInputs:
+    """`firing` by reference. Its entries must name their stream, as those that come out of an aligner do."""
+    inputs = {name: _ref(value) for name, value in firing.inputs.items()}
+    return FiringInputs(firing.stamp, firing.kind, firing.tick, inputs, firing.stale, firing.late)
+
+
+def _ref(value: InputValue) -> InputRef:
+    if value is None:
+        return None
+    if isinstance(value, Entry):
+        return _message_ref(value)
+    if isinstance(value, tuple):
+        return _runs(value)
+    return {stream: _message_ref(entry) for stream, entry in value.items()}
+
+
+def _message_ref(entry: Entry) -> MessageRef:
+    return MessageRef(entry.stream, entry.incarnation, entry.seq)
+
+
+def _runs(entries: tuple[Entry, ...]) -> tuple[RunRef, ...]:
+    """The fewest runs that hold exactly `entries`, by stream and then in order; a gap in seq begins a new run."""
+    runs: list[RunRef] = []
+    for entry in sorted(entries, key=lambda e: (e.stream, e.incarnation, e.seq)):
+        last = runs[-1] if runs else None
+        follows = (
+            last is not None
+            and (last.stream, last.incarnation) == (entry.stream, entry.incarnation)
+            and last.last_seq + 1 == entry.seq
+        )
+        if last is not None and follows:
+            runs[-1] = RunRef(last.stream, last.incarnation, last.first_seq, entry.seq)
+        else:
+            runs.append(RunRef(entry.stream, entry.incarnation, entry.seq, entry.seq))
+    return tuple(runs)

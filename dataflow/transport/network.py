@@ -1,0 +1,142 @@
+"""Where a bus listens and connects, and how that becomes a Zenoh configuration. Loopback only unless told otherwise."""
+
+from __future__ import annotations
+
+import ipaddress
+import json
+import re
+import socket
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, Self
+
+from zenoh import Config, ZError
+
+_ENDPOINT = re.compile(r"(?P<protocol>[a-z][a-z0-9-]*)/(?P<address>[^?#\s]+)(?P<rest>[?#]\S*)?")
+_LOCAL_PROTOCOLS = ("unixsock-stream", "unixpipe")
+
+
+class NetworkError(ValueError):
+    """An endpoint or a Zenoh setting that cannot be: says which, and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class NetworkConfig:
+    """How one process takes part in the network.
+
+    `listen` and `connect` are Zenoh endpoints such as `"tcp/127.0.0.1:7447"`. Peers that are not up yet are tried again
+    in the background until the bus is closed. An endpoint beyond this machine is refused in `listen` unless
+    `exposed` is set: it stands for "the graph's `network:` section says so". `shared_memory` lets large messages
+    between hosts of one machine go through shared memory, in a pool of `pool_bytes` for each publishing host. `zenoh`
+    holds further settings of Zenoh's own configuration by path: `{"transport/link/tls": {...}, "access_control": {}}`.
+    """
+
+    listen: tuple[str, ...] = ()
+    connect: tuple[str, ...] = ()
+    shared_memory: bool = True
+    exposed: bool = False
+    pool_bytes: int = 256 << 20
+    zenoh: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for endpoint in (*self.listen, *self.connect):
+            if _ENDPOINT.fullmatch(endpoint) is None:
+                raise NetworkError(
+                    f"endpoint {endpoint!r}: expected <protocol>/<address>, such as 'tcp/127.0.0.1:7447'"
+                )
+        if not self.exposed:
+            for endpoint in self.listen:
+                if not is_local(endpoint):
+                    raise NetworkError(
+                        f"endpoint {endpoint!r} can be reached from other machines; listen on 127.0.0.1, "
+                        "or write the endpoint under `network: listen:` in the graph"
+                    )
+
+    def zenoh_config(self) -> Config:
+        """The Zenoh configuration; raises `NetworkError` for a setting that Zenoh does not take."""
+        config = Config()
+        for path, value in (_BASE | dict(self.zenoh)).items():
+            _insert(config, path, value)
+        _insert(config, "listen/endpoints", list(self.listen))
+        _insert(config, "connect/endpoints", list(self.connect))
+        return config
+
+
+_BASE: dict[str, Any] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "listen/exit_on_failure": True,
+    # A peer that is not up yet: opening returns at once, and the connection is tried in the background without end.
+    "connect/exit_on_failure": False,
+    "connect/timeout_ms": -1,
+    "connect/retry": {"period_init_ms": 20, "period_max_ms": 500, "period_increase_factor": 1.5},
+    "open/return_conditions": {"connect_scouted": False, "declares": False},
+    # Zenoh's own shared memory loses messages to a stalled receiver and leaves files behind (benchmarks/transport.md);
+    # ours is in shared.py.
+    "transport/shared_memory/enabled": False,
+}
+
+
+def _insert(config: Config, path: str, value: Any) -> None:
+    try:
+        config.insert_json5(path, json.dumps(value))
+    except (ZError, TypeError, ValueError) as error:
+        raise NetworkError(f"Zenoh setting {path!r} = {value!r}: {error}") from None
+
+
+def is_local(endpoint: str) -> bool:
+    """True when only processes of this machine can reach `endpoint`."""
+    found = _ENDPOINT.fullmatch(endpoint)
+    if found is None:
+        return False
+    if found["protocol"] in _LOCAL_PROTOCOLS:
+        return True
+    if found["rest"] and "iface=" in found["rest"]:
+        return False
+    host = found["address"].rpartition(":")[0].strip("[]")
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class Reservation:
+    """Free TCP endpoints on 127.0.0.1, held for the hosts that will listen on them.
+
+    The ports stay bound (not listening) until `close`: the system gives them to nobody else meanwhile, while a Zenoh
+    session can listen on them already. Close it once all hosts have joined.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._sockets: list[socket.socket] = []
+        try:
+            for _ in range(count):
+                held = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+                self._sockets.append(held)
+                held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                held.bind(("127.0.0.1", 0))
+        except OSError:
+            self.close()
+            raise
+        self.endpoints = tuple(f"tcp/127.0.0.1:{s.getsockname()[1]}" for s in self._sockets)
+
+    def close(self) -> None:
+        for held in self._sockets:
+            held.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def reserve_endpoints(count: int) -> Reservation:
+    """`count` free loopback endpoints, no two alike, nobody else's until the reservation is closed."""
+    return Reservation(count)

@@ -1,0 +1,126 @@
+"""How a tool finds the graphs that run on this machine: one small file for each, in a folder of this user alone.
+
+A file whose process is gone is removed by whoever looks next.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import stat
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import psutil
+
+START_TOLERANCE = 1.0
+
+
+class RegistryError(RuntimeError):
+    """The folder of running graphs cannot be used: says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunningGraph:
+    """A graph that runs on this machine.
+
+    `endpoints` are the Zenoh endpoints of all its hosts: a tool connects to every one. `started` is the wall time
+    (seconds since the epoch) at which the graph was registered.
+    """
+
+    name: str
+    namespace: str
+    pid: int
+    """The supervisor's process."""
+    process_started: float
+    endpoints: tuple[str, ...]
+    started: float
+
+
+def registry_folder() -> Path:
+    """The folder, made on first use: `$XDG_RUNTIME_DIR/dataflow`, else one in the temporary folder.
+
+    Raises `RegistryError` when it exists but is another user's, or open to others.
+    """
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
+    folder = Path(runtime) / "dataflow" if runtime else Path(tempfile.gettempdir()) / f"dataflow-{user}"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.lstat()
+    except OSError as error:
+        raise RegistryError(f"cannot make the folder of running graphs {folder}: {error}") from error
+    if not stat.S_ISDIR(status.st_mode):
+        raise RegistryError(f"{folder} is no folder; remove it, or set XDG_RUNTIME_DIR to a folder of your own")
+    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o077):
+        raise RegistryError(
+            f"{folder} must belong to user {os.getuid()} with mode 0700, but belongs to {status.st_uid} with mode "
+            f"{stat.S_IMODE(status.st_mode):04o}; remove it, or set XDG_RUNTIME_DIR to a folder of your own"
+        )
+    return folder
+
+
+@contextmanager
+def register(name: str, namespace: str, endpoints: Sequence[str]) -> Iterator[RunningGraph]:
+    """Makes this process's graph known to tools for as long as the block runs."""
+    pid = os.getpid()
+    entry = RunningGraph(name, namespace, pid, psutil.Process(pid).create_time(), tuple(endpoints), started=time.time())
+    path = registry_folder() / f"{pid}-{secrets.token_hex(4)}.json"
+    written = path.with_suffix(".new")
+    written.write_text(json.dumps(asdict(entry)))
+    written.rename(path)
+    try:
+        yield entry
+    finally:
+        path.unlink(missing_ok=True)
+
+
+def running() -> list[RunningGraph]:
+    """The graphs that run on this machine for this user, the oldest first. Removes what dead processes left."""
+    found = []
+    for path in registry_folder().iterdir():
+        entry = _read(path)
+        if entry is not None and _lives(entry.pid, entry.process_started):
+            found.append(entry)
+        elif entry is not None or _is_abandoned(path):
+            path.unlink(missing_ok=True)
+    return sorted(found, key=lambda g: (g.started, g.pid))
+
+
+def _read(path: Path) -> RunningGraph | None:
+    if path.suffix != ".json":
+        return None
+    try:
+        data = json.loads(path.read_text())
+        return RunningGraph(
+            name=str(data["name"]),
+            namespace=str(data["namespace"]),
+            pid=int(data["pid"]),
+            process_started=float(data["process_started"]),
+            endpoints=tuple(str(e) for e in data["endpoints"]),
+            started=float(data["started"]),
+        )
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+
+
+def _lives(pid: int, process_started: float) -> bool:
+    """Whether that very process still runs; a later process with the same id began at another time."""
+    try:
+        process = psutil.Process(pid)
+        return (
+            abs(process.create_time() - process_started) < START_TOLERANCE and process.status() != psutil.STATUS_ZOMBIE
+        )
+    except psutil.NoSuchProcess:
+        return False
+
+
+def _is_abandoned(path: Path) -> bool:
+    """A file that is no entry: left by a process that died while writing it."""
+    pid = path.name.partition("-")[0]
+    return pid.isdigit() and not psutil.pid_exists(int(pid))

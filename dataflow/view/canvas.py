@@ -1,0 +1,151 @@
+"""Where a visualiser draws: one stream's entity, at one stamp; and the registry of visualisers by message class."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+from rerun.error_utils import catch_and_log_exceptions
+
+from dataflow.messages import Message
+from dataflow.view.frames import Rank
+from dataflow.view.scene import VIEWER_LOG, SceneState
+
+TIMELINE = "stamp"
+"""The one timeline: event time."""
+
+NAMELESS = "(no frame)"
+"""Stands for the empty frame name, which Rerun does not take."""
+
+Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor"]
+"""Which views a type appears in. `image` is drawn at the stream's entity itself, everything else at `<entity>/<role>`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """One message being drawn."""
+
+    recording: rr.RecordingStream
+    entity: str
+    stream: str
+    stamp: int
+    scene: SceneState
+
+    @property
+    def static(self) -> bool:
+        """Whether the message holds for all time."""
+        return self.stream in self.scene.layout.static
+
+    @property
+    def plane(self) -> str:
+        """The image plane that the stream's pixels lie in."""
+        return self.scene.layout.planes.get(self.stream, f"image:{self.stream}")
+
+    def log(self, path: str, *archetypes: rr.AsComponents, static: bool | None = None) -> None:
+        """Logs at `<entity>/<path>` (the entity itself for "")."""
+        entity = f"{self.entity}/{path}" if path else self.entity
+        self.recording.log(entity, *archetypes, static=self.static if static is None else static)
+
+    def draw(self, path: str, frame: str, *archetypes: rr.AsComponents) -> None:
+        """Logs at `<entity>/<path>`, in the coordinates of a named frame; the path's own in an image plane."""
+        if not frame:
+            self.notice("its messages name no frame; they are drawn at the root")
+            frame = NAMELESS
+        if frame != self.plane:
+            self.scene.see(self.recording, frame, self.stamp)
+        self.log(path, rr.CoordinateFrame(frame), *archetypes)
+
+    def clear(self, path: str) -> None:
+        """Takes away what was drawn at `<entity>/<path>` before, and below."""
+        if not self.static:
+            self.log(path, rr.Clear(recursive=True))
+
+    def plot(self, path: str, values: Sequence[float] | npt.NDArray[Any], names: Sequence[str]) -> None:
+        """One curve per name at `<entity>/plot/<path>`. Values that are not finite leave gaps."""
+        where = f"plot/{path}"
+        if not len(values):
+            return
+        if self.scene.changed(self.entity, where, tuple(names)):
+            self.log(where, rr.SeriesLines(names=list(names)), static=True)
+        self.log(where, rr.Scalars(np.asarray(values, np.float64)))
+
+    def text(self, text: str, level: str = "INFO") -> None:
+        """One line in the text log."""
+        self.log("log", rr.TextLog(text, level=level))
+
+    def notice(self, text: str) -> None:
+        """Tells people once that this stream is not shown as it is."""
+        if self.scene.once(self.stream, text):
+            self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level="WARN"))
+
+    def place(self, parent: str, child: str, T_parent_child: npt.NDArray[np.float64], *, tree: bool = False) -> None:
+        """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which has precedence."""
+        self.scene.place(
+            self.recording,
+            parent=parent,
+            child=child,
+            T_parent_child=T_parent_child,
+            stream=self.stream,
+            rank=Rank.TREE if tree else self.scene.rank(self.stream),
+            stamp=self.stamp,
+            static=self.static,
+        )
+
+
+M = TypeVar("M", bound=Message)
+Visualizer = Callable[[Canvas, Any], None]
+
+_visualizers: dict[type[Message], Visualizer] = {}
+_roles: dict[type[Message], tuple[Role, ...]] = {}
+
+
+def visualizer(
+    message_type: type[M], *roles: Role
+) -> Callable[[Callable[[Canvas, M], None]], Callable[[Canvas, M], None]]:
+    """Registers the function that draws a message type; `roles` says in which views it appears.
+
+    A package with message types of its own registers theirs the same way. Subclasses inherit.
+    """
+
+    def register(function: Callable[[Canvas, M], None]) -> Callable[[Canvas, M], None]:
+        _visualizers[message_type] = function
+        _roles[message_type] = roles
+        return function
+
+    return register
+
+
+def visualizers() -> Mapping[type[Message], Visualizer]:
+    """Every registered visualiser by message class."""
+    _load()
+    return dict(_visualizers)
+
+
+def roles_of(message_type: type[Message]) -> tuple[Role, ...]:
+    """In which views a type appears."""
+    _load()
+    return next((_roles[c] for c in message_type.__mro__ if c in _roles), ())
+
+
+def visualize(
+    recording: rr.RecordingStream, entity: str, message: Message, scene: SceneState, stream: str = ""
+) -> None:
+    """Draws `message` at `entity` on the timeline `stamp`; `stream` defaults to the entity's own name.
+
+    Sets the calling thread's time on `recording`. Raises whatever the visualiser raises: a message that cannot be drawn
+    must not pass for one that was drawn.
+    """
+    _load()
+    draw = next(_visualizers[c] for c in type(message).__mro__ if c in _visualizers)
+    recording.set_time(TIMELINE, timestamp=np.datetime64(message.stamp, "ns"))
+    canvas = Canvas(recording, entity, stream or entity.lstrip("/"), message.stamp, scene)
+    with catch_and_log_exceptions(strict=True):  # this thread only: Rerun otherwise turns errors into warnings
+        draw(canvas, message)
+
+
+def _load() -> None:
+    import dataflow.view.visualizers  # noqa: F401  (registers the built-in ones)

@@ -1,0 +1,73 @@
+"""Colours that stay the same: for a class by its name, for an identity by its number, for a value by its size."""
+
+from __future__ import annotations
+
+import colorsys
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import xxhash
+
+RGB = tuple[int, int, int]
+Colors = npt.NDArray[np.uint8]
+
+TRUTH: RGB = (80, 200, 120)
+"""Ground truth, wherever it is drawn."""
+
+NEUTRAL: RGB = (150, 155, 165)
+"""What has no class and no identity."""
+
+AXES: tuple[RGB, RGB, RGB] = ((235, 80, 80), (90, 200, 90), (90, 140, 250))
+"""x, y and z."""
+
+ESTIMATES: tuple[RGB, ...] = ((255, 176, 0), (86, 180, 233), (230, 110, 190), (213, 94, 0), (170, 140, 255))
+"""Trajectories that are no ground truth, in the order of their stream names (after Okabe and Ito)."""
+
+_GOLDEN = 0.618033988749895
+_TURBO = ((48, 18, 59), (70, 107, 227), (40, 187, 235), (50, 242, 152), (164, 252, 60), (238, 207, 58), (251, 126, 33),
+          (208, 48, 5), (122, 4, 3))  # fmt: skip
+
+
+def of_class(name: str) -> RGB:
+    """The colour of a class: by its name, so that two detectors with different tables agree."""
+    return _vivid((xxhash.xxh32_intdigest(name.encode()) % 4096) / 4096)
+
+
+def of_classes(names: Sequence[str]) -> Colors:
+    """Colours (N, 3) of N class names."""
+    return np.array([of_class(name) for name in names], np.uint8).reshape(-1, 3)
+
+
+def of_identity(number: int) -> RGB:
+    """The colour of a track, a cluster or an instance: neighbouring numbers get hues far apart."""
+    return _vivid((number * _GOLDEN) % 1.0)
+
+
+def of_identities(numbers: Sequence[int]) -> Colors:
+    """Colours (N, 3) of N identities."""
+    return np.array([of_identity(number) for number in numbers], np.uint8).reshape(-1, 3)
+
+
+def of_values(values: npt.ArrayLike, low: float | None = None, high: float | None = None) -> Colors:
+    """Colours (N, 3) of N numbers from dark blue (low) over green to red (high), after Google's Turbo.
+
+    The limits default to the 2nd and 98th percentile; NaN is neutral grey.
+    """
+    v = np.asarray(values, np.float64).reshape(-1)
+    known = np.isfinite(v)
+    colors = np.empty((len(v), 3), np.uint8)
+    colors[:] = NEUTRAL
+    if known.any():
+        lower = float(np.percentile(v[known], 2)) if low is None else low
+        upper = float(np.percentile(v[known], 98)) if high is None else high
+        t = np.clip((v[known] - lower) / max(upper - lower, 1e-9), 0.0, 1.0)
+        stops, ramp = np.linspace(0, 1, len(_TURBO)), np.array(_TURBO, np.float64)
+        colors[known] = np.stack([np.interp(t, stops, ramp[:, c]) for c in range(3)], axis=-1).round()
+    return colors
+
+
+def _vivid(hue: float) -> RGB:
+    """A colour that is legible on dark and on light; hues of equal brightness, green darkened a little."""
+    r, g, b = colorsys.hls_to_rgb(hue, 0.58, 0.78)
+    return round(r * 255), round(g * 255), round(b * 255)

@@ -1,0 +1,171 @@
+"""What belongs to what: which calibration to which image, which detections over which image. Pure."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+from dataflow.graph.model import Graph
+from dataflow.messages import (
+    CameraInfo,
+    CompressedDepth,
+    CompressedImage,
+    DepthImage,
+    Detections2D,
+    Image,
+    Message,
+    SegmentationMap,
+    Tracks,
+)
+
+COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
+DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth)
+OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
+
+_TRUTH = {"truth", "groundtruth", "gt"}
+
+
+@dataclass(frozen=True, slots=True)
+class Camera:
+    """One image stream, its calibration (None: it has none) and what is drawn over it."""
+
+    image: str
+    info: str | None
+    depth: bool
+    overlays: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """How the streams of a viewer hang together.
+
+    - `streams`: the streams shown, sorted, with their types.
+    - `cameras`: every image stream; colour before depth, then by name.
+    - `planes`: stream → name of the image plane that its pixels lie in, for images, calibrations and overlays.
+    - `static`: streams whose one message holds for all time.
+    """
+
+    streams: Mapping[str, type[Message]] = field(default_factory=lambda: MappingProxyType({}))
+    cameras: tuple[Camera, ...] = ()
+    planes: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    static: frozenset[str] = frozenset()
+
+    def of_type(self, *types: type[Message]) -> tuple[str, ...]:
+        """The streams of some types, sorted."""
+        return tuple(name for name, type_ in self.streams.items() if issubclass(type_, types))
+
+
+def layout(streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()) -> Layout:
+    """The layout of `streams` (name → message type), less those that the graph hides.
+
+    With a graph, what is drawn over an image is found by walking the graph upstream; without one, by the words that
+    names share. `static` adds to what the graph says.
+    """
+    hidden = set(graph.view.hide) if graph is not None else set()
+    shown = {name: streams[name] for name in sorted(streams) if name not in hidden}
+    fixed = {name for name in static if name in shown}
+    if graph is not None:
+        fixed |= {name for name, stream in graph.streams.items() if stream.static and name in shown}
+
+    images = [name for name, type_ in shown.items() if issubclass(type_, COLOR)]
+    depths = [name for name, type_ in shown.items() if issubclass(type_, DEPTH)]
+    infos = [name for name, type_ in shown.items() if issubclass(type_, CameraInfo)]
+    info_of = {name: _calibration(name, infos, images + depths, graph) for name in images + depths}
+
+    over: dict[str, list[str]] = {name: [] for name in images + depths}
+    planes: dict[str, str] = {info: plane_name(info) for info in infos}
+    for name, info in info_of.items():
+        planes[name] = plane_name(info or name)
+    for name, type_ in shown.items():
+        if issubclass(type_, OVERLAYS) and (image := _image_under(name, images, depths, graph)) is not None:
+            over[image].append(name)
+            planes[name] = planes[image]
+    cameras = tuple(
+        Camera(name, info_of[name], depth=name in depths, overlays=tuple(over[name])) for name in images + depths
+    )
+    return Layout(MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed))
+
+
+def plane_name(stream: str) -> str:
+    """The frame that stands for an image plane: named for the calibration, or for the image where there is none."""
+    return f"image:{stream}"
+
+
+def is_truth(stream: str) -> bool:
+    """Whether a stream's name says that it is ground truth (`truth`, `ground_truth`, `gt`)."""
+    return bool(_TRUTH & set(_words(stream)))
+
+
+def _calibration(image: str, infos: list[str], images: list[str], graph: Graph | None) -> str | None:
+    """The calibration of an image: of its own operator, else of an image it was made from, else of the same device."""
+    near = [info for info in infos if _operator(info) == _operator(image)]
+    if not near and graph is not None:
+        for stream in _upstream(image, graph):
+            if stream in images:
+                return _calibration(stream, infos, images, graph)
+            if stream in infos:
+                return stream
+    if not near:
+        shared = {info: len(_common(_operator(info), _operator(image))) for info in infos}
+        near = [info for info in infos if shared[info] == max(shared.values()) and shared[info] > 0]
+        if not near and len(infos) == 1:
+            near = infos
+    return max(near, key=lambda info: (_likeness(_port(info), _port(image)), -len(info)), default=None)
+
+
+def _image_under(overlay: str, images: list[str], depths: list[str], graph: Graph | None) -> str | None:
+    """The image that an overlay was made from."""
+    if graph is not None:
+        made_from = list(_upstream(overlay, graph))
+        found = next((s for s in made_from if s in images), None) or next((s for s in made_from if s in depths), None)
+        if found is not None:
+            return found
+    candidates = images or depths
+    return max(candidates, key=lambda image: (_likeness(image, overlay), -candidates.index(image)), default=None)
+
+
+def _upstream(stream: str, graph: Graph) -> Iterable[str]:
+    """The streams that `stream` is made from, nearest first."""
+    if stream not in graph.streams:
+        return
+    queue, seen = [stream], {stream}
+    while queue:
+        node, _ = graph.producer(queue.pop(0))
+        for taken in node.inputs.values():
+            for name in taken:
+                if name not in seen:
+                    seen.add(name)
+                    yield name
+                    if name in graph.streams:
+                        queue.append(name)
+
+
+def _operator(stream: str) -> str:
+    return stream.rpartition("/")[0]
+
+
+def _port(stream: str) -> str:
+    return stream.rpartition("/")[2]
+
+
+def _words(name: str) -> list[str]:
+    return [word for word in re.split(r"[^0-9a-z]+", name.lower()) if word]
+
+
+def _common(a: str, b: str) -> list[str]:
+    """The leading chunks that two keys share."""
+    shared = []
+    for x, y in zip(a.split("/"), b.split("/"), strict=False):
+        if x != y:
+            break
+        shared.append(x)
+    return shared
+
+
+def _likeness(a: str, b: str) -> tuple[int, int]:
+    """How much two names share: words, then leading letters."""
+    words_a, words_b = set(_words(a)), set(_words(b))
+    prefix = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
+    return len(words_a & words_b), prefix

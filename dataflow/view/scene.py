@@ -1,0 +1,227 @@
+"""What a viewer remembers between messages: frames, ends of trails, what it said already, where to look from."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from dataflow.messages.geometry import split_matrix
+from dataflow.view import colors
+from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
+from dataflow.view.layout import COLOR, DEPTH, Layout, is_truth
+
+Vector = npt.NDArray[np.float64]
+
+SCENE = "/scene"
+"""Entity of the drawing frame: the origin of the 3-D view."""
+
+FRAMES = "/frames"
+"""Entities of the frames: `/frames/<name>`."""
+
+VIEWER_LOG = "/viewer/log"
+"""Entity of what the viewer itself has to say."""
+
+ASSUMPTION_GRACE = 1_000_000_000
+"""Event time (ns) for which a frame may stay unplaced before the viewer says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class ViewOptions:
+    """How much is shown, and at what price in memory.
+
+    - `jpeg_quality`: raw colour images are sent as JPEG of this quality, None: as they are (20 times the memory).
+    - `compress_depth`: depth is sent as 16-bit PNG in steps of 1 mm (coarser only beyond 65 m) instead of float32.
+    - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log says so once.
+    - `trail`: trails get a vertex every so many metres at least.
+    - `track_history`: event time (ns) for which the paths of tracks are drawn.
+    """
+
+    jpeg_quality: int | None = 85
+    compress_depth: bool = True
+    max_points: int = 200_000
+    trail: float = 0.01
+    track_history: int = 5_000_000_000
+
+    def __post_init__(self) -> None:
+        if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"jpeg_quality must be 1 to 100 or None, got {self.jpeg_quality}")
+        if self.max_points < 1:
+            raise ValueError(f"max_points must be at least 1, got {self.max_points}")
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """Where to look from, in the drawing frame: metres. `up` is a unit vector along an axis."""
+
+    up: Vector
+    position: Vector | None = None
+    target: Vector | None = None
+
+
+@dataclass(slots=True)
+class Trail:
+    """The last vertex of a trail that has been drawn."""
+
+    frame: str
+    position: Vector
+
+
+@dataclass(slots=True)
+class SceneState:
+    """The state of one viewer session; visualisers read and update it."""
+
+    layout: Layout = field(default_factory=Layout)
+    options: ViewOptions = field(default_factory=ViewOptions)
+    tree: FrameTree = field(default_factory=FrameTree)
+    optical: dict[str, None] = field(default_factory=dict)
+    trails: dict[str, Trail] = field(default_factory=dict)
+    track_paths: dict[str, dict[int, deque[tuple[int, Vector]]]] = field(default_factory=dict)
+    remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
+    _noted: set[tuple[str, str]] = field(default_factory=set)
+    _ranges: list[float] = field(default_factory=list)
+    _posed: dict[str, None] = field(default_factory=dict)
+    _waiting: dict[str, int] = field(default_factory=dict)
+
+    def changed(self, entity: str, key: str, value: object) -> bool:
+        """Whether `value` differs from what was last remembered under (entity, key); remembers it."""
+        if self.remembered.get((entity, key), self) == value:
+            return False
+        self.remembered[entity, key] = value
+        return True
+
+    def once(self, stream: str, what: str) -> bool:
+        """True the first time for (stream, what)."""
+        if (stream, what) in self._noted:
+            return False
+        self._noted.add((stream, what))
+        return True
+
+    def rank(self, stream: str) -> Rank:
+        """Whose word counts on where frames lie."""
+        return Rank.TRUTH if is_truth(stream) else Rank.ESTIMATE
+
+    def trail_color(self, stream: str, streams: tuple[str, ...]) -> colors.RGB:
+        """Green for ground truth; else by the place of the stream among `streams`, those of its kind."""
+        if is_truth(stream):
+            return colors.TRUTH
+        others = [name for name in streams if not is_truth(name)]
+        index = others.index(stream) if stream in others else len(others)
+        return colors.ESTIMATES[index % len(colors.ESTIMATES)]
+
+    def see(self, recording: rr.RecordingStream, frame: str, stamp: int) -> None:
+        """A message names `frame`: makes sure that it hangs somewhere."""
+        if frame not in self.tree:
+            self.draw_frames(recording, self.tree.see(frame), stamp)
+
+    def place(
+        self,
+        recording: rr.RecordingStream,
+        *,
+        parent: str,
+        child: str,
+        T_parent_child: Vector,
+        stream: str,
+        rank: Rank,
+        stamp: int,
+        static: bool,
+    ) -> None:
+        """A message places `child` in `parent`; poses that are not finite are passed over."""
+        if not np.isfinite(T_parent_child).all():
+            return
+        self._posed.setdefault(child)
+        changes = self.tree.place(parent, child, T_parent_child, owner=stream, rank=rank, stamp=stamp)
+        self.draw_frames(recording, changes, stamp, static=static)
+
+    def draw_frames(
+        self, recording: rr.RecordingStream, changes: list[Change], stamp: int, *, static: bool = False
+    ) -> None:
+        """Logs the changes of the tree. What is assumed is never static, so that what is given later replaces it."""
+        for change in changes:
+            match change:
+                case Attach():
+                    position, orientation = split_matrix(change.T_parent_child)
+                    recording.log(
+                        frame_entity(change.child),
+                        rr.Transform3D(
+                            translation=position,
+                            quaternion=rr.Quaternion(xyzw=orientation),
+                            parent_frame=change.parent,
+                            child_frame=change.child,
+                        ),
+                        static=static and not change.assumed,
+                    )
+                    if change.assumed:
+                        self._waiting.setdefault(change.child, stamp)
+                case Detach():
+                    recording.log(frame_entity(change.child), rr.Clear(recursive=False))
+                case NewRoot():
+                    recording.log(SCENE, rr.CoordinateFrame(change.frame), static=True)
+
+    def doubts(self, stamp: int) -> list[str]:
+        """What to tell people about frames that nobody placed for a while; each once."""
+        words = []
+        assumed = self.tree.assumed() if self._waiting else {}
+        for frame, since in list(self._waiting.items()):
+            if frame not in assumed:
+                del self._waiting[frame]
+            elif stamp - since >= ASSUMPTION_GRACE:
+                del self._waiting[frame]
+                reason = self.tree.reason(frame)
+                words.append(
+                    f"frame {frame!r} is not placed by any stream: it is drawn "
+                    + (f"where {reason} agree" if reason else f"at the origin of {assumed[frame]!r}")
+                    + ". Publish a Transforms message that places it"
+                )
+        return words
+
+    def saw_range(self, distances: npt.ArrayLike) -> None:
+        """Distances (N,) in metres at which things were seen: they set how far back to look from."""
+        d = np.asarray(distances, np.float64)
+        d = d[np.isfinite(d) & (d > 0)]
+        if d.size and len(self._ranges) < 256:
+            self._ranges.append(float(np.median(d)))
+
+    def outlook(self) -> Outlook:
+        """Where to look from: behind and above the cameras, or else the robot, so that what they see is in view.
+
+        Up is +z (REP 103), unless the root is itself like an optical frame (y down), as in data sets whose world is
+        their first camera.
+        """
+        up = np.array([0.0, 0.0, 1.0])
+        cameras = [T for frame in self.optical if (T := self.tree.pose(frame)) is not None]
+        if cameras and all(T[1, 1] > 0.7 and T[2, 2] > 0.7 for T in cameras):
+            up = np.array([0.0, -1.0, 0.0])
+        if cameras:
+            at, ahead = cameras[0][:3, 3], cameras[0][:3, 2]
+        else:
+            robot = next((T for frame in self._posed if (T := self.tree.pose(frame)) is not None), None)
+            if robot is None and not self._ranges:
+                return Outlook(up)
+            at, ahead = (np.zeros(3), np.eye(3)[0]) if robot is None else (robot[:3, 3], robot[:3, 0])
+        level = ahead - up * (ahead @ up)
+        if np.linalg.norm(level) < 0.2:
+            level = np.eye(3)[0] - up * up[0]
+        level /= np.linalg.norm(level)
+        reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
+        side = np.cross(level, up)
+        position = at - level * (0.75 * reach) + up * (0.75 * reach) + side * (0.45 * reach)
+        return Outlook(up, position, at + level * (0.55 * reach))
+
+    def image_streams(self) -> tuple[str, ...]:
+        """Every stream of images, colour and depth."""
+        return self.layout.of_type(*COLOR, *DEPTH)
+
+
+def frame_entity(frame: str) -> str:
+    """The entity that places a frame: always the same, as Rerun demands."""
+    return f"{FRAMES}/{rr.escape_entity_path_part(frame)}"
+
+
+def entity_of(stream: str) -> str:
+    """The entity of a stream: its name as a path."""
+    return "/" + "/".join(rr.escape_entity_path_part(part) for part in stream.split("/") if part)

@@ -1,0 +1,350 @@
+"""Where visualised messages go: a window, a running viewer, a browser or a file.
+
+`ViewerSink.log` never waits for a viewer unless it is asked to. Rerun's own `log` does: when a viewer stalls, its
+channels fill and the calling thread stands still. So a thread of the sink's own talks to Rerun, behind a queue that is
+bounded in messages and bytes and that drops its oldest.
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import threading
+import traceback
+import uuid
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Self
+from urllib.parse import quote, urlsplit
+
+import rerun as rr
+
+from dataflow.graph.model import Graph
+from dataflow.messages import Message
+from dataflow.view import process
+from dataflow.view.blueprint import blueprint_of
+from dataflow.view.canvas import visualize
+from dataflow.view.layout import layout
+from dataflow.view.process import LOOPBACK, ViewerError
+from dataflow.view.scene import SCENE, VIEWER_LOG, SceneState, ViewOptions, entity_of
+
+SETTLE = 1_000_000_000
+"""Event time (ns) after which the viewer decides where to look from."""
+
+_GRPC_PORT = 9876
+_WEB_PORT = 9090
+
+
+@dataclass(frozen=True, slots=True)
+class Spawn:
+    """A window on this machine; it stays open when the program ends. Past `memory_limit` it forgets the oldest data."""
+
+    port: int = _GRPC_PORT
+    memory_limit: str = "2GB"
+
+
+@dataclass(frozen=True, slots=True)
+class Connect:
+    """A viewer that runs already, by its address: `rerun+http://127.0.0.1:9876/proxy`."""
+
+    url: str = f"rerun+http://{LOOPBACK}:{_GRPC_PORT}/proxy"
+
+
+@dataclass(frozen=True, slots=True)
+class Serve:
+    """A page for browsers on this machine, as long as the sink is open. Latecomers get what fits in `memory_limit`."""
+
+    web_port: int = _WEB_PORT
+    grpc_port: int = _GRPC_PORT
+    memory_limit: str = "1GB"
+
+    @property
+    def url(self) -> str:
+        """What to open in the browser."""
+        data = quote(f"rerun+http://{LOOPBACK}:{self.grpc_port}/proxy", safe="")
+        return f"http://{LOOPBACK}:{self.web_port}/?url={data}"
+
+
+@dataclass(frozen=True, slots=True)
+class Save:
+    """A file that Rerun opens; an existing one is replaced."""
+
+    path: Path
+
+
+Target = Spawn | Connect | Serve | Save
+
+
+def parse_target(text: str) -> Target:
+    """`spawn`, `serve`, `rerun+http://host:port/proxy`, or a path that ends in `.rrd`. Raises `ViewerError`."""
+    if text in ("spawn", "serve"):
+        return Spawn() if text == "spawn" else Serve()
+    if text.startswith(("rerun://", "rerun+http://", "rerun+https://")):
+        return Connect(text)
+    if text.endswith(".rrd"):
+        return Save(Path(text))
+    raise ViewerError(
+        f"viewer {text!r}: expected spawn, serve, rerun+http://HOST:PORT/proxy, or a file name ending in .rrd"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """How much may wait for the viewer: messages and bytes of arrays."""
+
+    messages: int = 500
+    bytes: int = 64 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class SinkStatistics:
+    """What became of the messages: drawn, dropped because the viewer was too slow, failed to draw."""
+
+    drawn: int
+    dropped: int
+    failed: int
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """The queue between the callers and the drawing thread; guarded by `changed`."""
+
+    changed: threading.Condition = field(default_factory=threading.Condition)
+    static: deque[tuple[str, Message]] = field(default_factory=deque)
+    messages: deque[tuple[str, Message]] = field(default_factory=deque)
+    bytes: int = 0
+    closing: bool = False
+
+
+class ViewerSink:
+    """Draws messages of streams in a viewer. `open`, `log` any number of times, `close`; or a `with` block.
+
+    `report` gets one line for people about everything that goes wrong, once per stream and cause.
+    """
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        options: ViewOptions | None = None,
+        bounds: Bounds | None = None,
+        report: Callable[[str], None] | None = None,
+        application: str = "dataflow",
+    ) -> None:
+        self.target = target
+        self._options = options or ViewOptions()
+        self._bounds = bounds or Bounds()
+        self._report = report or logging.getLogger(__name__).warning
+        self._application = application
+        self._recording: rr.RecordingStream | None = None
+        self._scene = SceneState()
+        self._thread: threading.Thread | None = None
+        self._server: subprocess.Popen[bytes] | None = None
+        self._waiting = _Waiting()
+        self._counts: Counter[str] = Counter()
+        self._reported: set[tuple[str, str]] = set()
+        self._started_at: int | None = None
+        self._settled = False
+
+    def open(
+        self, streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()
+    ) -> None:
+        """Starts or reaches the viewer and lays out its views. Raises `ViewerError`.
+
+        `streams`: name → message type. What the graph hides is not sent. `static`: streams whose one message holds for
+        all time, besides those that the graph says.
+        """
+        if self._recording is not None:
+            raise ViewerError("this sink is open already")
+        self._scene = SceneState(layout(streams, graph, static), self._options)
+        name = graph.name if graph is not None else self._application
+        recording = rr.RecordingStream(name, recording_id=uuid.uuid4())
+        try:
+            self._reach(recording)
+        except ViewerError:
+            self._stop_server()
+            raise
+        recording.send_recording_name(name)
+        recording.log(SCENE, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        if not isinstance(self.target, Save):
+            recording.send_blueprint(blueprint_of(self._scene.layout, following=True))
+        self._recording = recording
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    def log(self, stream: str, message: Message, *, wait: float = 0.0) -> bool:
+        """Hands a message over for drawing; returns whether it was taken.
+
+        Where the queue is full, waits up to `wait` seconds for room, then drops the oldest. Messages of streams that
+        are not shown are passed over.
+        """
+        if self._recording is None:
+            raise ViewerError("this sink is not open: call open() first")
+        if stream not in self._scene.layout.streams:
+            return False
+        waiting, size = self._waiting, message.nbytes()
+        with waiting.changed:
+            if waiting.closing:
+                return False
+            if stream in self._scene.layout.static:
+                waiting.static.append((stream, message))
+                waiting.changed.notify_all()
+                return True
+            if wait > 0:
+                waiting.changed.wait_for(lambda: not self._full(size) or waiting.closing, wait)
+            dropped = 0
+            while waiting.messages and self._full(size):
+                waiting.bytes -= waiting.messages.popleft()[1].nbytes()
+                dropped += 1
+            waiting.messages.append((stream, message))
+            waiting.bytes += size
+            self._counts["dropped"] += dropped
+            waiting.changed.notify_all()
+        if dropped:
+            self._tell("", "slow", "the viewer is too slow: some messages are not shown (the oldest are dropped)")
+        return True
+
+    def is_static(self, stream: str) -> bool:
+        """Whether the stream's one message holds for all time."""
+        return stream in self._scene.layout.static
+
+    def statistics(self) -> SinkStatistics:
+        """What became of the messages so far."""
+        return SinkStatistics(self._counts["drawn"], self._counts["dropped"], self._counts["failed"])
+
+    def close(self, timeout: float = 10.0) -> bool:
+        """Draws what waits, flushes and lets go of the viewer; returns whether all arrived within `timeout` seconds."""
+        if self._recording is None or self._thread is None:
+            return True
+        with self._waiting.changed:
+            self._waiting.closing = True
+            self._waiting.changed.notify_all()
+        self._thread.join(timeout)
+        finished = not self._thread.is_alive()
+        if not finished:
+            _abandoned.append(self._recording)  # its destructor would wait for the stalled viewer
+            self._tell("", "close", f"the viewer did not take everything within {timeout:g} s; the rest is not shown")
+        self._recording = None
+        self._stop_server()
+        return finished
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _full(self, size: int) -> bool:
+        """Whether another message of `size` bytes is too much; one message alone never is."""
+        waiting = self._waiting
+        return bool(waiting.messages) and (
+            len(waiting.messages) >= self._bounds.messages or waiting.bytes + size > self._bounds.bytes
+        )
+
+    def _reach(self, recording: rr.RecordingStream) -> None:
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        match self.target:
+            case Save(path):
+                if not path.parent.is_dir():
+                    raise ViewerError(f"cannot save {path}: there is no folder {path.parent}")
+                try:
+                    recording.save(path)
+                except Exception as error:
+                    raise ViewerError(f"cannot save {path}: {error}") from error
+            case Connect(url):
+                _check_reachable(url)
+                recording.connect_grpc(url)
+            case Spawn(port, memory):
+                if (problem := process.display_problem()) is not None:
+                    raise ViewerError(f"cannot open a viewer window: {problem}. Use serve (a browser) or a .rrd file")
+                arguments = ["--port", str(port), "--memory-limit", memory, "--expect-data-soon"]
+                process.start(arguments, [port], outlive=True)
+                recording.connect_grpc(f"rerun+http://{LOOPBACK}:{port}/proxy")
+            case Serve(web, grpc, memory):
+                arguments = ["--serve-web", "--port", str(grpc), "--web-viewer-port", str(web)]
+                self._server = process.start([*arguments, "--server-memory-limit", memory], [grpc, web], outlive=False)
+                recording.connect_grpc(f"rerun+http://{LOOPBACK}:{grpc}/proxy")
+
+    def _stop_server(self) -> None:
+        if self._server is not None:
+            process.stop(self._server)
+            self._server = None
+
+    def _run(self) -> None:
+        """The drawing thread: everything that may wait for the viewer happens here."""
+        recording, waiting = self._recording, self._waiting
+        assert recording is not None
+        while True:
+            with waiting.changed:
+                waiting.changed.wait_for(lambda: waiting.static or waiting.messages or waiting.closing)
+                if waiting.static:
+                    stream, message = waiting.static.popleft()
+                elif waiting.messages:
+                    stream, message = waiting.messages.popleft()
+                    waiting.bytes -= message.nbytes()
+                else:
+                    break
+                waiting.changed.notify_all()
+            self._draw(recording, stream, message)
+        self._guarded("", lambda: self._settle(recording))
+        self._guarded("", lambda: recording.flush(timeout_sec=3600.0))  # close() bounds the wait
+        recording.disconnect()
+
+    def _draw(self, recording: rr.RecordingStream, stream: str, message: Message) -> None:
+        static = stream in self._scene.layout.static
+        if self._guarded(stream, lambda: visualize(recording, entity_of(stream), message, self._scene, stream)):
+            self._counts["drawn"] += 1
+        else:
+            self._counts["failed"] += 1
+        if static:
+            return
+        if self._started_at is None:
+            self._started_at = message.stamp
+        if not self._settled and message.stamp - self._started_at >= SETTLE:
+            self._guarded("", lambda: self._settle(recording))
+        for doubt in self._scene.doubts(message.stamp):
+            self._guarded("", lambda text=doubt: recording.log(VIEWER_LOG, rr.TextLog(text, level="WARN")))
+
+    def _settle(self, recording: rr.RecordingStream) -> None:
+        """Decides, once, which way is up and where to look from."""
+        if self._settled:
+            return
+        self._settled = True
+        outlook = self._scene.outlook()
+        if outlook.up[1] < 0:
+            recording.log(SCENE, rr.ViewCoordinates.RDF, static=True)
+        following = not isinstance(self.target, Save)
+        recording.send_blueprint(blueprint_of(self._scene.layout, outlook=outlook, following=following))
+
+    def _guarded(self, stream: str, action: Callable[[], object]) -> bool:
+        """Runs an action whose failure must not end the viewer; returns whether it worked."""
+        try:
+            action()
+        except Exception as error:
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            cause = f"{type(error).__name__} at {frame.name}:{frame.lineno}"
+            self._tell(stream, cause, f"cannot draw {stream or 'the views'}: {type(error).__name__}: {error}")
+            return False
+        return True
+
+    def _tell(self, stream: str, cause: str, text: str) -> None:
+        if (stream, cause) not in self._reported:
+            self._reported.add((stream, cause))
+            self._report(text)
+
+
+_abandoned: list[rr.RecordingStream] = []
+"""Recordings whose viewer stalled: kept, because letting go of one would wait for it."""
+
+
+def _check_reachable(url: str) -> None:
+    """Rerun's `connect_grpc` returns at once and tries for ever; this says at once that nobody is there."""
+    parts = urlsplit(url)
+    if parts.path != "/proxy" or parts.hostname is None:
+        raise ViewerError(f"viewer address {url!r}: expected rerun+http://HOST:PORT/proxy")
+    port = parts.port or _GRPC_PORT
+    if not process.listening(port, parts.hostname, timeout=3.0):
+        raise ViewerError(f"no viewer listens on {parts.hostname}:{port}; start one with `rerun --bind {LOOPBACK}`")

@@ -1,0 +1,15 @@
+"""One visualiser per message type, one module per family; importing this package registers them all."""
+
+from dataflow.view.visualizers import (
+    cameras,
+    clouds,
+    fallback,
+    maps,
+    objects,
+    poses,
+    ranging,
+    semantics,
+    status,
+)
+
+__all__ = ["cameras", "clouds", "fallback", "maps", "objects", "poses", "ranging", "semantics", "status"]

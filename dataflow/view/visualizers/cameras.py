@@ -1,0 +1,108 @@
+"""Calibrations, images, depth."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import rerun as rr
+
+from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.view.canvas import Canvas, visualizer
+
+_FRUSTUM = (150, 155, 165)
+_DEPTH_COLORS = rr.components.Colormap.Turbo
+
+
+@visualizer(CameraInfo, "image")
+def camera_info(canvas: Canvas, message: CameraInfo) -> None:
+    """A frustum in the optical frame; images and overlays of this camera lie in its plane. Distortion is not shown."""
+    canvas.scene.optical.setdefault(message.frame)
+    canvas.scene.see(canvas.recording, message.frame, canvas.stamp)
+    canvas.log(
+        "",
+        rr.Pinhole(
+            image_from_camera=message.K,
+            resolution=[message.width, message.height],
+            parent_frame=message.frame,
+            child_frame=canvas.plane,
+            image_plane_distance=0.3,
+            color=_FRUSTUM,
+        ),
+    )
+
+
+@visualizer(Image, "image")
+def image(canvas: Canvas, message: Image) -> None:
+    """The image, as JPEG unless the options say otherwise."""
+    if message.data.size == 0:
+        canvas.clear("")
+        return
+    picture = rr.Image(message.data, color_model="RGB" if message.is_color else "L")
+    quality = canvas.scene.options.jpeg_quality
+    canvas.draw("", canvas.plane, picture if quality is None else picture.compress(jpeg_quality=quality))
+
+
+@visualizer(CompressedImage, "image")
+def compressed_image(canvas: Canvas, message: CompressedImage) -> None:
+    """The encoded file as it is."""
+    canvas.draw(
+        "", canvas.plane, rr.EncodedImage(contents=message.data.tobytes(), media_type=f"image/{message.format}")
+    )
+
+
+@visualizer(DepthImage, "image")
+def depth_image(canvas: Canvas, message: DepthImage) -> None:
+    """Colours by distance, and points in space where the camera is calibrated."""
+    _depth(canvas, message.data)
+
+
+@visualizer(CompressedDepth, "image")
+def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
+    """As a depth image; the file is passed on as it is where its values are proportional to depth."""
+    if message.quantizer == "linear" and message.offset == 0.0:
+        canvas.draw(
+            "",
+            canvas.plane,
+            rr.EncodedDepthImage(
+                blob=message.data.tobytes(),
+                media_type="image/png",
+                meter=1.0 / message.scale,
+                colormap=_DEPTH_COLORS,
+            ),
+        )
+        return
+    values = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
+    if values is None:
+        raise ValueError("the PNG of the CompressedDepth cannot be decoded")
+    pixels = values.astype(np.float32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = (
+            message.scale * pixels + message.offset
+            if message.quantizer == "linear"
+            else message.scale / (pixels - message.offset)
+        )
+    _depth(canvas, np.where(pixels > 0, depth, 0.0).astype(np.float32))
+
+
+def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:
+    if depth.size == 0:
+        canvas.clear("")
+        return
+    known = np.isfinite(depth) & (depth > 0)
+    clean = np.where(known, depth, np.float32(0))
+    sample = clean[::8, ::8]
+    canvas.scene.saw_range(sample[sample > 0])
+    if not canvas.scene.options.compress_depth:
+        canvas.draw("", canvas.plane, rr.DepthImage(clean, meter=1.0, colormap=_DEPTH_COLORS))
+        return
+    farthest = float(clean.max(initial=0.0))
+    units = 1000.0 if farthest <= 65.0 else 65000.0 / farthest  # per metre
+    steps = np.rint(clean * np.float32(units)).astype(np.uint16)
+    encoded, png = cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not encoded:
+        raise ValueError(f"a depth image of shape {depth.shape} cannot be written as PNG")
+    canvas.draw(
+        "",
+        canvas.plane,
+        rr.EncodedDepthImage(blob=png.tobytes(), media_type="image/png", meter=units, colormap=_DEPTH_COLORS),
+    )

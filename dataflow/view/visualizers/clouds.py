@@ -1,0 +1,79 @@
+"""Point clouds and clusters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from dataflow.messages import Clusters, PointCloud
+from dataflow.view import colors
+from dataflow.view.canvas import Canvas, visualizer
+
+
+@visualizer(PointCloud, "space")
+def point_cloud(canvas: Canvas, message: PointCloud) -> None:
+    """The points in their own colours, else by intensity, else by height (by distance in an optical frame)."""
+    kept = thin(canvas, np.flatnonzero(np.isfinite(message.points).all(axis=1)))
+    points = message.points[kept]
+    if message.colors is not None:
+        paint = message.colors[kept]
+    elif message.intensities is not None:
+        paint = colors.of_values(message.intensities[kept])
+    else:
+        paint = colors.of_values(points[:, 2])
+    canvas.scene.saw_range(np.linalg.norm(points[::16], axis=1))
+    canvas.draw("space", message.frame, rr.Points3D(points, colors=paint, radii=rr.Radius.ui_points(1.5)))
+
+
+@visualizer(Clusters, "space")
+def clusters(canvas: Canvas, message: Clusters) -> None:
+    """A box around each cluster, or a point at its centroid where it has no bounds."""
+    names = range(message.count) if message.ids is None else message.ids.tolist()
+    paint = colors.of_identities(list(names))
+    labels = [str(name) for name in names]
+    if message.lower is not None and message.upper is not None:
+        shown = finite_rows(message.lower, message.upper)
+        canvas.draw(
+            "space",
+            message.frame,
+            rr.Boxes3D(
+                centers=((message.lower + message.upper) / 2)[shown],
+                half_sizes=((message.upper - message.lower) / 2)[shown],
+                colors=paint[shown],
+                labels=[labels[i] for i in shown],
+                show_labels=True,
+            ),
+        )
+        return
+    shown = finite_rows(message.centroids)
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Points3D(
+            message.centroids[shown],
+            colors=paint[shown],
+            labels=[labels[i] for i in shown],
+            radii=rr.Radius.ui_points(5.0),
+            show_labels=True,
+        ),
+    )
+
+
+def finite_rows(*arrays: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+    """Indices of the rows in which every array is finite."""
+    good = np.ones(len(arrays[0]), bool)
+    for data in arrays:
+        good &= np.isfinite(data.reshape(len(data), -1)).all(axis=1)
+    return np.flatnonzero(good)
+
+
+def thin(canvas: Canvas, indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Every n-th index, so that at most `max_points` remain; says so once."""
+    most = canvas.scene.options.max_points
+    if len(indices) <= most:
+        return indices
+    canvas.notice(f"shown thinned to at most {most:,} points of a message (option max_points)")
+    return indices[:: -(-len(indices) // most)]

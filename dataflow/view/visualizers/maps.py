@@ -1,0 +1,99 @@
+"""Maps: occupancy grids, meshes, planes."""
+
+from __future__ import annotations
+
+import numpy as np
+import rerun as rr
+
+from dataflow.messages import Mesh, OccupancyGrid, Planes
+from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.view import colors
+from dataflow.view.canvas import Canvas, visualizer
+from dataflow.view.visualizers.clouds import finite_rows
+
+_UNBOUNDED = 2.0  # metres: side of the square that stands for a plane without an extent
+_NORMAL = 0.3  # metres
+
+
+@visualizer(OccupancyGrid, "space")
+def occupancy_grid(canvas: Canvas, message: OccupancyGrid) -> None:
+    """The grid lying in its plane: white free, black occupied, green-grey unknown (RViz's map colours)."""
+    height, width = message.cells.shape
+    if height == 0 or width == 0:
+        canvas.clear("space")
+        return
+    image = message.cells[::-1].view(np.uint8)  # an image's first row is the top one; the grid's lies at the origin
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.GridMap(
+            data=image.tobytes(),
+            format=rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="U8"),
+            cell_size=message.resolution,
+            translation=message.position,
+            quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
+            colormap=rr.components.Colormap.RvizMap,
+            opacity=0.85,
+        ),
+    )
+
+
+@visualizer(Mesh, "space")
+def mesh(canvas: Canvas, message: Mesh) -> None:
+    """The triangles, in the vertices' colours or grey."""
+    bad = np.flatnonzero(~np.isfinite(message.vertices).all(axis=1))
+    triangles = message.triangles[~np.isin(message.triangles, bad).any(axis=1)]
+    if not len(triangles):
+        canvas.clear("space")
+        return
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Mesh3D(
+            vertex_positions=np.nan_to_num(message.vertices),
+            triangle_indices=triangles,
+            vertex_normals=None if message.normals is None else np.nan_to_num(message.normals),
+            vertex_colors=message.colors,
+            albedo_factor=None if message.colors is not None else (*colors.NEUTRAL, 255),
+        ),
+    )
+
+
+@visualizer(Planes, "space")
+def planes(canvas: Canvas, message: Planes) -> None:
+    """The rectangle seen of each plane, else a square where it comes nearest to the origin; and the normals."""
+    paint = colors.of_identities(list(range(message.count)))
+    normals = message.coefficients[:, :3]
+    if message.centers is not None and message.orientations is not None and message.extents is not None:
+        shown = finite_rows(message.centers, message.orientations, message.extents)
+        centers, turned, extents = message.centers[shown], message.orientations[shown], message.extents[shown]
+    else:
+        shown = finite_rows(message.coefficients)
+        centers = -normals[shown] * message.coefficients[shown, 3:]
+        turned = np.array([matrix_to_quaternion(_basis(n)) for n in normals[shown]]).reshape(-1, 4)
+        extents = np.full((len(shown), 2), _UNBOUNDED)
+    half = np.column_stack([extents / 2, np.full(len(shown), 0.002)])
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Boxes3D(
+            centers=centers,
+            half_sizes=half,
+            quaternions=turned,
+            colors=np.column_stack([paint[shown], np.full(len(shown), 90, np.uint8)]),
+            fill_mode=rr.components.FillMode.Solid,
+        ),
+    )
+    canvas.draw(
+        "space/normals",
+        message.frame,
+        rr.Arrows3D(origins=centers, vectors=normals[shown] * _NORMAL, colors=paint[shown]),
+    )
+
+
+def _basis(normal: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
+    """A rotation (3, 3) whose z axis is `normal`."""
+    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    x = np.cross(helper, normal)
+    x /= np.linalg.norm(x)
+    return np.column_stack([x, np.cross(normal, x), normal])

@@ -1,0 +1,238 @@
+"""Objects in the image and in space: detections, segmentation, boxes, tracks, landmarks."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from dataflow.messages import Boxes3D, Detections2D, LandmarkSightings, SegmentationMap, Tracks, TrackState
+from dataflow.view import colors
+from dataflow.view.canvas import Canvas, visualizer
+from dataflow.view.visualizers.clouds import finite_rows
+
+MANY_LABELS = 40  # more labels than this are shown only on hovering
+_RAY = 10.0  # metres: how far a bearing without a range is drawn
+_PATH_VERTICES = 200
+
+
+@visualizer(Detections2D, "overlay")
+def detections_2d(canvas: Canvas, message: Detections2D) -> None:
+    """Boxes over the image, coloured by class, labelled with name, identity and score."""
+    shown = finite_rows(message.boxes)
+    names = message.labels()
+    labels = [_label(names[i], _id(message.ids, i), float(message.scores[i])) for i in shown]
+    _boxes_2d(canvas, message.boxes[shown], colors.of_classes([names[i] for i in shown]), labels)
+
+
+@visualizer(SegmentationMap, "overlay")
+def segmentation_map(canvas: Canvas, message: SegmentationMap) -> None:
+    """Classes as a half-transparent layer in class colours; instances, where known, in a layer of their own."""
+    if message.classes.size == 0:
+        canvas.clear("overlay")
+        return
+    known = range(len(message.class_names)) if message.class_names else np.unique(message.classes).tolist()
+    table = canvas.scene.remembered.setdefault((canvas.entity, "classes"), {})
+    for index in known:
+        name = message.class_names[index] if message.class_names else str(index)
+        table[index] = rr.AnnotationInfo(id=index, label=name, color=(*colors.of_class(name), 255))
+    if message.void is not None:
+        table[message.void] = rr.AnnotationInfo(id=message.void, label="void", color=(0, 0, 0, 0))
+    if canvas.scene.changed(canvas.entity, "annotations", tuple((i, table[i].label) for i in sorted(table))):
+        canvas.log("overlay", rr.AnnotationContext([table[i] for i in sorted(table)]), static=True)
+    canvas.draw("overlay", canvas.plane, rr.SegmentationImage(message.classes, opacity=0.45, draw_order=1.0))
+    if message.instances is not None:
+        canvas.draw("instances", canvas.plane, rr.SegmentationImage(message.instances, opacity=0.6))
+
+
+@visualizer(Boxes3D, "space")
+def boxes_3d(canvas: Canvas, message: Boxes3D) -> None:
+    """Oriented boxes, coloured by class, with arrows for velocities (one second of travel)."""
+    shown = finite_rows(message.centers, message.sizes, message.orientations)
+    names = message.labels()
+    paint = colors.of_classes([names[i] for i in shown])
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Boxes3D(
+            centers=message.centers[shown],
+            half_sizes=message.sizes[shown] / 2,
+            quaternions=message.orientations[shown],
+            colors=paint,
+            labels=[_label(names[i], _id(message.ids, i), float(message.scores[i])) for i in shown],
+            show_labels=len(shown) <= MANY_LABELS,
+        ),
+    )
+    _velocities(canvas, message.frame, message.centers[shown], message.velocities, shown, paint)
+
+
+@visualizer(Tracks, "overlay", "space")
+def tracks(canvas: Canvas, message: Tracks) -> None:
+    """Boxes over the image and in space, coloured by identity and darker while coasting, with their recent paths."""
+    alive = np.flatnonzero(message.states != TrackState.ENDED)
+    names = message.labels()
+    labels = [_label(names[i], int(message.ids[i]), None) for i in range(message.count)]
+    paint = colors.of_identities(message.ids.tolist())
+    paint[message.states == TrackState.COASTING] //= 2
+    if message.boxes is not None:
+        shown = alive[np.isfinite(message.boxes[alive]).all(axis=1)]
+        _boxes_2d(canvas, message.boxes[shown], paint[shown], [labels[i] for i in shown])
+    if message.positions is None:
+        return
+    shown = alive[np.isfinite(message.positions[alive]).all(axis=1)]
+    centers = message.positions[shown]
+    names_shown = [labels[i] for i in shown]
+    if message.sizes is not None:
+        canvas.draw(
+            "space",
+            message.frame,
+            rr.Boxes3D(
+                centers=centers,
+                half_sizes=np.nan_to_num(message.sizes[shown]) / 2,
+                quaternions=None if message.orientations is None else message.orientations[shown],
+                colors=paint[shown],
+                labels=names_shown,
+                show_labels=len(shown) <= MANY_LABELS,
+            ),
+        )
+    else:
+        canvas.draw(
+            "space",
+            message.frame,
+            rr.Points3D(
+                centers,
+                colors=paint[shown],
+                labels=names_shown,
+                radii=rr.Radius.ui_points(6.0),
+                show_labels=len(shown) <= MANY_LABELS,
+            ),
+        )
+    _velocities(canvas, message.frame, centers, message.velocities, shown, paint[shown])
+    _track_paths(canvas, message, shown, paint)
+
+
+@visualizer(LandmarkSightings, "space")
+def landmark_sightings(canvas: Canvas, message: LandmarkSightings) -> None:
+    """Points; where only the bearing is known, rays of 10 m; where only the range is known, circles."""
+    paint = colors.of_identities(message.ids.tolist())
+    labels = [f"{message.family} {i}".strip() if i >= 0 else "?" for i in message.ids.tolist()]
+    points, ranges, bearings = message.positions, message.ranges, message.bearings
+    if points is not None and points.shape[1] == 2:
+        points = np.column_stack([points, np.zeros(len(points))])
+    if points is None and bearings is not None:
+        e = np.zeros(message.count) if message.elevations is None else message.elevations
+        rays = np.column_stack([np.cos(e) * np.cos(bearings), np.cos(e) * np.sin(bearings), np.sin(e)])
+        if ranges is None:
+            shown = finite_rows(rays)
+            strips = [np.array([np.zeros(3), rays[i] * _RAY]) for i in shown]
+            canvas.draw(
+                "space",
+                message.frame,
+                rr.LineStrips3D(strips, colors=paint[shown], labels=[labels[i] for i in shown]),
+            )
+            return
+        points = rays * ranges[:, None]
+    if points is None:
+        assert ranges is not None  # polar without bearings
+        turn = np.linspace(0, 2 * np.pi, 65)
+        circle = np.column_stack([np.cos(turn), np.sin(turn), np.zeros_like(turn)])
+        shown = finite_rows(ranges)
+        canvas.draw(
+            "space",
+            message.frame,
+            rr.LineStrips3D(
+                [circle * ranges[i] for i in shown], colors=paint[shown], labels=[labels[i] for i in shown]
+            ),
+        )
+        return
+    shown = finite_rows(points)
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Points3D(
+            points[shown],
+            colors=paint[shown],
+            labels=[labels[i] for i in shown],
+            radii=rr.Radius.ui_points(6.0),
+            show_labels=len(shown) <= MANY_LABELS,
+        ),
+    )
+
+
+def _boxes_2d(canvas: Canvas, boxes: npt.NDArray[np.float32], paint: colors.Colors, labels: list[str]) -> None:
+    canvas.draw(
+        "overlay",
+        canvas.plane,
+        rr.Boxes2D(
+            array=boxes.reshape(-1, 4),
+            array_format=rr.Box2DFormat.XYXY,
+            colors=paint,
+            labels=labels,
+            show_labels=len(labels) <= MANY_LABELS,
+            draw_order=10.0,
+        ),
+    )
+
+
+def _velocities(
+    canvas: Canvas,
+    frame: str,
+    origins: npt.NDArray[np.float64],
+    velocities: npt.NDArray[np.float64] | None,
+    shown: npt.NDArray[np.int64],
+    paint: colors.Colors,
+) -> None:
+    if velocities is None:
+        return
+    vectors = velocities[shown]
+    moving = np.isfinite(vectors).all(axis=1) & (np.linalg.norm(np.nan_to_num(vectors), axis=1) > 0.05)
+    canvas.draw(
+        "space/velocity",
+        frame,
+        rr.Arrows3D(
+            vectors=vectors[moving],
+            origins=origins[moving],
+            colors=paint[moving],
+            radii=rr.Radius.ui_points(1.5),
+        ),
+    )
+
+
+def _track_paths(canvas: Canvas, message: Tracks, shown: npt.NDArray[np.int64], paint: colors.Colors) -> None:
+    assert message.positions is not None
+    paths = canvas.scene.track_paths.setdefault(canvas.entity, {})
+    if canvas.scene.changed(canvas.entity, "track frame", message.frame):
+        paths.clear()
+    oldest = message.stamp - canvas.scene.options.track_history
+    for i in shown:
+        path = paths.setdefault(int(message.ids[i]), deque(maxlen=_PATH_VERTICES))
+        path.append((message.stamp, message.positions[i]))
+    for identity, path in list(paths.items()):
+        while path and (path[0][0] < oldest or path[0][0] > message.stamp):
+            path.popleft()
+        if not path:
+            del paths[identity]
+    drawn = [(i, paths[int(message.ids[i])]) for i in shown if len(paths.get(int(message.ids[i]), ())) > 1]
+    canvas.draw(
+        "space/paths",
+        message.frame,
+        rr.LineStrips3D(
+            [np.array([position for _, position in path]) for _, path in drawn],
+            colors=[paint[i] for i, _ in drawn],
+            radii=rr.Radius.ui_points(1.5),
+        ),
+    )
+
+
+def _id(ids: Sequence[int] | npt.NDArray[np.int64] | None, index: int) -> int | None:
+    return None if ids is None else int(ids[index])
+
+
+def _label(name: str, identity: int | None, score: float | None) -> str:
+    words = [name] + ([f"#{identity}"] if identity is not None else [])
+    if score is not None and np.isfinite(score):
+        words.append(f"{score:.2f}")
+    return " ".join(words)

@@ -1,0 +1,182 @@
+"""Where things are: transforms, poses, odometry, paths, particles, satellite fixes."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from dataflow.messages import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
+from dataflow.messages.geometry import matrix_to_quaternion, quaternion_from_yaw, quaternion_to_matrix
+from dataflow.view import colors
+from dataflow.view.canvas import Canvas, visualizer
+from dataflow.view.scene import Trail
+from dataflow.view.visualizers.clouds import finite_rows, thin
+
+_AXIS = 0.15  # metres
+_ARROW = 0.12  # metres: a particle
+_GAP = 5.0  # metres: a farther step than this is a jump, and no line is drawn along it
+
+
+@visualizer(Transforms, "space")
+def transforms(canvas: Canvas, message: Transforms) -> None:
+    """Frames of the tree, with their axes."""
+    for frame, child, T in zip(message.frames, message.child_frames, message.matrices(), strict=True):
+        canvas.place(frame, child, T, tree=True)
+        if child and canvas.scene.changed(canvas.entity, f"axes {child}", True):
+            where = f"space/{rr.escape_entity_path_part(child)}"
+            canvas.log(where, rr.CoordinateFrame(child), _axes(np.eye(4), 0.6 * _AXIS), static=True)
+
+
+@visualizer(Pose, "space")
+def pose(canvas: Canvas, message: Pose) -> None:
+    """Axes, the trail behind them, the covariance of the position; a named child frame follows the pose."""
+    _moving(canvas, message.frame, message.child_frame, message.matrix(), message.covariance)
+
+
+@visualizer(Odometry, "space", "plot")
+def odometry(canvas: Canvas, message: Odometry) -> None:
+    """As a pose, and curves of the speeds."""
+    _moving(canvas, message.frame, message.child_frame, message.matrix(), message.pose_covariance)
+    _speeds(canvas, message.linear, message.angular)
+
+
+@visualizer(Twist, "plot")
+def twist(canvas: Canvas, message: Twist) -> None:
+    """Curves of the velocities along and about each axis."""
+    canvas.plot("linear", message.linear, ["vx m/s", "vy m/s", "vz m/s"])
+    canvas.plot("angular", message.angular, ["wx rad/s", "wy rad/s", "wz rad/s"])
+
+
+@visualizer(Path, "space")
+def path(canvas: Canvas, message: Path) -> None:
+    """The whole path as a line."""
+    shown = finite_rows(message.positions)
+    color = canvas.scene.trail_color(canvas.stream, canvas.scene.layout.of_type(Path))
+    strips = [message.positions[shown]] if len(shown) > 1 else []
+    canvas.draw("space", message.frame, rr.LineStrips3D(strips, colors=color, radii=rr.Radius.ui_points(2.0)))
+
+
+@visualizer(ParticleSet, "space")
+def particle_set(canvas: Canvas, message: ParticleSet) -> None:
+    """An arrow along x per particle, coloured by weight."""
+    kept = thin(canvas, finite_rows(message.poses))
+    poses = message.poses[kept]
+    if poses.shape[1] == 3:
+        positions = np.column_stack([poses[:, :2], np.zeros(len(poses))])
+        rotations = quaternion_from_yaw(poses[:, 2])
+    else:
+        positions, rotations = poses[:, :3], poses[:, 3:]
+    ahead = quaternion_to_matrix(rotations)[..., 0] if len(poses) else np.zeros((0, 3))
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Arrows3D(
+            origins=positions,
+            vectors=ahead * _ARROW,
+            colors=colors.of_values(message.weights[kept]),
+            radii=rr.Radius.ui_points(1.0),
+        ),
+    )
+
+
+@visualizer(NavSatFix, "map", "plot")
+def nav_sat_fix(canvas: Canvas, message: NavSatFix) -> None:
+    """A point on the map, the way so far, and the height as a curve; nothing without a fix."""
+    if np.isfinite(message.altitude):
+        canvas.plot("altitude", [message.altitude], ["altitude m"])
+    if not (np.isfinite(message.latitude) and np.isfinite(message.longitude)):
+        canvas.clear("map/fix")
+        return
+    here = np.array([message.latitude, message.longitude])
+    color = canvas.scene.trail_color(canvas.stream, canvas.scene.layout.of_type(NavSatFix))
+    canvas.log("map/fix", rr.GeoPoints(lat_lon=[here], radii=rr.Radius.ui_points(7.0), colors=color))
+    before = canvas.scene.trails.get(canvas.entity)
+    if before is not None:
+        canvas.log("map/way", rr.GeoLineStrings(lat_lon=[[before.position, here]], colors=color))
+    canvas.scene.trails[canvas.entity] = Trail("", here)
+
+
+def _moving(
+    canvas: Canvas,
+    frame: str,
+    child: str,
+    T_frame_child: npt.NDArray[np.float64],
+    covariance: npt.NDArray[np.float64] | None,
+) -> None:
+    if not np.isfinite(T_frame_child).all():
+        canvas.clear("space/axes")
+        canvas.clear("space/covariance")
+        canvas.scene.trails.pop(canvas.entity, None)
+        return
+    if child and child != frame:
+        canvas.place(frame, child, T_frame_child)
+    canvas.draw("space/axes", frame, _axes(T_frame_child, _AXIS))
+    position = T_frame_child[:3, 3]
+    if covariance is not None:
+        _ellipsoid(canvas, frame, position, covariance[:3, :3])
+    _trail(canvas, frame, position)
+
+
+def _trail(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> None:
+    """One segment, from the last vertex to here: the view shows all of them, so a trail costs the same for ever."""
+    last = canvas.scene.trails.get(canvas.entity)
+    if last is None or last.frame != frame:
+        canvas.scene.trails[canvas.entity] = Trail(frame, position)
+        return
+    step = float(np.linalg.norm(position - last.position))
+    if step < canvas.scene.options.trail:
+        return
+    if step <= _GAP:
+        color = canvas.scene.trail_color(canvas.stream, canvas.scene.layout.of_type(Pose, Odometry))
+        canvas.draw(
+            "space/trail",
+            frame,
+            rr.LineStrips3D([[last.position, position]], colors=color, radii=rr.Radius.ui_points(2.0)),
+        )
+    canvas.scene.trails[canvas.entity] = Trail(frame, position)
+
+
+def _axes(T: npt.NDArray[np.float64], length: float) -> rr.Arrows3D:
+    return rr.Arrows3D(
+        origins=np.repeat(T[None, :3, 3], 3, axis=0),
+        vectors=T[:3, :3].T * length,
+        colors=list(colors.AXES),
+        radii=rr.Radius.ui_points(2.0),
+    )
+
+
+def _ellipsoid(
+    canvas: Canvas, frame: str, center: npt.NDArray[np.float64], covariance: npt.NDArray[np.float64]
+) -> None:
+    """Two standard deviations of a position. A covariance that is none (not finite, not positive) is not drawn."""
+    if not np.isfinite(covariance).all():
+        canvas.clear("space/covariance")
+        return
+    variances, directions = np.linalg.eigh((covariance + covariance.T) / 2)
+    if variances.min() < -1e-9 or variances.max() <= 0:
+        canvas.clear("space/covariance")
+        return
+    if np.linalg.det(directions) < 0:
+        directions[:, 0] *= -1
+    canvas.draw(
+        "space/covariance",
+        frame,
+        rr.Ellipsoids3D(
+            centers=[center],
+            half_sizes=[2 * np.sqrt(np.maximum(variances, 0))],
+            quaternions=[matrix_to_quaternion(directions)],
+            colors=(*colors.NEUTRAL, 120),
+        ),
+    )
+
+
+def _speeds(canvas: Canvas, linear: npt.NDArray[np.float64] | None, angular: npt.NDArray[np.float64] | None) -> None:
+    values, names = [], []
+    if linear is not None:
+        values.append(float(np.linalg.norm(linear)))
+        names.append("speed m/s")
+    if angular is not None:
+        values.append(float(np.linalg.norm(angular)))
+        names.append("turn rad/s")
+    canvas.plot("speed", values, names)

@@ -1,0 +1,81 @@
+"""Sensors of the robot itself, and the health of the system: curves and text."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import rerun as rr
+
+from dataflow.messages import Diagnostics, Imu, JointState, Level, MagneticField, WheelTicks
+from dataflow.view.canvas import Canvas, visualizer
+
+_LEVELS = {Level.OK: "INFO", Level.WARN: "WARN", Level.ERROR: "ERROR", Level.STALE: "WARN"}
+_LATENCY = re.compile(r"latency|lag|delay|duration|age|_ms$|_s$|time")
+_RATE = re.compile(r"rate|hz|fps|frequency|throughput")
+
+
+@visualizer(Imu, "plot")
+def imu(canvas: Canvas, message: Imu) -> None:
+    """Curves of the gyroscope and the accelerometer, and of the temperature where it is given."""
+    canvas.plot("gyroscope", message.angular_velocity, ["wx rad/s", "wy rad/s", "wz rad/s"])
+    canvas.plot("accelerometer", message.linear_acceleration, ["ax m/s²", "ay m/s²", "az m/s²"])
+    if message.temperature is not None:
+        canvas.plot("temperature", [message.temperature], ["°C"])
+
+
+@visualizer(MagneticField, "plot")
+def magnetic_field(canvas: Canvas, message: MagneticField) -> None:
+    """Curves of the field in microtesla."""
+    canvas.plot("field", message.field * 1e6, ["x µT", "y µT", "z µT"])
+
+
+@visualizer(WheelTicks, "plot")
+def wheel_ticks(canvas: Canvas, message: WheelTicks) -> None:
+    """A curve of the count of each wheel."""
+    canvas.plot("ticks", message.ticks.astype(np.float64), message.names)
+
+
+@visualizer(JointState, "plot")
+def joint_state(canvas: Canvas, message: JointState) -> None:
+    """Curves of positions, velocities and efforts of each joint."""
+    for what in ("positions", "velocities", "efforts"):
+        values = getattr(message, what)
+        if values is not None:
+            canvas.plot(what, values, message.names)
+
+
+@visualizer(Diagnostics, "log", "plot")
+def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
+    """A line of text when a status changes; numeric values as curves, latencies and rates in plots of their own."""
+    for i, name in enumerate(message.names):
+        level = Level(int(message.levels[i]))
+        state = (level, message.messages[i])
+        if canvas.scene.changed(canvas.entity, f"status {name}", state):
+            canvas.text(f"{name}: {level.name} {message.messages[i]}".rstrip(), _LEVELS[level])
+        for key, value in message.pairs(i).items():
+            number = _number(value)
+            if number is None:
+                continue
+            path = "/".join(("plot", _kind(key), *map(rr.escape_entity_path_part, (name, key))))
+            if canvas.scene.changed(canvas.entity, path, True):
+                canvas.log(path, rr.SeriesLines(names=f"{name} {key}"), static=True)
+            canvas.log(path, rr.Scalars(number))
+
+
+def _kind(key: str) -> str:
+    """Which plot a value belongs to: the same unit, more or less."""
+    lower = key.lower()
+    if _RATE.search(lower):
+        return "rate"
+    return "latency" if _LATENCY.search(lower) else "value"
+
+
+def _number(text: str) -> float | None:
+    """The number that a value begins with (`12.5 ms`), or None."""
+    try:
+        value = float(text.split()[0]) if text.strip() else math.nan
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

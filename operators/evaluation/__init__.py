@@ -1,0 +1,5 @@
+"""Sinks that score streams against ground truth."""
+
+from operators.evaluation.trajectory_metrics import TrajectoryMetrics
+
+__all__ = ["TrajectoryMetrics"]

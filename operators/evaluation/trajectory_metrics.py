@@ -1,0 +1,87 @@
+"""Scores odometry against ground truth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from dataflow.messages import Odometry, Pose
+from dataflow.operator import Batch, Duration, In, Operator, Param
+from operators.evaluation.trajectory import (
+    Trajectory,
+    absolute_error,
+    match,
+    path_length,
+    relative_errors,
+)
+
+
+class TrajectoryMetrics(Operator):
+    """Collects an estimated and a true trajectory and computes ATE and RPE when the estimate ends.
+
+    Both must pose the same child frame; the frames they are expressed in may differ, which the alignment makes up for.
+    Poses are paired after the fact, each with the truth nearest in time within `tolerance`: truth is a batch input, so
+    it may come at any rate and late without delaying or dropping an estimate.
+    """
+
+    estimate: In[Odometry] = In(doc="the poses to score")
+    ground_truth: Batch[Pose] = Batch(doc="the true poses of the same child frame")
+
+    alignment: Literal["se3", "sim3", "none"] = Param(
+        "se3", doc="moves the whole estimate onto the truth (Umeyama): rigidly, with scale, or not at all"
+    )
+    tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
+    rpe_seconds: float = Param(1.0, gt=0, doc="span of the relative error over time", unit="s")
+    rpe_metres: float = Param(1.0, gt=0, doc="span of the relative error over the true path", unit="m")
+    out: str | None = Param(None, doc="folder for estimate.tum, ground_truth.tum and metrics.json; made if missing")
+
+    def setup(self) -> None:
+        self._estimate, self._truth = Trajectory.empty(), Trajectory.empty()
+        self._not_finite = 0
+        self._figures: dict[str, float | int | str] = {}
+
+    def process(self, estimate: Odometry, ground_truth: tuple[Pose, ...]) -> None:
+        """Raises ValueError where estimate and truth pose different child frames."""
+        for truth in ground_truth:
+            if truth.child_frame and truth.child_frame != estimate.child_frame:
+                raise ValueError(
+                    f"the ground truth poses {truth.child_frame!r} but the estimate {estimate.child_frame!r}: "
+                    f"both must pose the same frame"
+                )
+            self._truth.append(truth.stamp, truth.position, truth.orientation)
+        if np.isfinite(estimate.position).all():
+            self._estimate.append(estimate.stamp, estimate.position, estimate.orientation)
+        else:
+            self._not_finite += 1
+
+    def finish(self) -> None:
+        """Computes the figures and writes the files."""
+        matches = match(self._estimate, self._truth, self.tolerance)
+        self._figures = {
+            "matched": len(matches.estimate),
+            "unmatched_estimates": matches.unmatched_estimates,
+            "unmatched_truths": matches.unmatched_truths,
+            "estimates_not_finite": self._not_finite,
+            "path_m": path_length(matches.truth),
+            "alignment": self.alignment,
+        }
+        try:
+            self._figures |= absolute_error(matches, self.alignment)
+        except ValueError as error:
+            self._figures["ate"] = f"not computed for {len(matches.estimate)} matched poses: {error}"
+        self._figures |= relative_errors(matches, self.rpe_seconds, self.rpe_metres)
+        if self.out is not None:
+            self._write(Path(self.out).expanduser())
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        return dict(self._figures)
+
+    def _write(self, folder: Path) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "estimate.tum").write_text(self._estimate.tum())
+        (folder / "ground_truth.tum").write_text(self._truth.tum())
+        (folder / "metrics.json").write_text(json.dumps(self._figures, indent=2) + "\n")

@@ -1,0 +1,135 @@
+"""RGB-D visual odometry as an operator."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import CameraInfo, DepthImage, Image, Odometry, Transforms
+from dataflow.messages.geometry import invert
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.cloud_builder import transform_between
+from operators.odometry.camera import RgbdCamera
+from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig
+from operators.odometry.se3 import Matrix
+from operators.odometry.surface import DepthNoise
+
+
+@dataclass(frozen=True)
+class _Tracker:
+    calibration: tuple[CameraInfo, CameraInfo, Transforms | None]
+    odometry: RgbdOdometry
+
+
+class VisualOdometry(Operator):
+    """Tracks an RGB-D camera by its features and its depth; the first frame's depth camera is the origin.
+
+    The pose is that of the depth camera's optical frame, at every frame, also while nothing can be measured:
+    then it follows the motion so far and its covariance grows. The images need not be registered, but must be
+    free of lens distortion. Without `extrinsics` the two cameras are taken to coincide.
+    """
+
+    image: In[Image] = In(doc="colour or grey, of the same stamp")
+    depth: In[DepthImage] = In(doc="depth, metres")
+    image_info: Sampled[CameraInfo] = Sampled(doc="calibration of the colour camera")
+    depth_info: Sampled[CameraInfo] = Sampled(doc="calibration of the depth camera")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the two cameras' frames, in either direction"
+    )
+    odometry: Out[Odometry] = Out(doc="the depth camera in the odometry frame, with covariance and velocity")
+
+    odometry_frame: str = Param(
+        "odom", min_length=1, doc="name of the frame that the first depth camera defines"
+    )
+    near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
+    far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
+    depth_noise_floor: float = Param(0.002, gt=0, doc="standard deviation of a near depth", unit="m")
+    depth_noise_quadratic: float = Param(
+        0.002, ge=0, doc="and what it grows by per depth squared", unit="1/m"
+    )
+    corners: int = Param(300, ge=30, doc="most corners tracked from a keyframe")
+    min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
+    refine: bool = Param(True, doc="refine with the depth image; off leaves the features alone")
+    keyframe_distance: float = Param(
+        0.15, gt=0, doc="change of view that makes a new keyframe: angle plus baseline over depth", unit="rad"
+    )
+    keyframes: int = Param(12, ge=1, doc="keyframes remembered")
+    patience: float = Param(
+        0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s"
+    )
+    give_up: float = Param(2.0, ge=0, doc="and until it begins anew at the predicted pose", unit="s")
+
+    _tracker: _Tracker | None = None
+
+    def process(
+        self,
+        image: Image,
+        depth: DepthImage,
+        image_info: CameraInfo,
+        depth_info: CameraInfo,
+        extrinsics: Transforms | None = None,
+    ) -> Odometry:
+        """Raises ValueError where an image does not fit its calibration, or no transform fits."""
+        _check("image", image, image_info)
+        _check("depth", depth, depth_info)
+        result = self._tracking(image_info, depth_info, extrinsics).track(image.data, depth.data, depth.stamp)
+        return Odometry.from_matrix(
+            result.T_world_camera,
+            stamp=depth.stamp,
+            frame=self.odometry_frame,
+            child_frame=depth.frame,
+            linear=result.velocity[:3],
+            angular=result.velocity[3:],
+            pose_covariance=about_fixed_axes(result.covariance, result.T_world_camera),
+        )
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew, so nothing before it can be compared with."""
+        self._tracker = None
+
+    def _tracking(
+        self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None
+    ) -> RgbdOdometry:
+        """The tracker, made once for each calibration."""
+        given = (image_info, depth_info, extrinsics)
+        if self._tracker is None or self._tracker.calibration != given:
+            T_image_depth = transform_between(extrinsics, depth_info.frame, image_info.frame)
+            camera = RgbdCamera(image_info.K, depth_info.K, invert(T_image_depth))
+            self._tracker = _Tracker(given, RgbdOdometry(camera, self._config()))
+        return self._tracker.odometry
+
+    def _config(self) -> RgbdOdometryConfig:
+        return RgbdOdometryConfig(
+            near=self.near,
+            far=self.far,
+            depth_noise=DepthNoise(self.depth_noise_floor, self.depth_noise_quadratic),
+            corners=self.corners,
+            min_inliers=self.min_inliers,
+            refine=self.refine,
+            keyframe_distance=self.keyframe_distance,
+            keyframes=self.keyframes,
+            patience_s=self.patience,
+            give_up_s=self.patience + self.give_up,
+        )
+
+
+def about_fixed_axes(covariance: Matrix, T_world_camera: Matrix) -> NDArray[np.float64]:
+    """The covariance (6, 6) of (position, rotation about the world's axes) from that of a right perturbation."""
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = T_world_camera[:3, :3]
+    return A @ covariance @ A.T
+
+
+def _check(port: str, image: Image | DepthImage, info: CameraInfo) -> None:
+    if (image.width, image.height) != (info.width, info.height):
+        raise ValueError(
+            f"{port} has {image.width}x{image.height} pixels, but {port}_info describes {info.width}x{info.height}"
+        )
+    if image.frame != info.frame:
+        raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")
+    if info.distortion is not None and np.any(info.distortion):
+        raise ValueError(
+            f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first"
+        )

@@ -1,0 +1,188 @@
+"""RGB-D datasets on disk as a source."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Transforms
+from dataflow.messages.geometry import normalize, transform_matrix
+from dataflow.operator import Out, Param, Source
+from operators.sources.rgbd_layouts import (
+    Dataset,
+    DatasetError,
+    Frame,
+    Intrinsics,
+    detect_layout,
+    list_7scenes,
+    list_tum,
+)
+
+Size = tuple[int, int]
+
+
+class RgbdFolder(Source):
+    """Reads a folder of RGB-D frames in the 7-Scenes or the TUM RGB-D layout.
+
+    Image and depth of a frame carry one stamp: the colour image's in TUM, first_stamp + N / rate for frame N of
+    7-Scenes, exact in nanoseconds and the same for any start, stop and stride. Ground truth is the depth camera's pose
+    and absent at frames that have none. Every frame's files must be there when the graph starts.
+    """
+
+    image: Out[Image] = Out(doc="colour")
+    depth: Out[DepthImage] = Out(doc="depth, metres; 0 where there was no return or it lies beyond max_depth")
+    image_info: Out[CameraInfo] = Out(static=True, doc="calibration of the colour camera")
+    depth_info: Out[CameraInfo] = Out(static=True, doc="calibration of the depth camera")
+    extrinsics: Out[Transforms] = Out(static=True, doc="the colour camera in the depth camera's frame")
+    ground_truth: Out[Pose] = Out(doc="T_world_camera of the depth camera")
+
+    path: str = Param(doc="folder of the dataset")
+    layout: Literal["auto", "7scenes", "tum"] = Param("auto", doc="how the files lie")
+    rate: float = Param(30.0, gt=0, doc="frames a second where the layout has no stamps (7-Scenes)", unit="Hz")
+    first_stamp: int = Param(0, ge=0, doc="stamp of frame 0 where the layout has no stamps (7-Scenes)", unit="ns")
+    start: int = Param(0, ge=0, doc="first frame read, counted in the folder")
+    stop: int | None = Param(None, ge=1, doc="frame to stop before; none reads to the end")
+    stride: int = Param(1, ge=1, doc="read every stride-th frame")
+    max_depth: float = Param(6.0, gt=0, doc="larger depths are taken as no return", unit="m")
+    image_intrinsics: tuple[float, float, float, float] | None = Param(
+        None,
+        doc="fx, fy, cx, cy of the colour camera instead of the layout's (7-Scenes: 525 px, for its intrinsics file "
+        "describes the depth camera only)",
+        unit="px",
+    )
+    depth_intrinsics: tuple[float, float, float, float] | None = Param(
+        None, doc="fx, fy, cx, cy of the depth camera instead of the folder's camera-intrinsics.txt", unit="px"
+    )
+    T_depth_image: tuple[float, float, float, float, float, float, float] = Param(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+        doc="x, y, z, qx, qy, qz, qw of the colour camera in the depth camera's frame",
+        unit="m",
+    )
+    world_frame: str = Param("world", min_length=1, doc="frame of the ground truth")
+    image_frame: str = Param("camera_color_optical", min_length=1, doc="optical frame of the colour camera")
+    depth_frame: str = Param("camera_depth_optical", min_length=1, doc="optical frame of the depth camera")
+
+    def setup(self) -> None:
+        """Raises DatasetError for a folder, list, calibration or parameter that cannot be used."""
+        if self.image_frame == self.depth_frame:
+            raise DatasetError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
+        folder = Path(self.path).expanduser()
+        self._dataset = self._list(folder)
+        self._frames = self._dataset.frames[self.start : self.stop : self.stride]
+        if not self._frames:
+            raise DatasetError(
+                f"{folder} has {len(self._dataset.frames)} frames: start={self.start}, stop={self.stop}, "
+                f"stride={self.stride} leaves none"
+            )
+        for frame in self._frames:
+            for file in (frame.image, frame.depth):
+                if not file.is_file():
+                    raise DatasetError(f"frame {frame.name}: no file {file}")
+        if (folder / "camera-intrinsics.txt").is_file():
+            self.use_file(folder / "camera-intrinsics.txt")
+        self._image_size = _size(read_color(self._frames[0]))
+        self._depth_size = _size(read_depth(self._frames[0]))
+
+    def static_outputs(self) -> Mapping[str, Message]:
+        stamp, data = self._frames[0].stamp, self._dataset
+        *translation, qx, qy, qz, qw = self.T_depth_image
+        if not abs(np.linalg.norm([qx, qy, qz, qw]) - 1) < 1e-3:
+            raise DatasetError(f"T_depth_image: its last four numbers must be a unit quaternion, got {qx, qy, qz, qw}")
+        extrinsics = transform_matrix(translation, normalize([qx, qy, qz, qw]))
+        image = _camera(self.image_intrinsics, data.image_intrinsics)
+        depth = _camera(self.depth_intrinsics, data.depth_intrinsics)
+        return {
+            "image_info": _info(stamp, self.image_frame, self._image_size, image),
+            "depth_info": _info(stamp, self.depth_frame, self._depth_size, depth),
+            "extrinsics": Transforms.from_matrix(
+                extrinsics, stamp=stamp, frame=self.depth_frame, child_frame=self.image_frame
+            ),
+        }
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        """Raises DatasetError that names the frame and file where one cannot be read."""
+        for frame in self._frames:
+            color, raw = read_color(frame), read_depth(frame)
+            self._check_size(frame, frame.image, _size(color), self._image_size)
+            self._check_size(frame, frame.depth, _size(raw), self._depth_size)
+            depth = depth_in_metres(raw, self._dataset.depth_scale, self._dataset.invalid, self.max_depth)
+            messages: dict[str, Message] = {
+                "image": Image(stamp=frame.stamp, frame=self.image_frame, data=color),
+                "depth": DepthImage(stamp=frame.stamp, frame=self.depth_frame, data=depth),
+            }
+            T = frame.T_world_camera()
+            if T is not None:
+                messages["ground_truth"] = Pose.from_matrix(
+                    T, stamp=frame.stamp, frame=self.world_frame, child_frame=self.depth_frame
+                )
+            yield messages
+
+    def length(self) -> int | None:
+        return len(self._frames) if hasattr(self, "_frames") else None
+
+    def _list(self, folder: Path) -> Dataset:
+        layout = detect_layout(folder) if self.layout == "auto" else self.layout
+        if layout == "tum":
+            return list_tum(folder)
+        return list_7scenes(folder, self.rate, self.first_stamp)
+
+    def _check_size(self, frame: Frame, file: Path, found: Size, expected: Size) -> None:
+        if found != expected:
+            raise DatasetError(
+                f"frame {frame.name}: {file} has {found[0]}x{found[1]} pixels, "
+                f"but the first frame {expected[0]}x{expected[1]}"
+            )
+
+
+def read_color(frame: Frame) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB. Raises DatasetError."""
+    pixels = cv2.imread(str(frame.image), cv2.IMREAD_COLOR_RGB)
+    if pixels is None:
+        raise DatasetError(f"frame {frame.name}: {_why(frame.image)} as a colour image")
+    return np.asarray(pixels, np.uint8)
+
+
+def read_depth(frame: Frame) -> NDArray[np.uint16]:
+    """(H, W) in the dataset's own units. Raises DatasetError."""
+    pixels = cv2.imread(str(frame.depth), cv2.IMREAD_UNCHANGED)
+    if pixels is None:
+        raise DatasetError(f"frame {frame.name}: {_why(frame.depth)} as a depth image")
+    if pixels.dtype != np.uint16 or pixels.ndim != 2:
+        raise DatasetError(
+            f"frame {frame.name}: {frame.depth} must have one 16-bit channel, has {pixels.dtype} {pixels.shape}"
+        )
+    return np.asarray(pixels, np.uint16)
+
+
+def depth_in_metres(
+    raw: NDArray[np.uint16], scale: float, invalid: tuple[int, ...], max_depth: float
+) -> NDArray[np.float32]:
+    """Metres (H, W) float32 of raw values, `scale` units a metre; 0 for invalid ones and those beyond `max_depth`."""
+    metres = (np.arange(65536) / scale).astype(np.float32)
+    metres[metres > np.float32(max_depth)] = 0
+    metres[list(invalid)] = 0
+    return metres[raw]
+
+
+def _why(file: Path) -> str:
+    return f"cannot decode {file} ({file.stat().st_size} bytes)" if file.is_file() else f"no file {file} to read"
+
+
+def _size(pixels: NDArray[np.uint8] | NDArray[np.uint16]) -> Size:
+    return pixels.shape[1], pixels.shape[0]
+
+
+def _camera(given: tuple[float, float, float, float] | None, default: Intrinsics) -> Intrinsics:
+    return default if given is None else Intrinsics(*given)
+
+
+def _info(stamp: int, frame: str, size: Size, camera: Intrinsics) -> CameraInfo:
+    return CameraInfo.from_intrinsics(
+        stamp=stamp, frame=frame, width=size[0], height=size[1],
+        fx=camera.fx, fy=camera.fy, cx=camera.cx, cy=camera.cy,
+    )  # fmt: skip

@@ -1,0 +1,197 @@
+"""Where the files of an RGB-D dataset lie and what they mean: the 7-Scenes and TUM RGB-D layouts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import transform_matrix
+from operators.association import mutually_nearest
+from operators.sources.pacing import frame_stamp
+
+Matrix = NDArray[np.float64]
+LayoutName = Literal["7scenes", "tum"]
+
+_TUM_GAP = 20_000_000  # ns: images farther apart than this are no pair, as in the dataset's own associate.py
+_FRAME = re.compile(r"frame-(\d+)\.(?:color\.(?:jpg|png)|depth\.png|pose\.txt)")
+
+
+class DatasetError(ValueError):
+    """A dataset that cannot be read: names the file, the frame, what is wrong and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """A pinhole camera in pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Frame:
+    """The files of one frame. `pose` is a file with T_world_camera, that matrix (4, 4) itself, or None."""
+
+    name: str
+    stamp: int
+    image: Path
+    depth: Path
+    pose: Path | Matrix | None
+
+    def T_world_camera(self) -> Matrix | None:
+        """The true pose, its rotation made orthonormal, or None. Raises DatasetError for a matrix that is no pose."""
+        if self.pose is None or isinstance(self.pose, np.ndarray):
+            return self.pose
+        T = read_matrix(self.pose, (4, 4))
+        if not np.isfinite(T).all():  # 7-Scenes marks a pose it does not know so
+            return None
+        if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6 or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 0.05:
+            raise DatasetError(f"{self.pose}: frame {self.name}: not a rigid motion:\n{T}")
+        T[:3, :3] = nearest_rotation(T[:3, :3])
+        return T
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Dataset:
+    """A listed folder. One unit of a depth image is `1 / depth_scale` metres; the values in `invalid` are no return."""
+
+    frames: Sequence[Frame]
+    depth_scale: float
+    invalid: tuple[int, ...]
+    image_intrinsics: Intrinsics
+    depth_intrinsics: Intrinsics
+
+
+def detect_layout(folder: Path) -> LayoutName:
+    """Raises DatasetError where the folder is neither."""
+    if not folder.is_dir():
+        raise DatasetError(f"no folder {str(folder)!r} (looked for {folder.absolute()})")
+    if (folder / "rgb.txt").is_file():
+        return "tum"
+    if any(_FRAME.fullmatch(entry.name) for entry in folder.iterdir()):
+        return "7scenes"
+    raise DatasetError(
+        f"{folder} holds neither the 7-Scenes layout (frame-000000.color.jpg, ...) nor TUM RGB-D (rgb.txt, depth.txt)"
+    )
+
+
+def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
+    """`frame-NNNNNN.color.jpg|png`, `.depth.png` (millimetres), `.pose.txt`; frame N is at first_stamp + N / rate.
+
+    `camera-intrinsics.txt` is K of the depth camera. The colour camera is not the same and not registered to it: its
+    focal length is taken as 525 px, the Kinect's nominal one, around the same centre.
+    """
+    numbers: dict[int, str] = {}
+    present: set[str] = set()
+    for entry in folder.iterdir():
+        match = _FRAME.fullmatch(entry.name)
+        if match:
+            numbers[int(match[1])] = match[1]
+            present.add(entry.name)
+    if not numbers:
+        raise DatasetError(f"{folder} has no frame-NNNNNN.color.jpg, as the 7-Scenes layout has")
+    frames = []
+    for number in sorted(numbers):
+        stem = f"frame-{numbers[number]}"
+        image = next((f"{stem}.color.{s}" for s in ("jpg", "png") if f"{stem}.color.{s}" in present), None)
+        if image is None:
+            raise DatasetError(f"frame {numbers[number]} has no colour image: no {folder / stem}.color.jpg (or .png)")
+        if f"{stem}.depth.png" not in present:
+            raise DatasetError(f"frame {numbers[number]} has no depth image: no {folder / stem}.depth.png")
+        pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
+        stamp = frame_stamp(number, rate, first_stamp)
+        frames.append(Frame(numbers[number], stamp, folder / image, folder / f"{stem}.depth.png", pose))
+    depth = _intrinsics_file(folder) or Intrinsics(585.0, 585.0, 320.0, 240.0)
+    return Dataset(frames, 1000.0, (0, 65535), Intrinsics(525.0, 525.0, depth.cx, depth.cy), depth)
+
+
+def list_tum(folder: Path) -> Dataset:
+    """`rgb.txt`, `depth.txt`, `groundtruth.txt`: stamps in seconds, pairs by nearest stamp within 20 ms.
+
+    A frame's stamp is its colour image's. Depth is registered to colour, 5000 units a metre; without
+    `camera-intrinsics.txt` both have the dataset's default of 525 px around (319.5, 239.5).
+    """
+    images, depths = _tum_list(folder / "rgb.txt", 1), _tum_list(folder / "depth.txt", 1)
+    truth = _tum_list(folder / "groundtruth.txt", 7) if (folder / "groundtruth.txt").is_file() else []
+    stamps = [stamp for stamp, _ in images]
+    try:
+        poses = dict(mutually_nearest(stamps, [stamp for stamp, _ in truth], _TUM_GAP))
+        pairs = mutually_nearest(stamps, [stamp for stamp, _ in depths], _TUM_GAP)
+    except ValueError as error:
+        raise DatasetError(f"{folder}: {error}") from None
+    if not pairs:
+        raise DatasetError(f"{folder}: no image of rgb.txt is within 20 ms of one of depth.txt")
+    frames = []
+    for i, j in pairs:
+        stamp, (image,) = images[i]
+        pose = _tum_pose(folder, *truth[poses[i]]) if i in poses else None
+        frames.append(Frame(image, stamp, folder / image, folder / depths[j][1][0], pose))
+    K = _intrinsics_file(folder) or Intrinsics(525.0, 525.0, 319.5, 239.5)
+    return Dataset(frames, 5000.0, (0,), K, K)
+
+
+def nearest_rotation(M: Matrix) -> Matrix:
+    """The rotation (3, 3) nearest to M in the Frobenius norm."""
+    U, _, Vt = np.linalg.svd(M)
+    R: Matrix = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return R
+
+
+def read_matrix(file: Path, shape: tuple[int, int]) -> Matrix:
+    """A text file of numbers as a matrix. Raises DatasetError."""
+    try:
+        values = np.array(file.read_text().split(), np.float64)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"{file}: {error}") from None
+    if values.size != shape[0] * shape[1]:
+        raise DatasetError(f"{file}: expected {shape[0]}x{shape[1]} numbers, found {values.size}")
+    return values.reshape(shape)
+
+
+def _intrinsics_file(folder: Path) -> Intrinsics | None:
+    file = folder / "camera-intrinsics.txt"
+    if not file.is_file():
+        return None
+    K = read_matrix(file, (3, 3))
+    if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise DatasetError(f"{file}: not an intrinsic matrix with positive focal lengths:\n{K}")
+    return Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
+
+
+def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
+    """The lines `seconds value...` of a TUM list file, stamps exact in nanoseconds."""
+    if not file.is_file():
+        raise DatasetError(f"the TUM RGB-D layout needs {file.name} (looked for {file.absolute()})")
+    rows = []
+    for number, line in enumerate(file.read_text().splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp = int(Fraction(words[0]) * 10**9)
+        except (ValueError, ZeroDivisionError):
+            raise DatasetError(f"{file}:{number}: {words[0]!r} is no time in seconds") from None
+        if len(words) != values + 1:
+            raise DatasetError(f"{file}:{number}: expected a time and {values} values, found {line!r}")
+        rows.append((stamp, words[1:]))
+    return rows
+
+
+def _tum_pose(folder: Path, stamp: int, words: Sequence[str]) -> Matrix:
+    try:
+        x, y, z, qx, qy, qz, qw = map(float, words)
+    except ValueError as error:
+        raise DatasetError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: {error}") from None
+    norm = float(np.linalg.norm([qx, qy, qz, qw]))
+    if not abs(norm - 1) < 0.01:
+        raise DatasetError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: quaternion of length {norm:.3g}, not 1")
+    return transform_matrix([x, y, z], [qx, qy, qz, qw])

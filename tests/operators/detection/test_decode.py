@@ -1,0 +1,55 @@
+"""Decoding network outputs whose content is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from operators.detection.decode import decode_fastestdet, decode_yolov5, decode_yolov8
+
+
+def test_fastestdet_reads_offset_size_and_score_of_a_cell() -> None:
+    output = np.zeros((1, 5 + 80, 22, 22), np.float32)
+    output[0, 0, 3, 7] = 0.81  # objectness
+    output[0, 1:3, 3, 7] = np.arctanh([0.5, -0.25])  # offsets in cells
+    output[0, 3:5, 3, 7] = np.log([0.2 / 0.8, 0.4 / 0.6])  # size as share of the image, before the sigmoid
+    output[0, 5 + 16, 3, 7] = 0.64
+    found = decode_fastestdet(output, (352, 176), 0.1)
+    center, size = np.array([(7 + 0.5) / 22 * 352, (3 - 0.25) / 22 * 176]), np.array([0.2 * 352, 0.4 * 176])
+    np.testing.assert_allclose(found.boxes, [[*(center - size / 2), *(center + size / 2)]], rtol=1e-5)
+    np.testing.assert_allclose(found.scores, [0.81**0.6 * 0.64**0.4], rtol=1e-5)
+    assert found.classes.tolist() == [16]
+
+
+def test_the_threshold_itself_passes() -> None:
+    output = np.zeros((1, 6, 1, 2), np.float32)
+    output[0, 0] = output[0, 5] = [[1.0, 0.999]]
+    assert len(decode_fastestdet(output, (8, 8), 1.0).scores) == 1
+
+
+def test_yolov5_and_yolov8_agree_on_the_same_boxes() -> None:
+    rows = np.array([[50, 40, 20, 10, 0.1, 0.8], [10, 10, 4, 4, 0.05, 0.02]], np.float32)
+    v8 = decode_yolov8(np.ascontiguousarray(rows.T[None]), (64, 64), 0.25)
+    with_objectness = np.insert(rows, 4, 1.0, axis=1)
+    v5 = decode_yolov5(with_objectness[None], (64, 64), 0.25)
+    for found in (v8, v5):
+        assert found.boxes.tolist() == [[40, 35, 60, 45]]
+        assert found.classes.tolist() == [1]
+        np.testing.assert_allclose(found.scores, [0.8])
+
+
+def test_yolov5_multiplies_by_objectness() -> None:
+    found = decode_yolov5(np.array([[[5, 5, 2, 2, 0.5, 0.8]]], np.float32), (64, 64), 0.1)
+    np.testing.assert_allclose(found.scores, [0.4])
+
+
+@pytest.mark.parametrize("decode", [decode_fastestdet, decode_yolov5, decode_yolov8])
+def test_scores_that_are_not_numbers_give_no_boxes(decode) -> None:  # type: ignore[no-untyped-def]
+    shape = (1, 85, 4, 4) if decode is decode_fastestdet else (1, 85, 85)
+    assert len(decode(np.full(shape, np.nan, np.float32), (64, 64), 0.0).scores) == 0
+
+
+@pytest.mark.parametrize("decode", [decode_fastestdet, decode_yolov5, decode_yolov8])
+def test_an_output_of_another_shape_is_refused_with_the_right_one(decode) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(ValueError, match=r"has shape \(1, .*got \(3, 7\)"):
+        decode(np.zeros((3, 7), np.float32), (64, 64), 0.1)

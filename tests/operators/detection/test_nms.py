@@ -1,0 +1,74 @@
+"""Non-maximum suppression against OpenCV and its own laws."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from operators.detection.nms import class_wise_nms, intersection_over_union
+
+
+def random_boxes(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Boxes that overlap often, scores with ties, three classes."""
+    rng = np.random.default_rng(seed)
+    corner = rng.uniform(0, 60, (count, 2))
+    boxes = np.concatenate([corner, corner + rng.uniform(1, 40, (count, 2))], axis=1).astype(np.float32)
+    return boxes, (rng.integers(1, 20, count) / 20).astype(np.float32), rng.integers(0, 3, count).astype(np.int32)
+
+
+SEEDS, COUNTS, THRESHOLDS = st.integers(0, 10_000), st.integers(0, 60), st.sampled_from([0.1, 0.3, 0.5, 0.9])
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, COUNTS, THRESHOLDS)
+def test_it_is_idempotent(seed: int, count: int, threshold: float) -> None:
+    boxes, scores, classes = random_boxes(seed, count)
+    kept = class_wise_nms(boxes, scores, classes, threshold)
+    again = class_wise_nms(boxes[kept], scores[kept], classes[kept], threshold)
+    assert again.tolist() == list(range(len(kept)))
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, COUNTS, THRESHOLDS)
+def test_the_order_of_the_boxes_does_not_matter_even_with_ties(seed: int, count: int, threshold: float) -> None:
+    boxes, scores, classes = random_boxes(seed, count)
+    shuffle = np.random.default_rng(seed + 1).permutation(count)
+    kept = class_wise_nms(boxes, scores, classes, threshold)
+    shuffled = shuffle[class_wise_nms(boxes[shuffle], scores[shuffle], classes[shuffle], threshold)]
+    np.testing.assert_array_equal(boxes[kept], boxes[shuffled])
+    np.testing.assert_array_equal(scores[kept], scores[shuffled])
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, COUNTS, THRESHOLDS)
+def test_what_is_kept_does_not_overlap_and_what_is_dropped_does(seed: int, count: int, threshold: float) -> None:
+    boxes, scores, classes = random_boxes(seed, count)
+    kept = class_wise_nms(boxes, scores, classes, threshold).tolist()
+    for i in range(count):
+        rivals = [
+            j for j in kept if j != i and classes[j] == classes[i] and (i not in kept or kept.index(j) < kept.index(i))
+        ]
+        overlaps = bool((intersection_over_union(boxes[i], boxes[rivals]) > threshold).any())
+        assert overlaps == (i not in kept)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_it_agrees_with_opencv(seed: int) -> None:
+    boxes, _, classes = random_boxes(seed, 200)
+    scores = (1 + np.random.default_rng(seed).permutation(200).astype(np.float32)) / 200  # without ties
+    theirs: list[int] = []
+    for label in range(3):
+        of_class = np.flatnonzero(classes == label)
+        corner_and_size = np.hstack([boxes[of_class, :2], boxes[of_class, 2:] - boxes[of_class, :2]])
+        kept = cv2.dnn.NMSBoxes(corner_and_size.tolist(), scores[of_class].tolist(), 0.0, 0.45)
+        theirs += of_class[np.asarray(kept)].tolist()
+    assert class_wise_nms(boxes, scores, classes, 0.45).tolist() == sorted(theirs, key=lambda i: -scores[i])
+
+
+def test_boxes_without_area_overlap_nothing() -> None:
+    boxes = np.array([[5, 5, 5, 5], [0, 0, 10, 10]], np.float32)
+    assert intersection_over_union(boxes[0], boxes).tolist() == [0, 0]
+    assert len(class_wise_nms(boxes, np.ones(2, np.float32), np.zeros(2, np.int32), 0.0)) == 2

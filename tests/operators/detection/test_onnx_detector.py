@@ -1,0 +1,155 @@
+"""The detector on models made here, whose answers are known, and FastestDet on real photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dataflow.messages import Image
+from operators.detection import OnnxDetector
+from operators.detection.onnx_detector import ModelError
+
+onnx = pytest.importorskip("onnx")
+
+
+def save_model(file: Path, output: np.ndarray, size: tuple[int | str, int | str] = (64, 64)) -> str:
+    """A model whose answer is `output` times the mean of its red channel (input channel 0), so it reads its input."""
+    make = onnx.helper
+    nodes = [
+        make.make_node("Gather", ["x", "channel"], ["red"], axis=1),
+        make.make_node("ReduceMean", ["red"], ["mean"], keepdims=0),
+        make.make_node("Mul", ["rows", "mean"], ["y"]),
+    ]
+    graph = make.make_graph(
+        nodes,
+        "constant_boxes",
+        [make.make_tensor_value_info("x", onnx.TensorProto.FLOAT, [1, 3, *size])],
+        [make.make_tensor_value_info("y", onnx.TensorProto.FLOAT, output.shape)],
+        [
+            onnx.numpy_helper.from_array(output.astype(np.float32), "rows"),
+            onnx.numpy_helper.from_array(np.array([0]), "channel"),
+        ],
+    )
+    model = make.make_model(graph, opset_imports=[make.make_opsetid("", 17)], ir_version=9)
+    onnx.checker.check_model(model)
+    onnx.save(model, str(file))
+    return str(file)
+
+
+def yolov8_rows(*rows: tuple[float, ...]) -> np.ndarray:
+    return np.array(rows, np.float32).T[None]
+
+
+def red(width: int = 200, height: int = 100, stamp: int = 7) -> Image:
+    data = np.zeros((height, width, 3), np.uint8)
+    data[..., 0] = 255
+    return Image(stamp=stamp, frame="camera", data=data)
+
+
+def detector(**params: object) -> OnnxDetector:
+    made = OnnxDetector(**params)
+    made.setup()
+    return made
+
+
+def test_boxes_come_back_in_the_pixels_of_the_image(tmp_path: Path) -> None:
+    # The image 200x100 is stretched on 64x64: x by 3.125, y by 1.5625. Two boxes overlap; the weaker one goes.
+    rows = yolov8_rows((32, 32, 16, 32, 0.9, 0.1), (33, 32, 16, 32, 0.8, 0.1), (8, 8, 8, 8, 0.1, 0.7))
+    found = detector(model=save_model(tmp_path / "m.onnx", rows), decoder="yolov8", fit="stretch").process(red())
+    np.testing.assert_allclose(found.boxes, [[75, 25, 125, 75], [12.5, 6.25, 37.5, 18.75]], atol=1e-4)
+    np.testing.assert_allclose(found.scores, [0.9, 0.7], atol=1e-5)
+    assert [found.class_names[i] for i in found.class_ids] == ["person", "bicycle"]
+    assert (found.stamp, found.frame, found.width, found.height) == (7, "camera", 200, 100)
+
+
+def test_yolo_letterboxes_by_default(tmp_path: Path) -> None:
+    # 200x100 in 64x64: scaled by 0.32, with 16 rows of grey above; grey dims the mean of red to 0.5 + 0.5 * 114/255.
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 32, 16, 0.9)) / (0.5 + 0.5 * 114 / 255))
+    found = detector(model=model, decoder="yolov8").process(red())
+    np.testing.assert_allclose(found.boxes, [[50, 25, 150, 75]], atol=0.01)
+
+
+def test_fastestdet_is_given_blue_first(tmp_path: Path) -> None:
+    output = np.ones((1, 85, 2, 2))
+    model = save_model(tmp_path / "m.onnx", output)
+    options = {"model": model, "decoder": "fastestdet"}
+    blue = red().replace(data=red().data[..., ::-1])
+    assert len(detector(**options).process(blue).scores) > 0
+    assert len(detector(**options).process(red()).scores) == 0
+
+
+def test_only_the_best_are_kept(tmp_path: Path) -> None:
+    rows = yolov8_rows(*((8 * i + 4, 32, 6, 6, 0.4 + 0.05 * i) for i in range(8)))
+    found = detector(model=save_model(tmp_path / "m.onnx", rows), decoder="yolov8", fit="stretch", max_detections=3)
+    np.testing.assert_allclose(found.process(red()).scores, [0.75, 0.7, 0.65], atol=1e-5)
+
+
+def test_class_names_come_from_a_file(tmp_path: Path) -> None:
+    (tmp_path / "names.txt").write_text("crate\n\npallet\n")
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
+    options = {"model": model, "decoder": "yolov8", "fit": "stretch"}
+    made = detector(**options, classes=str(tmp_path / "names.txt"))
+    assert made.process(red()).class_names == ("crate", "pallet")
+    assert set(made.files) == {model, str(tmp_path / "names.txt")}  # both content hashes are on record
+    (tmp_path / "names.txt").write_text("crate\n")
+    with pytest.raises(ModelError, match="found class 1, but there are 1 class names"):
+        detector(**options, classes=str(tmp_path / "names.txt")).process(red())
+
+
+def test_an_open_input_takes_the_size_of_the_parameter(tmp_path: Path) -> None:
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((16, 16, 8, 8, 0.9)), ("H", "W"))
+    found = detector(model=model, decoder="yolov8", fit="stretch", input_size=32).process(red())
+    np.testing.assert_allclose(found.boxes, [[75, 37.5, 125, 62.5]], atol=1e-4)
+
+
+def test_grey_images_and_images_without_objects_are_fine(tmp_path: Path) -> None:
+    made = detector(model=save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 8, 8, 0.9))), decoder="yolov8")
+    white = Image(stamp=1, frame="camera", data=np.full((64, 64), 255, np.uint8))
+    black = Image(stamp=1, frame="camera", data=np.zeros((64, 64), np.uint8))
+    assert made.process(white).boxes.shape == (1, 4)
+    assert made.process(black).boxes.shape == (0, 4)
+
+
+def test_a_missing_model_says_where_it_was_looked_for(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=rf"looked for {tmp_path}/none\.onnx"):
+        detector(model=str(tmp_path / "none.onnx"), decoder="fastestdet")
+
+
+def test_a_file_that_is_no_model_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bad.onnx").write_bytes(b"not a model")
+    with pytest.raises(ModelError, match=r"bad\.onnx cannot be loaded"):
+        detector(model=str(tmp_path / "bad.onnx"), decoder="fastestdet")
+
+
+def test_a_decoder_that_does_not_fit_the_model_is_named(tmp_path: Path) -> None:
+    made = detector(model=save_model(tmp_path / "m.onnx", yolov8_rows((1, 1, 1, 1, 0.9))), decoder="fastestdet")
+    with pytest.raises(ModelError, match=r"decoder='fastestdet' does not fit .*m\.onnx: .* got \(1, 5, 1\)"):
+        made.process(red())
+
+
+@pytest.mark.data
+def test_fastestdet_finds_what_is_in_real_photographs(data_dir: Path) -> None:
+    """About half of the boxes of this small network overlap a label of their class by more than half."""
+    folder = data_dir / "coco128"
+    options = {"model": str(data_dir / "models" / "FastestDet.onnx"), "decoder": "fastestdet", "score_threshold": 0.6}
+    made, again = detector(**options), detector(**options)
+    right = total = 0
+    for i, file in enumerate(sorted((folder / "images").iterdir())[:40]):
+        image = Image(stamp=i, frame="camera", data=np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR_RGB), np.uint8))
+        found = made.process(image)
+        assert found.digest() == again.process(image).digest()
+        labels = folder / "labels" / f"{file.stem}.txt"
+        truth = np.array(labels.read_text().split() if labels.is_file() else [], np.float64).reshape(-1, 5)
+        scale = np.array([image.data.shape[1], image.data.shape[0]] * 2)
+        corners = np.hstack([truth[:, 1:3] - truth[:, 3:] / 2, truth[:, 1:3] + truth[:, 3:] / 2]) * scale
+        for box, label in zip(found.boxes, found.class_ids, strict=True):
+            same = corners[truth[:, 0] == label]
+            inner = np.clip(np.minimum(box[2:], same[:, 2:]) - np.maximum(box[:2], same[:, :2]), 0, None).prod(axis=1)
+            union = (box[2:] - box[:2]).prod() + (same[:, 2:] - same[:, :2]).prod(axis=1) - inner
+            total += 1
+            right += bool((inner / union > 0.5).any())
+    assert total >= 20
+    assert right / total > 0.45

@@ -1,0 +1,213 @@
+"""RgbdFolder on folders written by the tests, in both layouts, and on the real frames."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Transforms
+from dataflow.operator import ParameterError
+from operators.sources import RgbdFolder
+from operators.sources.rgbd_layouts import DatasetError, nearest_rotation
+
+COLOR = np.zeros((6, 8, 3), np.uint8)
+COLOR[..., 0], COLOR[..., 2] = 200, 10  # RGB: reddish
+DEPTH = np.full((6, 8), 1500, np.uint16)
+DEPTH[0, :4] = 0, 65535, 6000, 6001
+T_QUARTER = np.array([[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1.0]])  # 90° about z
+
+
+def write_7scenes(folder: Path, numbers: range = range(3)) -> Path:
+    for k in numbers:
+        stem = folder / f"frame-{k:06d}"
+        cv2.imwrite(f"{stem}.color.png", COLOR[..., ::-1])
+        cv2.imwrite(f"{stem}.depth.png", DEPTH)
+        np.savetxt(f"{stem}.pose.txt", T_QUARTER + np.diag([0, 0, 0.01, 0]))  # not quite orthonormal
+    np.savetxt(folder / "camera-intrinsics.txt", [[7, 0, 4], [0, 7, 3], [0, 0, 1]])
+    return folder
+
+
+def write_tum(folder: Path) -> Path:
+    """Three colour images; depth is 5 ms late, the second frame has no truth, the third no depth."""
+    for name in ("rgb", "depth"):
+        (folder / name).mkdir(parents=True)
+    rgb, depth = ["# color images"], []
+    for k, seconds in enumerate(("10.000000", "10.1000001", "10.200000")):
+        cv2.imwrite(str(folder / f"rgb/{k}.png"), COLOR[..., ::-1])
+        rgb.append(f"{seconds} rgb/{k}.png")
+    for k, seconds in enumerate(("10.005", "10.105", "10.3")):
+        cv2.imwrite(str(folder / f"depth/{k}.png"), DEPTH)
+        depth.append(f"{seconds} depth/{k}.png")
+    (folder / "rgb.txt").write_text("\n".join(rgb))
+    (folder / "depth.txt").write_text("\n".join(depth))
+    (folder / "groundtruth.txt").write_text("9.999 1 2 3 0 0 0.70710678 0.70710678\n10.2 9 9 9 0 0 0 1\n")
+    return folder
+
+
+def read(folder: Path, **params: object) -> tuple[RgbdFolder, list[dict[str, Message]]]:
+    source = RgbdFolder(path=str(folder), **params)
+    source.setup()
+    return source, [dict(messages) for messages in source.stream()]
+
+
+def test_7scenes_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
+    source, frames = read(write_7scenes(tmp_path))
+    assert source.length() == len(frames) == 3
+    image, depth = frames[1]["image"], frames[1]["depth"]
+    assert isinstance(image, Image)
+    assert isinstance(depth, DepthImage)
+    np.testing.assert_array_equal(image.data, COLOR)
+    assert depth.data[0, :5].tolist() == [0, 0, 6, 0, 1.5]  # no return, invalid, the farthest, beyond, ordinary
+    statics = source.static_outputs()
+    depth_info, image_info, extrinsics = (statics[p] for p in ("depth_info", "image_info", "extrinsics"))
+    assert isinstance(depth_info, CameraInfo)
+    assert isinstance(image_info, CameraInfo)
+    assert isinstance(extrinsics, Transforms)
+    assert (depth_info.fx, depth_info.cx, depth_info.cy, depth_info.width, depth_info.height) == (7, 4, 3, 8, 6)
+    assert (image_info.fx, image_info.fy, image_info.cx) == (525, 525, 4)
+    assert (depth_info.frame, image_info.frame) == (depth.frame, image.frame)
+    assert extrinsics.frames == (depth.frame,)
+    np.testing.assert_array_equal(extrinsics.matrix(image.frame), np.eye(4))
+
+
+def test_poses_are_made_rigid(tmp_path: Path) -> None:
+    pose = read(write_7scenes(tmp_path))[1][0]["ground_truth"]
+    assert isinstance(pose, Pose)
+    assert (pose.frame, pose.child_frame) == ("world", "camera_depth_optical")
+    np.testing.assert_allclose(pose.matrix(), T_QUARTER, atol=1e-12)
+
+
+def test_the_nearest_rotation_is_never_a_reflection() -> None:
+    rng = np.random.default_rng(1)
+    for M in (*rng.normal(size=(20, 3, 3)), np.diag([1.0, 1.0, -0.01])):
+        R = nearest_rotation(M)
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) > 0
+
+
+@pytest.mark.parametrize("rate", [30, 29.97, 7])
+def test_stamps_are_exact_and_the_same_for_every_slice(tmp_path: Path, rate: float) -> None:
+    write_7scenes(tmp_path, range(5, 15))
+    thousandths = round(rate * 1000)
+    expected = [100 + k * 10**12 // thousandths for k in range(5, 15)]
+    stamps = [m["image"].stamp for m in read(tmp_path, rate=rate, first_stamp=100)[1]]
+    assert stamps == expected
+    sliced = read(tmp_path, rate=rate, first_stamp=100, start=2, stop=9, stride=3)[1]
+    assert [m["depth"].stamp for m in sliced] == expected[2:9:3]
+
+
+def test_a_frame_without_pose_has_no_ground_truth(tmp_path: Path) -> None:
+    write_7scenes(tmp_path)
+    (tmp_path / "frame-000001.pose.txt").unlink()
+    np.savetxt(tmp_path / "frame-000002.pose.txt", np.full((4, 4), -np.inf))
+    assert ["ground_truth" in messages for messages in read(tmp_path)[1]] == [True, False, False]
+
+
+def test_tum_frames_are_associated_by_nearest_stamp(tmp_path: Path) -> None:
+    source, frames = read(write_tum(tmp_path))
+    assert [m["image"].stamp for m in frames] == [10_000_000_000, 10_100_000_100]
+    assert all(m["depth"].stamp == m["image"].stamp for m in frames)
+    assert ["ground_truth" in m for m in frames] == [True, False]
+    pose, depth = frames[0]["ground_truth"], frames[0]["depth"]
+    assert isinstance(pose, Pose)
+    assert isinstance(depth, DepthImage)
+    np.testing.assert_allclose(pose.matrix(), T_QUARTER, atol=1e-7)
+    np.testing.assert_allclose(depth.data[1, 0], 0.3, rtol=1e-6)  # 1500 / 5000
+    info = source.static_outputs()["image_info"]
+    assert isinstance(info, CameraInfo)
+    assert (info.fx, info.cx, info.cy) == (525, 319.5, 239.5)
+
+
+def test_given_calibration_and_names_win(tmp_path: Path) -> None:
+    source, frames = read(
+        write_7scenes(tmp_path),
+        image_intrinsics=(500, 501, 4.5, 3.5),
+        depth_intrinsics=(600, 601, 4, 3),
+        T_depth_image=(0.025, 0, 0, 0, 0, 0, 1),
+        image_frame="rgb",
+        depth_frame="ir",
+        max_depth=1.0,
+    )
+    statics = source.static_outputs()
+    extrinsics, image_info = statics["extrinsics"], statics["image_info"]
+    assert isinstance(extrinsics, Transforms)
+    assert isinstance(image_info, CameraInfo)
+    assert extrinsics.matrix("rgb")[0, 3] == 0.025
+    assert image_info.K.tolist() == [[500, 0, 4.5], [0, 501, 3.5], [0, 0, 1]]
+    assert [m["image"].frame for m in frames] == ["rgb"] * 3  # type: ignore[attr-defined]
+    assert not frames[0]["depth"].data.any()  # type: ignore[attr-defined]
+
+
+def test_equal_folders_give_equal_digests(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write_7scenes(tmp_path / name)
+    first, second = read(tmp_path / "a")[1], read(tmp_path / "b")[1]
+    assert [{p: m.digest() for p, m in f.items()} for f in first] == [
+        {p: m.digest() for p, m in f.items()} for f in second
+    ]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda f: (f / "frame-000001.depth.png").unlink(), r"frame 000001 has no depth image: no .*frame-000001"),
+        (lambda f: (f / "frame-000001.color.png").unlink(), r"frame 000001 has no colour image"),
+        (lambda f: (f / "frame-000001.color.png").write_bytes(b"junk"), r"frame 000001: cannot decode .*color\.png"),
+        (lambda f: (f / "frame-000001.depth.png").write_bytes(b""), r"frame 000001: cannot decode .*depth\.png"),
+        (lambda f: cv2.imwrite(str(f / "frame-000001.depth.png"), COLOR), r"frame 000001: .* one 16-bit channel"),
+        (lambda f: cv2.imwrite(str(f / "frame-000001.depth.png"), DEPTH[:4]), r"has 8x4 pixels, but the first .* 8x6"),
+        (lambda f: (f / "frame-000001.pose.txt").write_text("1 2 3"), r"pose\.txt: expected 4x4 numbers, found 3"),
+        (lambda f: np.savetxt(f / "frame-000001.pose.txt", 2 * T_QUARTER), r"frame 000001: not a rigid motion"),
+        (lambda f: np.savetxt(f / "camera-intrinsics.txt", -np.eye(3)), r"camera-intrinsics\.txt: not an intrinsic"),
+    ],
+)
+def test_a_spoiled_file_is_named_with_its_frame(tmp_path: Path, spoil, message: str) -> None:  # type: ignore[no-untyped-def]
+    spoil(write_7scenes(tmp_path))
+    with pytest.raises(DatasetError, match=message):
+        read(tmp_path)
+
+
+def test_spoiled_tum_lists_are_named_with_their_line(tmp_path: Path) -> None:
+    write_tum(tmp_path)
+    (tmp_path / "depth.txt").write_text("10.0 depth/0.png\nsoon depth/1.png\n")
+    with pytest.raises(DatasetError, match=r"depth\.txt:2: 'soon' is no time in seconds"):
+        read(tmp_path)
+    (tmp_path / "depth.txt").write_text("10.0 depth/9.png\n")
+    with pytest.raises(DatasetError, match=r"no file .*depth/9\.png"):
+        read(tmp_path)
+
+
+def test_folders_and_slices_without_frames_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(DatasetError, match="holds neither the 7-Scenes layout"):
+        read(tmp_path)
+    with pytest.raises(DatasetError, match=r"no folder .*nowhere"):
+        read(tmp_path / "nowhere")
+    write_7scenes(tmp_path)
+    with pytest.raises(DatasetError, match="has 3 frames: start=5"):
+        read(tmp_path, start=5)
+    with pytest.raises(ParameterError, match=r"RgbdFolder\.rate"):
+        RgbdFolder(path=str(tmp_path), rate=0)
+
+
+@pytest.mark.data
+def test_the_real_frames_have_their_known_properties(data_dir: Path) -> None:
+    source, frames = read(data_dir / "rgbd_7scenes", start=240)
+    assert len(frames) == 10
+    for k, messages in enumerate(frames, 240):
+        image, depth, pose = messages["image"], messages["depth"], messages["ground_truth"]
+        assert isinstance(image, Image)
+        assert isinstance(depth, DepthImage)
+        assert isinstance(pose, Pose)
+        assert image.stamp == k * 10**9 // 30
+        assert image.data.shape == (480, 640, 3)
+        assert 0.5 < (depth.data > 0).mean() <= 1
+        assert depth.data.max() <= 6
+        R = pose.matrix()[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    info = source.static_outputs()["depth_info"]
+    assert isinstance(info, CameraInfo)
+    assert info.fx == 585
