@@ -60,6 +60,14 @@ def results(found: dict[str, Detections2D]) -> list[dict[str, object]]:
     return rows
 
 
+def moved(found: Detections2D, shift: float, scale: float) -> Detections2D:
+    """The boxes shifted by a share of the image and grown about their centres."""
+    size = np.array([found.width, found.height], np.float32)
+    center = (found.boxes[:, :2] + found.boxes[:, 2:]) / 2 + np.float32(shift) * size
+    half = (found.boxes[:, 2:] - found.boxes[:, :2]) / 2 * np.float32(scale)
+    return found.replace(boxes=np.hstack([center - half, center + half]))
+
+
 def score(folder: Path, found: dict[str, Detections2D]) -> dict[str, float]:
     """AP at IoU 0.5, AP over 0.5 to 0.95, and recall with 100 boxes an image."""
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
@@ -78,6 +86,11 @@ def main() -> None:
     parser.add_argument("data", type=Path, help="folder with images/ and labels/")
     parser.add_argument("--score-threshold", type=float, default=0.001)
     parser.add_argument("--nms-iou", type=float, default=0.45)
+    parser.add_argument("--fit", default="default", help="stretch or letterbox instead of the decoder's own")
+    controls = parser.add_argument_group("controls, which must all lower AP if the decoding is right")
+    controls.add_argument("--swap-colors", action="store_true", help="exchange red and blue")
+    controls.add_argument("--shift", type=float, default=0.0, help="move boxes right and down, share of the image")
+    controls.add_argument("--scale", type=float, default=1.0, help="grow boxes about their centres")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
 
@@ -86,14 +99,17 @@ def main() -> None:
         decoder=arguments.decoder,
         score_threshold=arguments.score_threshold,
         nms_iou=arguments.nms_iou,
+        fit=arguments.fit,
     )
     detector.setup()
     found, seconds = {}, []
     for i, file in enumerate(sorted((arguments.data / "images").iterdir())):
-        image = Image(stamp=i, frame="camera", data=np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR_RGB), np.uint8))
+        pixels = np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR_RGB), np.uint8)
+        image = Image(stamp=i, frame="camera", data=pixels[..., ::-1] if arguments.swap_colors else pixels)
         start = time.perf_counter()
-        found[file.stem] = detector.process(image)
+        detections = detector.process(image)
         seconds.append(time.perf_counter() - start)
+        found[file.stem] = moved(detections, arguments.shift, arguments.scale)
     figures = " | ".join(f"{name} {value:.3f}" for name, value in score(arguments.data, found).items())
     print(f"{len(found)} images | {figures} | median {np.median(seconds) * 1e3:.1f} ms a frame, one thread")
 

@@ -38,6 +38,7 @@ Rate = Annotated[
     float | None, typer.Option("--rate", min=1e-6, help="Pace: 1 is real time. Default: as fast as the graph goes.")
 ]
 Paranoid = Annotated[bool, typer.Option("--paranoid", help="Catch operators that write into their inputs.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the recording if it exists.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the report, digests included, as JSON.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress display.")]
 
@@ -49,6 +50,7 @@ def run(
     host_each: HostEach = False,
     place: Place = None,
     record: Record = None,
+    overwrite: Overwrite = False,
     view: View = None,
     rate: Rate = None,
     paranoid: Paranoid = False,
@@ -67,7 +69,7 @@ def run(
 
     with friendly_errors():
         loaded = load_graph(graph, settings=settings or ())
-        options = _options(loaded, one_host, host_each, place, record, view, rate, paranoid)
+        options = _options(loaded, one_host, host_each, place, record, overwrite, view, rate, paranoid)
         _execute(
             lambda watch: run_graph(loaded, watch=watch, **options), loaded, view, None, json=json, quiet=quiet or json
         )
@@ -85,6 +87,7 @@ def replay(
     host_each: HostEach = False,
     place: Place = None,
     record: Record = None,
+    overwrite: Overwrite = False,
     view: View = None,
     rate: Rate = None,
     paranoid: Paranoid = False,
@@ -115,7 +118,7 @@ def replay(
         first = max(min((i.first for i in infos if i.first is not None), default=0), log.start or 0)
         last = max((i.last for i in infos if i.last is not None), default=0)
         span = (first, last if log.end is None else min(last, log.end))
-        options = _options(loaded, one_host, host_each, place, record, view, rate, paranoid)
+        options = _options(loaded, one_host, host_each, place, record, overwrite, view, rate, paranoid)
         _execute(
             lambda watch: replay_recording(recording, graph=loaded, start=start, end=end, watch=watch, **options),
             loaded,
@@ -132,6 +135,7 @@ def _options(
     host_each: bool,
     place: list[str] | None,
     record: Path | None,
+    overwrite: bool,
     view: str | None,
     rate: float | None,
     paranoid: bool,
@@ -147,11 +151,14 @@ def _options(
                 known = ", ".join(graph.nodes)
                 raise fail(f"--place {word!r}: expected OPERATOR=HOST with an operator of the graph ({known})")
             placement[operator] = host
+    if record is not None and record.exists() and not overwrite:
+        raise fail(f"{record} exists; name another file, or replace it with --overwrite")
     if view is not None and view not in ("spawn", "serve") and not view.endswith(".rrd"):
         raise fail(f"--view {view!r}: expected spawn, serve, or a file that ends in .rrd")
     return {
         "placement": placement,
         "record": record,
+        "overwrite": overwrite,
         "view_file": Path(view) if view is not None and view.endswith(".rrd") else None,
         "rate": rate,
         "paranoid": paranoid,

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import typer
 
-from dataflow.cli import execution, inspection
+from dataflow.cli import execution, inspection, live, recordings
 
 app = typer.Typer(
     name="dataflow",
@@ -22,10 +23,18 @@ app.command()(execution.replay)
 app.command()(inspection.check)
 app.command()(inspection.show)
 app.command()(inspection.operators)
+app.command()(recordings.info)
+app.command()(recordings.diff)
+app.command()(live.view)
+app.command("list")(live.list_running)
+app.command()(live.echo)
+app.command()(live.hz)
 
 
 def main() -> None:
-    """The console script."""
+    """The console script. Operators may lie in the folder it is called from."""
+    if "" not in sys.path and os.getcwd() not in sys.path:
+        sys.path.insert(0, os.getcwd())
     sys.exit(app())
 
 

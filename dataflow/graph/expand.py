@@ -112,7 +112,7 @@ class _Scope:
     prefix: str
     key: str
     given: Mapping[str, Tree]
-    bindings: Mapping[str, list[Pattern]]
+    bindings: Mapping[str, tuple[Place, list[Pattern]]]
     use: Place | None
     process: Leaf | None
     machine: Leaf | None
@@ -238,10 +238,10 @@ class Expander:
                     "a graph with inputs runs inside another graph: name this file there with 'use:'",
                 )
             return {name: GraphInput((), kind, place) for name, (place, kind) in declared.items()}
-        for name, patterns in scope.bindings.items():
-            if name not in declared and patterns:
+        for name, (place, _) in scope.bindings.items():
+            if name not in declared:
                 hint = did_you_mean(name, declared, "its inputs")
-                self.problems.add(self.binding_place(scope, name), f"{scope.shown} has no input {name!r}", hint)
+                self.problems.add(place, f"{scope.shown} has no input {name!r}", hint)
         inputs = {}
         for name, (place, kind) in declared.items():
             if fault := name_fault(name):
@@ -256,13 +256,9 @@ class Expander:
                     f"add 'inputs: {{{name}: ...}}'",
                     [(place, "declared here")],
                 )
-            inputs[name] = GraphInput(tuple(bound or ()), kind, place)
+            inputs[name] = GraphInput(tuple(bound[1] if bound else ()), kind, place)
             self.out.graph_inputs.append((f"{scope.prefix}{name}", inputs[name]))
         return inputs
-
-    def binding_place(self, scope: _Scope, name: str) -> Place:
-        assert scope.use is not None
-        return next((p.place for p in scope.bindings.get(name, ())), scope.use)
 
     def message_type(self, tree: Tree, name: str) -> type[Message] | None:
         if isinstance(tree, Leaf) and tree.value is None:
@@ -419,7 +415,7 @@ class Expander:
             prefix=f"{full}/",
             key=prefix,
             given={key: e.value for key, e in given.entries.items()} if given else {},
-            bindings={port: patterns for port, (_, patterns) in wired.items()},
+            bindings=wired,
             use=place,
             process=self.label(table.get("process"), "process") or scope.process,
             machine=self.label(table.get("machine"), "machine") or scope.machine,

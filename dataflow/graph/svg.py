@@ -36,7 +36,7 @@ text { font-family: "Inter", "Segoe UI", "Helvetica Neue", Arial, "DejaVu Sans",
 .class { font-size: 10.5px; fill: #5b6773; }
 .port { font-size: 11.5px; }
 .type { font-size: 10px; fill: #6b7784; paint-order: stroke; stroke: #ffffff; stroke-width: 3px; }
-.note { font-size: 10.5px; fill: #5b6773; }
+.note { font-size: 10.5px; font-weight: 400; fill: #5b6773; }
 .line { fill: none; stroke: #77838f; stroke-width: 1.5; }
 .sampled { stroke-dasharray: 5 4; }
 .batch { stroke-width: 5; }

@@ -35,9 +35,12 @@ class CameraInfo(Message):
     distortion: F64 | None = array("float64", "N", "coefficients of the lens model; None for none", default=None)
     R: F64 | None = array("float64", "3 3", "rectification rotation (stereo); None for identity", default=None)
     P: F64 | None = array(
-        "float64", "3 4", "projection of the rectified image, P[0, 3] = -fx * baseline; None where not known",
-        unit="px", default=None,
-    )  # fmt: skip
+        "float64",
+        "3 4",
+        "projection of the rectified image, P[0, 3] = -fx * baseline; None where not known",
+        unit="px",
+        default=None,
+    )
 
     def validate(self) -> None:
         positive(self, "width", "height")

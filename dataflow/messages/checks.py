@@ -50,6 +50,8 @@ def within(message: Message, low: float, high: float, *names: str, nan: bool = F
         if data is None:
             continue
         data = np.asarray(data)
+        if not data.size or (data.min() >= low and data.max() <= high):
+            continue
         inside = (data >= low) & (data <= high)
         if nan:
             inside |= np.isnan(data)

@@ -11,7 +11,7 @@ FORMATS = ("jpeg", "png", "webp")
 
 
 class Image(Message):
-    """A colour or grey image, as the camera's optical frame sees it; the stamp is the middle of the exposure."""
+    """A colour or grey image, as the camera's optical frame sees it; stamped at the middle of its exposure."""
 
     frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
     data: U8 = array("uint8", "H W 3|H W", "RGB pixels, or one grey channel; row 0 is the top; at least one pixel")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataflow.messages.arrays import F32, I32, U8, U16
 from dataflow.messages.base import Message, MessageError, array, scalar
-from dataflow.messages.checks import not_empty
+from dataflow.messages.checks import not_empty, within
 
 
 class SegmentationMap(Message):
@@ -34,8 +34,4 @@ class SegmentationMap(Message):
                     f"SegmentationMap.classes must index class_names, which has {count} entries, or be void "
                     f"({self.void}), got {wrong[0]} in {wrong.size} pixels"
                 )
-        if self.confidence is not None and ((self.confidence < 0) | (self.confidence > 1)).any():
-            raise MessageError(
-                f"SegmentationMap.confidence must lie in [0, 1] or be NaN, got values from "
-                f"{self.confidence.min()} to {self.confidence.max()}"
-            )
+        within(self, 0.0, 1.0, "confidence", nan=True)

@@ -110,9 +110,12 @@ class LandmarkSightings(Message):
         "float64", "N 4", "unit quaternions (x, y, z, w) that map the landmark's axes to `frame`", default=None
     )
     covariances: F64 | None = array(
-        "float64", "N D D", "of the position, or of the polar fields given, in the order range, bearing, elevation",
-        unit="m, rad", default=None,
-    )  # fmt: skip
+        "float64",
+        "N D D",
+        "of the position, or of the polar fields given, in the order range, bearing, elevation",
+        unit="m, rad",
+        default=None,
+    )
 
     def validate(self) -> None:
         polar = sum(x is not None for x in (self.ranges, self.bearings, self.elevations))

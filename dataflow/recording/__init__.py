@@ -1,11 +1,16 @@
 """Recordings: MCAP files that other tools open as they are, written safely and read back without loss."""
 
 from dataflow.recording.codecs import ForeignDecoder, register_decoder
+from dataflow.recording.diff import DiffReport, StreamDiff, diff
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.facts import machine_facts
+from dataflow.recording.info import Description, describe
 from dataflow.recording.reader import Event, RawRecord, Recorded, Recording, StreamInfo
 from dataflow.recording.writer import RecordingWriter
 
 __all__ = [
+    "Description",
+    "DiffReport",
     "Event",
     "ForeignDecoder",
     "RawRecord",
@@ -13,6 +18,10 @@ __all__ = [
     "Recording",
     "RecordingError",
     "RecordingWriter",
+    "StreamDiff",
     "StreamInfo",
+    "describe",
+    "diff",
+    "machine_facts",
     "register_decoder",
 ]

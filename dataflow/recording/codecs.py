@@ -1,4 +1,4 @@
-"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON; and foreign decoders."""
+"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON; foreign decoders."""
 
 from __future__ import annotations
 
@@ -153,8 +153,8 @@ def declaration_digest(message: type[Message]) -> str:
 class ForeignDecoder:
     """Reads the messages that other programs wrote with one schema.
 
-    `decode(data, log_time)` returns a message whose stamp is the one that the data carries, or else the log time.
-    `schema` is the text of the file's schema, for encodings that need it (`bind` is called once per channel).
+    `bind(schema)` is called once per channel with the schema as it stands in the file, and returns the function that
+    turns (data, log time) into a message. Its stamp is the one that the data carries, or else the log time.
     """
 
     bind: Callable[[SchemaText], Callable[[bytes, int], Message]]

@@ -14,10 +14,11 @@ import time
 import zlib
 from array import array
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-import lz4.frame
+import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
@@ -56,7 +57,7 @@ def record_bytes(record: McapRecord) -> bytes:
     """`record` as it lies in a file."""
     builder = RecordBuilder()
     record.write(builder)
-    return bytes(builder.end())
+    return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
 def _compressor(compression: Compression) -> Callable[[bytes], bytes]:
@@ -68,6 +69,32 @@ def _compressor(compression: Compression) -> Callable[[bytes], bytes]:
         case "none":
             return lambda data: data
     raise RecordingError(f"unknown compression {compression!r}; known: zstd, lz4, none")
+
+
+@dataclass(slots=True)
+class _Chunk:
+    """The messages gathered since the last chunk was written."""
+
+    since: float
+    parts: list[Buffer] = field(default_factory=list)
+    size: int = 0
+    entries: dict[int, array[int]] = field(default_factory=dict)
+    """By channel: log time and offset of each message, alternating."""
+    first: int = 0
+    last: int = 0
+
+    def add(self, channel: int, log_time: int, sequence: int, parts: Sequence[Buffer]) -> None:
+        length = _MESSAGE_FIXED + sum(len(part) for part in parts)
+        self.first = log_time if not self.parts else min(self.first, log_time)
+        self.last = max(self.last, log_time)
+        self.parts.append(_MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time, log_time))
+        self.parts.extend(parts)
+        self.entries.setdefault(channel, array("Q")).extend((log_time, self.size))
+        self.size += length + 9
+
+    @property
+    def messages(self) -> int:
+        return sum(len(entries) // 2 for entries in self.entries.values())
 
 
 class ContainerWriter:
@@ -97,7 +124,7 @@ class ContainerWriter:
         self._counts: dict[int, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._start_new_chunk()
+        self._chunk: _Chunk | None = None
         self.first_time: int | None = None
         self.last_time = 0
         self._failure: str | None = None
@@ -121,7 +148,7 @@ class ContainerWriter:
     @property
     def messages(self) -> int:
         """Messages added so far, those of the unfinished chunk included."""
-        return sum(self._counts.values()) + sum(len(entries) // 2 for entries in self._entries.values())
+        return sum(self._counts.values()) + (self._chunk.messages if self._chunk else 0)
 
     @property
     def saved_bytes(self) -> int:
@@ -164,33 +191,26 @@ class ContainerWriter:
         """Adds messages, each (channel, log time, sequence, parts of its data), that must not be torn apart."""
         self._check_usable()
         now = time.monotonic()
-        if self._parts and now - self._chunk_since >= self._chunk_seconds:
+        if self._chunk is not None and now - self._chunk.since >= self._chunk_seconds:
             self.finish_chunk()
-        if not self._parts:
-            self._chunk_since = now
+        chunk = self._chunk = self._chunk or _Chunk(now)
         for channel, log_time, sequence, parts in group:
-            size = _MESSAGE_FIXED + sum(len(part) for part in parts)
-            self._parts.append(_MESSAGE.pack(Opcode.MESSAGE, size, channel, sequence, log_time, log_time))
-            self._parts.extend(parts)
-            self._entries.setdefault(channel, array("Q")).extend((log_time, self._size))
-            self._size += size + 9
-            self._chunk_first = log_time if self._chunk_first is None else min(self._chunk_first, log_time)
-            self._chunk_last = max(self._chunk_last, log_time)
-        if self._size >= self._chunk_bytes:
+            chunk.add(channel, log_time, sequence, parts)
+        if chunk.size >= self._chunk_bytes:
             self.finish_chunk()
 
     def finish_chunk(self) -> None:
         """Compresses the messages gathered so far and hands them to the operating system with their indexes."""
         self._check_usable()
-        if self._chunk_first is None:
+        chunk = self._chunk
+        if chunk is None:
             return
-        raw = b"".join(self._parts)
+        raw = b"".join(chunk.parts)
         data = self._compress(raw)
-        first, last = self._chunk_first, self._chunk_last
         name = self._compression.encode()
         length = 32 + len(name) + 8 + len(data)
         head = (
-            _CHUNK.pack(Opcode.CHUNK, length, first, last, len(raw), zlib.crc32(raw))
+            _CHUNK.pack(Opcode.CHUNK, length, chunk.first, chunk.last, len(raw), zlib.crc32(raw))
             + struct.pack("<I", len(name))
             + name
             + struct.pack("<Q", len(data))
@@ -199,7 +219,7 @@ class ContainerWriter:
         offset = start + len(head) + len(data)
         indexes: list[bytes] = []
         offsets: dict[int, int] = {}
-        for channel, entries in self._entries.items():
+        for channel, entries in chunk.entries.items():
             body = entries.tobytes()
             offsets[channel] = offset
             indexes.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(body), channel, len(body)) + body)
@@ -211,18 +231,18 @@ class ContainerWriter:
                 chunk_start_offset=start,
                 compression=self._compression,
                 compressed_size=len(data),
-                message_end_time=last,
+                message_end_time=chunk.last,
                 message_index_length=sum(map(len, indexes)),
                 message_index_offsets=offsets,
-                message_start_time=first,
+                message_start_time=chunk.first,
                 uncompressed_size=len(raw),
             )
         )
-        self.first_time = first if self.first_time is None else min(self.first_time, first)
-        self.last_time = max(self.last_time, last)
-        for channel, entries in self._entries.items():
+        self.first_time = chunk.first if self.first_time is None else min(self.first_time, chunk.first)
+        self.last_time = max(self.last_time, chunk.last)
+        for channel, entries in chunk.entries.items():
             self._counts[channel] += len(entries) // 2
-        self._start_new_chunk()
+        self._chunk = None
 
     def close(self) -> None:
         """Finishes the last chunk and writes the index. Idempotent; the file is closed whatever happens."""
@@ -244,14 +264,6 @@ class ContainerWriter:
         with contextlib.suppress(RecordingError):  # without one, readers index the file by a pass over it
             self._append(self._ending())
         self._failure = failure
-
-    def _start_new_chunk(self) -> None:
-        self._parts: list[Buffer] = []
-        self._size = 0
-        self._entries: dict[int, array[int]] = {}
-        self._chunk_first: int | None = None
-        self._chunk_last = 0
-        self._chunk_since = 0.0
 
     def _check_usable(self) -> None:
         if self._failure is not None:
@@ -286,7 +298,7 @@ class ContainerWriter:
         self._failure = (
             f"writing {self.path} failed: {error.strerror or error}. Saved: {self._position} bytes on disk, "
             f"{len(self._chunks)} chunks ({saved} bytes of messages{until}); the file is readable, {cut}. "
-            f"The {sum(len(e) // 2 for e in self._entries.values())} messages since then are lost. "
+            f"The {self._chunk.messages if self._chunk else 0} messages since then are lost. "
             "Free some space or record to another disk."
         )
         raise RecordingError(self._failure) from error

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.json_format import ParseDict, ParseError
+from google.protobuf.json_format import ParseDict, ParseError  # type: ignore[import-untyped]
+from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
 
 from dataflow.messages import DepthImage, Image
 from dataflow.messages.base import Message
@@ -68,8 +69,6 @@ def _with_proto_times(value: Any) -> Any:
 
 
 def _rfc3339(seconds: Any, nanoseconds: Any) -> str:
-    from google.protobuf.timestamp_pb2 import Timestamp
-
     try:
         return str(Timestamp(seconds=seconds, nanos=nanoseconds).ToJsonString())
     except (TypeError, ValueError) as error:

@@ -23,10 +23,12 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudPro
 from foxglove_schemas_protobuf.Pose_pb2 import Pose as PoseProto
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
+from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion as QuaternionProto
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.descriptor_pb2 import FileDescriptorSet
-from google.protobuf.message import DecodeError
-from google.protobuf.timestamp_pb2 import Timestamp
+from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
+from google.protobuf.descriptor_pb2 import FileDescriptorSet  # type: ignore[import-untyped]
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
 
 from dataflow.messages import (
     CameraInfo,
@@ -51,7 +53,7 @@ Decode = Callable[[Any], Fields]
 
 UINT32_MAX = 2**32 - 1
 NUMERIC = PackedElementField
-_NUMERIC_DTYPES = {
+_NUMERIC_DTYPES: dict[int, np.dtype[Any]] = {
     NUMERIC.UINT8: np.dtype("u1"),
     NUMERIC.INT8: np.dtype("i1"),
     NUMERIC.UINT16: np.dtype("<u2"),
@@ -122,7 +124,7 @@ def _with_field(proto: Any, field: str, data: npt.NDArray[Any]) -> Parts:
     head = proto.SerializeToString()
     if not data.size:
         return [head]
-    return [head + _varint(number << 3 | 2) + _varint(data.nbytes), memoryview(data).cast("B")]
+    return [head + _varint(number << 3 | 2) + _varint(data.nbytes), data.reshape(-1).view(np.uint8).data]
 
 
 def _varint(value: int) -> bytes:
@@ -276,7 +278,7 @@ def _encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
     names: list[str] = []
     formats: list[Any] = []
     proto = PointCloudProto(
-        timestamp=_timestamp(message.stamp), frame_id=message.frame, pose=PoseProto(orientation={"w": 1.0})
+        timestamp=_timestamp(message.stamp), frame_id=message.frame, pose=PoseProto(orientation=QuaternionProto(w=1.0))
     )
     offset = 0
     for field, columns, dtype, numeric in _CLOUD_COLUMNS:
@@ -351,7 +353,7 @@ def _columns(data: bytes, count: int, stride: int, present: list[tuple[int, int]
 def _pose(position: Sequence[float], orientation: Sequence[float]) -> PoseProto:
     x, y, z = position
     qx, qy, qz, qw = orientation
-    return PoseProto(position={"x": x, "y": y, "z": z}, orientation={"x": qx, "y": qy, "z": qz, "w": qw})
+    return PoseProto(position=Vector3(x=x, y=y, z=z), orientation=QuaternionProto(x=qx, y=qy, z=qz, w=qw))
 
 
 def _position(proto: Any) -> list[float]:
@@ -404,8 +406,8 @@ def _encode_transforms(message: Transforms) -> tuple[Parts, tuple[str, ...]]:
             timestamp=stamp,
             parent_frame_id=frame,
             child_frame_id=child,
-            translation={"x": x, "y": y, "z": z},
-            rotation={"x": qx, "y": qy, "z": qz, "w": qw},
+            translation=Vector3(x=x, y=y, z=z),
+            rotation=QuaternionProto(x=qx, y=qy, z=qz, w=qw),
         )
     return [proto.SerializeToString()], ()
 
@@ -448,7 +450,7 @@ def _encode_scan(message: LaserScan) -> tuple[Parts, tuple[str, ...]]:
     proto = LaserScanProto(
         timestamp=_timestamp(message.stamp),
         frame_id=message.frame,
-        pose=PoseProto(orientation={"w": 1.0}),
+        pose=PoseProto(orientation=QuaternionProto(w=1.0)),
         start_angle=message.angle_min,
         end_angle=message.angle_max,
     )

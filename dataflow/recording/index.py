@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-import lz4.frame
+import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import numpy.typing as npt
 import zstandard

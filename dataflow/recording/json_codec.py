@@ -177,7 +177,7 @@ def _encode_array(spec: ArrayField, data: npt.NDArray[Any], plain: dict[str, Any
         exact[spec.name] = {
             "dtype": data.dtype.name,
             "shape": list(data.shape),
-            "base64": base64.b64encode(np.ascontiguousarray(data)).decode() if data.size else "",
+            "base64": base64.b64encode(data.data).decode() if data.size else "",
         }
         return
     plain[spec.name] = data.ravel().tolist()
@@ -190,14 +190,12 @@ def _listable(data: npt.NDArray[Any]) -> bool:
     if data.dtype.kind == "f":
         return bool(np.isfinite(data).all())
     if data.dtype.itemsize == 8 and data.size:
-        return -MAX_SAFE_INTEGER <= int(data.min()) and int(data.max()) <= MAX_SAFE_INTEGER
+        return int(data.min()) >= -MAX_SAFE_INTEGER and int(data.max()) <= MAX_SAFE_INTEGER
     return True
 
 
 def _decode_array(spec: ArrayField, plain: Any, exact: Any) -> npt.NDArray[Any]:
-    dtype = spec.dtypes[0]
-    if exact is not None:
-        dtype = next((d for d in spec.dtypes if d.name == exact["dtype"]), None) or _refuse_dtype(spec, exact["dtype"])
+    dtype = spec.dtypes[0] if exact is None else _dtype(spec, exact["dtype"])
     if exact is not None and "base64" in exact:
         data = np.frombuffer(base64.b64decode(exact["base64"], validate=True), dtype)
     else:
@@ -208,7 +206,10 @@ def _decode_array(spec: ArrayField, plain: Any, exact: Any) -> npt.NDArray[Any]:
     return data
 
 
-def _refuse_dtype(spec: ArrayField, name: Any) -> np.dtype[Any]:
+def _dtype(spec: ArrayField, name: Any) -> np.dtype[Any]:
+    for dtype in spec.dtypes:
+        if dtype.name == name:
+            return dtype
     raise ValueError(f"dtype {name!r}; the declaration has {spec.dtype_text()}")
 
 

@@ -217,7 +217,7 @@ class Recording:
                 raise RecordingError(f"{self.path}: an event at {raw.log_time} cannot be read: {error!r}") from error
 
     def digests(self, streams: Sequence[str] | None = None) -> Mapping[str, str]:
-        """The stream digests, computed from the decoded messages: xxh3-128 over the message digests, in stream order."""
+        """The stream digests of the decoded messages: xxh3-128 over the message digests, in stream order."""
         found: dict[str, str] = {}
         for stream in sorted(self._choose(streams), key=lambda s: s.info.name):
             digest = StreamDigest()

@@ -133,9 +133,8 @@ class RecordingWriter:
         """
         known = self._streams.get(stream)
         if known is None:
-            raise RecordingError(
-                f"{self.path}: stream {stream!r} is not declared; declared: {', '.join(sorted(self._streams)) or 'none'}"
-            )
+            names = ", ".join(sorted(self._streams)) or "none"
+            raise RecordingError(f"{self.path}: stream {stream!r} is not declared; declared are: {names}")
         self._check(known, message, seq, incarnation)
         parts, extra = known.codec.encode(message)
         base = seq - seq % SEQUENCE_SPAN
@@ -217,7 +216,7 @@ class RecordingWriter:
     def _check(self, stream: _Stream, message: Message, seq: int, incarnation: int) -> None:
         where = f"{self.path}: stream {stream.name!r}"
         if type(message) is not stream.message:
-            raise RecordingError(f"{where} holds {stream.message.SCHEMA}, got a {type(message).__name__}")
+            raise RecordingError(f"{where} holds {stream.message.SCHEMA}, got {type(message).__name__}")
         if message.stamp < 0:
             raise RecordingError(
                 f"{where}: stamp {message.stamp} is before the epoch; MCAP times are unsigned, so stamps must be ≥ 0"

@@ -1,11 +1,58 @@
-"""Tools that follow a running graph from outside: viewers, `echo`, `hz`. They hold nobody up."""
+"""Tools that follow a running graph from outside: viewers, `echo`, `hz`. They can hold nobody up."""
 
 from __future__ import annotations
 
 import contextlib
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
+
+from dataflow.graph.model import Graph
+from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
+from dataflow.transport.registry import RunningGraph, running
+
+POLL = 0.1
+
+
+class NotRunning(LookupError):
+    """There is no such running graph, or more than one could be meant: says which ones run."""
+
+
+def find_running(name: str | None, *, wait: float = 0.0) -> RunningGraph:
+    """The running graph of that name (or namespace), or the only one. Waits up to `wait` seconds for it."""
+    deadline = time.monotonic() + wait
+    while True:
+        graphs = running()
+        found = [g for g in graphs if name is None or name in (g.name, g.namespace, str(g.pid))]
+        if len(found) == 1:
+            return found[0]
+        if len(found) > 1:
+            listed = ", ".join(f"{g.name} (process {g.pid})" for g in found)
+            raise NotRunning(f"several graphs run: {listed}; say which with --graph NAME or the process number")
+        if time.monotonic() >= deadline:
+            listed = ", ".join(g.name for g in graphs) or "none"
+            wanted = "no graph runs on this machine" if name is None else f"no graph {name!r} runs here"
+            raise NotRunning(f"{wanted} (running: {listed}); start one with: dataflow run GRAPH")
+        time.sleep(POLL)
+
+
+def graph_of(found: RunningGraph) -> Graph:
+    """The resolved graph that runs."""
+    return Graph.from_json(found.graph)
+
+
+def still_runs(found: RunningGraph) -> bool:
+    """Whether that very run goes on."""
+    return any(g.pid == found.pid and g.started == found.started for g in running())
+
+
+@contextlib.contextmanager
+def tap(found: RunningGraph, expressions: Sequence[str], window: TapWindow | None = None) -> Iterator[TapClient]:
+    """A lossy copy of the streams that match `expressions` (relative to the namespace, absolute with a leading `/`)."""
+    absolute = [e[1:] if e.startswith("/") else f"{found.namespace}/{e}" for e in expressions]
+    with Bus(NetworkConfig(connect=found.endpoints)) as bus, TapClient(bus, found.namespace, absolute, window) as client:
+        yield client
 
 
 @contextlib.contextmanager
@@ -14,13 +61,13 @@ def attached_viewer(graph: str, target: str | None) -> Iterator[None]:
     if target is None:
         yield
         return
-    command = [sys.executable, "-m", "dataflow.cli.main", "view", "--graph", graph, f"--{target}", "--wait", "60"]
+    command = [sys.executable, "-m", "dataflow.cli.main", "view", "--graph", graph, "--to", target, "--wait", "120"]
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0)
     try:
         yield
     finally:
         try:
-            process.wait(timeout=5.0)
+            process.wait(timeout=10.0)
         except subprocess.TimeoutExpired:
             process.terminate()
             process.wait(timeout=5.0)

@@ -33,7 +33,7 @@ class Channel:
         theirs.set_inheritable(True)
         return Channel(ours.detach()), theirs.detach()
 
-    def send(self, kind: str, **fields: Any) -> None:
+    def send(self, kind: str, /, **fields: Any) -> None:
         """Raises `ChannelClosed` when the other end is gone."""
         data = msgpack.packb([kind, fields], use_bin_type=True)
         try:

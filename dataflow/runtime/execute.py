@@ -14,6 +14,7 @@ from typing import Any
 
 from dataflow.graph.model import Graph, Placement
 from dataflow.recording import Recording
+from dataflow.recording.facts import machine_facts
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.replay import graph_metadata, plan_replay, recorded_graph
 from dataflow.runtime.supervisor import RunReport, Status, Supervisor
@@ -59,8 +60,6 @@ def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunRepor
 
 
 def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
-    from dataflow.recording.facts import machine_facts
-
     placed = {node: label for label, nodes in plan.graph.hosts(plan.placement).items() for node in nodes}
     run_facts = {
         "mode": mode,
@@ -70,7 +69,7 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         "threads": str(plan.graph.threads),
         **{f"host of {node}": label for node, label in placed.items()},
     }
-    return {**graph_metadata(plan.graph), "dataflow:run": run_facts, "dataflow:machine": machine_facts()}
+    return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **machine_facts()}
 
 
 @contextmanager

@@ -234,7 +234,7 @@ class OperatorRunner:
             failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
             self._record(kind, firing, started, (), failure.summary)
             raise failure from error
-        self.firings += 1
+        self.firings += kind != "finish"
         self._record(kind, firing, started, emissions, None)
         self.busy_ns += time.time_ns() - started
 

@@ -18,9 +18,10 @@ _VARIABLES = (
 
 
 def environment(threads: int) -> dict[str, str]:
-    """The environment of a host process: thread counts, and hashing that is the same in every process."""
+    """The environment of a host process: thread counts, the import path of this one, and hashing without a salt."""
     return {
         **os.environ,
+        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
         **dict.fromkeys(_VARIABLES, str(threads)),
         "PYTHONHASHSEED": "0",
         "DATAFLOW_THREADS": str(threads),

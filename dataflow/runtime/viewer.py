@@ -1,4 +1,4 @@
-"""Viewer output of a running graph: a sink that saves a viewer file, and a tap that follows a live graph."""
+"""The sink that saves what a running graph shows as a viewer file, losslessly."""
 
 from __future__ import annotations
 
@@ -8,32 +8,41 @@ from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
-from dataflow.runtime.sink import stream_types
-from dataflow.view import ViewerSink
+from dataflow.runtime.sink import SinkFailure, stream_types
+from dataflow.view import Save, ViewerSink
+
+PATIENCE = 30.0
 
 
 class ViewerFileSink:
-    """Saves the streams as a viewer file, losslessly."""
+    """Draws every message of the shown streams into one file."""
 
     def __init__(self, path: str, graph: Graph, streams: list[str]) -> None:
         self.path = Path(path)
-        self.viewer = ViewerSink.save(self.path)
+        self.viewer = ViewerSink(Save(self.path))
         self.viewer.open({s: stream_types(graph, s)[0] for s in streams}, graph)
-        self.messages = 0
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
-        self.messages += 1
-        self.viewer.log(stream, message)
+        dropped = self.viewer.statistics().dropped
+        self.viewer.log(stream, message, wait=PATIENCE)
+        if self.viewer.statistics().dropped > dropped:
+            raise SinkFailure(f"{self.path} took nothing for {PATIENCE:g} s")
 
     def firings(self, operator: str, stamp: int, payload: bytes) -> None:
         """Firing records are not shown."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        """A stream that ends stays as it is."""
+        """A stream that ended stays as it is."""
 
     def flush(self) -> None:
-        """The viewer's own writer flushes."""
+        """The viewer's own thread writes as it draws."""
 
     def close(self, outcome: str) -> Mapping[str, Any]:
-        self.viewer.close()
-        return {"path": str(self.path), "messages": self.messages, "bytes": self.path.stat().st_size}
+        self.viewer.close(timeout=PATIENCE)
+        drawn = self.viewer.statistics()
+        return {
+            "path": str(self.path),
+            "messages": drawn.drawn,
+            "failed": drawn.failed,
+            "bytes": self.path.stat().st_size,
+        }

@@ -1,24 +1,26 @@
 """The aligner: from messages and frontiers to firings, whatever the order in which they arrive.
 
-A pure state machine without clock, thread or I/O. Its law: for every interleaving that keeps each stream's own order, the
-sequence of firings is the same. It implements the eight rules of `docs/design.md`; where those leave room, this is the
-reading:
+A pure state machine without clock, thread or I/O. Its law: for every interleaving that keeps each stream's
+own order, the sequence of firings is the same. It implements the eight rules of `docs/design.md`; where those
+leave room, this is the reading:
 
-* *Final stamps.* A stream ends with a final stamp at or above every frontier it promised. So a frontier at g proves
-  that ticks reach g, and the `finish` firing, 1 ns above the largest final stamp of the triggers (and, with ticks, of
-  the streams that bound them), lies above every output frontier given out before.
-* *Ticks* are not bounded by `before` inputs. Those are feedback: they end with the operator, so they cannot end it.
+* *Final stamps.* A stream ends with a final stamp at or above every frontier it promised. So a frontier at g
+  proves that ticks reach g, and the `finish` firing, 1 ns above the largest final stamp of the triggers (and,
+  with ticks, of the streams that bound them), lies above every output frontier given out before.
+* *Ticks* are not bounded by `before` inputs. Those are feedback: they end with the operator, so they cannot
+  end it.
 * *`finish`* has no inputs. Batch messages after the last firing are dropped as `unused`.
-* *Dropped firings.* Where a required Sampled input is absent there is no firing: its triggers (and tick) are dropped, and
-  its Batch messages wait for the next one.
+* *Dropped firings.* Where a required Sampled input is absent there is no firing: its triggers (and tick) are
+  dropped, and its Batch messages wait for the next one.
 * *A join passes over an anchor* as soon as one input cannot match, without waiting for the others.
-* *Forced frontiers.* A trigger message is `late` when its stamp is not above everything decided, which includes
-  everything that `output_frontier` has told. Above that it still takes part, even below a forced frontier.
-* *Static streams* are waited for; forcing does not apply to them. As a trigger in a merge, or in a Batch, a static
-  message is an ordinary one at its stamp, on a stream that ends with it.
-* *Restarted streams.* `reset` begins a new incarnation; what lies at or below the last stamp of the earlier ones is late
-  for every input, because firing stamps never go back. A graph that should follow a clock which jumped back by much
-  starts new aligners.
+* *Forced frontiers.* A trigger message is `late` when its stamp is not above everything decided, which
+  includes everything that `output_frontier` has told. Above that it still takes part, even below a forced
+  frontier.
+* *Static streams* are waited for; forcing does not apply to them. As a trigger in a merge, or in a Batch, a
+  static message is an ordinary one at its stamp, on a stream that ends with it.
+* *Restarted streams.* `reset` begins a new incarnation; what lies at or below the last stamp of the earlier
+  ones is late for every input, because firing stamps never go back. A graph that should follow a clock which
+  jumped back by much starts new aligners.
 """
 
 from __future__ import annotations
@@ -48,7 +50,7 @@ class StreamEnd(NamedTuple):
 
 
 class Aligner:
-    """Decides the firings of one operator. `push`, `advance` and `end` tell it what streams said; `poll` asks.
+    """Decides one operator's firings. `push`, `advance` and `end` tell it what streams said; `poll` asks.
 
     One thread at a time. Frontiers and stamps are integer nanoseconds.
     """
@@ -121,7 +123,7 @@ class Aligner:
             lane.raise_frontier(frontier)
 
     def advance(self, stream: str, frontier: int) -> None:
-        """The stream promises that no later message has a stamp at or below `frontier`; older promises are ignored."""
+        """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back."""
         state = self._stream(stream)
         if frontier >= FOREVER:
             raise ValueError(
@@ -134,8 +136,8 @@ class Aligner:
     def end(self, stream: str, final_stamp: int | None = None, reason: str = "") -> None:
         """The stream ends: no later message. The second end of a stream is ignored.
 
-        final_stamp: event time the stream reached, at or above its last message and every frontier it promised. None
-            takes the larger of these, which is repeatable only if the promised frontiers are.
+        final_stamp: event time the stream reached, at or above its last message and every frontier it
+            promised. None takes the larger of these, which is repeatable only if the promised frontiers are.
         """
         state = self._stream(stream)
         if state.ended:
@@ -146,9 +148,10 @@ class Aligner:
             lane.raise_frontier(FOREVER)
 
     def reset(self, stream: str, incarnation: int) -> None:
-        """The stream's source restarted: a new incarnation, whose stamps at or below the old ones' last are late.
+        """The stream's source restarted and begins a new incarnation.
 
-        A stream that had ended is open again. `push` does this by itself on a message of a higher incarnation. Firings
+        What it then sends at or below the last stamp of earlier incarnations is late, for every input. A
+        stream that had ended is open again. `push` does this by itself on a message of a higher incarnation. Firings
         are repeatable across a restart if the old incarnation promised nothing above its last message.
         """
         state = self._stream(stream)
@@ -160,7 +163,7 @@ class Aligner:
     # What the host decides when it will not wait
 
     def force(self, input: str, frontier: int) -> None:
-        """Pretends that the streams of `input` have promised `frontier`. Live only; static streams are waited for."""
+        """Pretends that the streams of `input`, but for static ones, have promised `frontier`. Live only."""
         if input not in self._lanes:
             raise KeyError(f"no input {input!r}; the inputs are {', '.join(self._lanes)}")
         frontier = min(frontier, FOREVER - 1)
@@ -223,7 +226,7 @@ class Aligner:
     def output_frontier(self) -> int:
         """No firing that `poll` has still to return has a stamp at or below this. It never goes back.
 
-        A firing that poll has returned counts as done: until its messages are out, its ports promise its stamp - 1.
+        A firing that poll has returned counts as done: until its messages are out, promise its stamp - 1.
         """
         if self._finished:
             return FOREVER
@@ -290,7 +293,7 @@ class Aligner:
             self._ready = ticks.confirmed and triggers.bound >= tick
 
     def _undecided(self) -> int | None:
-        """The first undecided stamp; while it is not known where ticks start, the first that may turn out to be."""
+        """The first undecided stamp, or, while ticks have no known start, the first that may be one."""
         ticks = self._ticks
         if ticks is None or ticks.started:
             return self._stamp
@@ -304,7 +307,7 @@ class Aligner:
         return self._ticks.needs() if self._ticks.stamp == stamp else {}
 
     def _fire(self, stamp: int) -> Firing | None:
-        """The firing at a decided stamp; None if a required Sampled input is absent, which drops its triggers."""
+        """The firing at a decided stamp, or None if a required Sampled input is absent: a drop instead."""
         context: dict[str, InputValue] = {}
         stale: list[str] = []
         late: list[str] = []
@@ -400,7 +403,7 @@ class Aligner:
             self._prune(lane)
 
     def _prune(self, lane: Lane) -> None:
-        """Lets go of what no firing still to come can need; with the limit doubling, at little cost per message."""
+        """Forgets what no firing to come can need. The limit doubles, so the cost per message stays small."""
         bound = self.output_frontier()
         if lane.role == "sampled":
             self._sampled[lane.input].prune(lane, bound)

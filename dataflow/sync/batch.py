@@ -10,7 +10,7 @@ from dataflow.sync.spec import BatchSpec
 
 
 class Batch:
-    """One Batch input. Messages a forced decision left behind go into the next batch, so each stream's is a run."""
+    """One Batch input. What a forced decision left behind goes into the next batch: runs have no holes."""
 
     def __init__(self, spec: BatchSpec, lanes: Sequence[Lane], drop: DropEntry) -> None:
         self.name = spec.name
@@ -57,7 +57,7 @@ class Batch:
                 self._drop(lane, lane.entries.popleft(), "unused", "")
 
     def _cut(self, upto: int, now: int) -> None:
-        """Of the messages up to `upto`, drops all but the newest `max` and those older than `max_age` at `now`."""
+        """Drops what is older than `max_age` at `stamp`, and of the messages up to it all but `max`."""
         if self._max_age is not None:
             for lane in self._lanes:
                 while lane.entries and now - lane.entries[0].stamp > self._max_age:

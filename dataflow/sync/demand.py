@@ -1,8 +1,8 @@
 """Feedback: whether a graph's cycles can always make progress.
 
-The *demand* of an edge is how far ahead of its own next firing a consumer must know the producer's stream. An operator's
-output frontier advances to t - 1 once its inputs' frontiers reach t + demand; round a cycle this gets ahead only if the
-demands sum to less than zero.
+The *demand* of an edge is how far ahead of its own next firing a consumer must know the producer's stream. An
+operator's output frontier advances to t - 1 once its inputs' frontiers reach t + demand; round a cycle this
+gets ahead only if the demands sum to less than zero.
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from dataflow.sync.stamps import format_duration
 class Edge:
     """A stream from operator `producer` to input `input` of operator `consumer`.
 
-    before: of a Sampled input, as in `SampledSpec`. tolerance: of the join a trigger takes part in, as its `anchor` or
-    not. lag: of the producer's port. static: the stream carries one message, sent before anything fires: no demand.
+    before: of a Sampled input, as in `SampledSpec`. tolerance: of the join a trigger takes part in, as its
+    `anchor` or not. lag: of the producer's port. static: the stream carries one message, sent before anything
+    fires: no demand.
     """
 
     producer: str
@@ -56,9 +57,12 @@ class Cycle:
 
     def __str__(self) -> str:
         way = " -> ".join([self.edges[0].producer, *(f"{edge.consumer}.{edge.input}" for edge in self.edges)])
+        cure = "Sampled(before=True)"
+        if self.demand > 0:
+            cure = f"Sampled with a `before` more than {format_duration(self.demand)} longer"
         return (
-            f"cycle {way} would wait for itself: its demands sum to {format_duration(self.demand)}, and must be below 0;"
-            f" declare one of its inputs Sampled(before=True)"
+            f"cycle {way} would wait for itself: its demands sum to {format_duration(self.demand)} and must "
+            f"be below 0; declare one of its inputs {cure}"
         )
 
 

@@ -19,7 +19,7 @@ class StreamOrderError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """A message as the aligner sees it. Identity is (stream, incarnation, seq); `value` is carried, never looked at.
+    """A message as the aligner sees it. Its identity is (stream, incarnation, seq); `value` is only carried.
 
     stamp: event time, ns. seq: gapless within an incarnation of the stream. digest: of the message's content.
     """
@@ -33,16 +33,17 @@ class Entry:
 
 
 InputValue = Entry | None | tuple[Entry, ...] | Mapping[str, Entry]
-"""Of an input: an entry or None; a tuple for a Batch; for a `many` trigger or Sampled a map from stream to entry."""
+"""An entry or None; of a Batch a tuple; of a `many` trigger or Sampled a map from stream to entry."""
 
 
 @dataclass(frozen=True, slots=True)
 class Firing:
     """One call of `process()` (or of `finish()`): a stamp plus the exact messages given to each input.
 
-    kind: "fire" for trigger messages, "tick" for a tick alone, "finish" for the last one, which has no inputs.
-    tick: whether a tick lies at this stamp. stale: the Sampled inputs from which a message was withheld as older than
-    `max_age`. late: the Sampled and Batch inputs holding a message that an earlier firing should have had.
+    kind: "fire" for trigger messages, "tick" for a tick alone, "finish" for the last one, without inputs.
+    tick: whether a tick lies at this stamp.
+    stale: the Sampled inputs from which a message was withheld as older than `max_age`.
+    late: the Sampled and Batch inputs holding a message that an earlier firing should have had.
     """
 
     stamp: int
@@ -57,9 +58,10 @@ class Firing:
 class Drop:
     """A message (or tick, whose input is `TICK`) that no firing took.
 
-    unmatched: a join found no partner. no_sample, stale: the required Sampled input `because` was absent or too old.
-    unused: a Batch message cut off by `max` or `max_age`, or after the last firing. late: it came after a forced
-    decision, or a restarted stream went back over stamps it had already used.
+    unmatched: a join found no partner.
+    no_sample, stale: the required Sampled input `because` had no message yet, or too old a one.
+    unused: a Batch message cut off by `max` or `max_age`, or after the last firing.
+    late: it came after a forced decision, or on a restarted stream that went back over its stamps.
     """
 
     input: str
@@ -73,7 +75,7 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """The first undecided stamp, and for each input that holds it up the frontier which would settle that input."""
+    """The first undecided stamp, and the frontier that each input which holds it up would have to reach."""
 
     stamp: int
     needs: Mapping[str, int]

@@ -1,9 +1,9 @@
-"""Join: the triggers' messages meet at one stamp, or mutually nearest within a tolerance of the first trigger's.
+"""Join: the triggers' messages meet, at one stamp or as mutually nearest within a tolerance.
 
-The first trigger is the *anchor*; its stamp is the firing's. Anchor t and message x of another trigger match iff each is
-the other's nearest within the tolerance, ties to the earlier stamp. Nearest is over all messages, those already matched
-included, so a message matches at most once. A greedy search pairs differently: with tolerance 10, anchors 0 and 10 and
-x = 9 it would take (0, 9).
+The first trigger is the *anchor*; its stamp is the firing's. Anchor t and message x of another trigger match
+iff each is the other's nearest within the tolerance, ties to the earlier stamp. Nearest is over all messages,
+those already matched included, so a message matches at most once. A greedy search pairs differently: with
+tolerance 10, anchors 0 and 10 and x = 9 it would take (0, 9).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Join:
         self.ready = False
         """Whether `stamp` has a partner on every other trigger."""
         self.bound = NEVER
-        """No undecided anchor but `stamp` is at or below this: `stamp`, else the minimum of the trigger frontiers."""
+        """`stamp`, else the minimum of the trigger frontiers: no other firing lies at or below it."""
         self.decided = NEVER
         """The last anchor decided, matched or not."""
 
@@ -104,7 +104,7 @@ class Join:
         return needed
 
     def oldest_wait(self) -> tuple[int, dict[str, int]] | None:
-        """While no anchor waits: the oldest message of another trigger, and the anchor frontier that rules it out."""
+        """While no anchor waits: the oldest message of the others, and the anchor frontier to rule it out."""
         heads = [lane.entries[0].stamp for lane in self._others if lane.entries]
         return (min(heads), {self._anchor.input: min(heads) + self._tolerance}) if heads else None
 

@@ -46,7 +46,7 @@ class StreamState:
         self.final: int | None = None
 
     def accept(self, entry: Entry) -> bool:
-        """Takes note of a message. False if it is merely late, because the stream restarted; raises if it is wrong."""
+        """Takes note of a message. False if it is late, as the stream restarted; raises if it is wrong."""
         stamp = entry.stamp
         if stamp <= self.promised or self.ended or entry.incarnation != self.incarnation:
             self._check_order(entry)
@@ -71,8 +71,8 @@ class StreamState:
             final_stamp = self.promised if self.promised != NEVER else None
         elif final_stamp < self.promised:
             raise StreamOrderError(
-                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, but had promised frontier "
-                f"{format_stamp(self.promised)}; the final stamp is the larger of last message and last frontier"
+                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, below the "
+                f"frontier {format_stamp(self.promised)} it promised: pass the larger of last stamp and frontier"
             )
         self.ended = True
         self.final = final_stamp
@@ -90,7 +90,7 @@ class StreamState:
         self.ended = False
 
     def _check_order(self, entry: Entry) -> None:
-        """Returns if the message lies in the time of an earlier incarnation; raises if it breaks a promise."""
+        """Returns if the message lies in the time of earlier incarnations; raises if it breaks a promise."""
         where = f"stream {self.name!r}: message {entry.seq} at {format_stamp(entry.stamp)}"
         if entry.incarnation < self.incarnation:
             raise StreamOrderError(f"{where} is of incarnation {entry.incarnation}, after {self.incarnation}")
@@ -108,7 +108,7 @@ class StreamState:
 
 
 class Lane:
-    """A stream on its way into one input: entries not yet decided upon, and the frontier as that input sees it."""
+    """A stream on its way into one input: entries not yet decided, and the frontier as that input sees it."""
 
     __slots__ = ("delay", "entries", "frontier", "input", "late", "limit", "removed", "role", "state")
 

@@ -1,4 +1,4 @@
-"""Merge: every trigger message fires, all those of one stamp together. A single trigger is the simplest merge."""
+"""Merge: every trigger message fires, those of one stamp together. One trigger is the simplest merge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from dataflow.sync.stamps import FOREVER, NEVER
 
 
 class Merge:
-    """The next trigger stamp is the smallest at the head of a lane; it is known once every frontier has reached it."""
+    """The next stamp is the smallest at the head of a lane, decided once every frontier has reached it."""
 
     def __init__(self, triggers: Sequence[TriggerSpec], lanes: Sequence[Lane], drop: DropEntry) -> None:
         self._lanes = tuple(lanes)

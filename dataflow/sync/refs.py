@@ -33,7 +33,7 @@ class RunRef:
 
 
 InputRef = MessageRef | None | tuple[RunRef, ...] | Mapping[str, MessageRef]
-"""Of an input: a message or None; runs for a Batch; for a `many` trigger or Sampled a map from stream to message."""
+"""A message or None; of a Batch its runs; of a `many` trigger or Sampled a map from stream to message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +69,7 @@ def _message_ref(entry: Entry) -> MessageRef:
 
 
 def _runs(entries: tuple[Entry, ...]) -> tuple[RunRef, ...]:
-    """The fewest runs that hold exactly `entries`, by stream and then in order; a gap in seq begins a new run."""
+    """The fewest runs that hold exactly `entries`, stream by stream; a gap in seq begins a new run."""
     runs: list[RunRef] = []
     for entry in sorted(entries, key=lambda e: (e.stream, e.incarnation, e.seq)):
         last = runs[-1] if runs else None

@@ -1,4 +1,4 @@
-"""The inverse of the aligner: from recorded firings and messages in any interleaving to exactly those firings."""
+"""The inverse of the aligner: recorded firings, and messages in any order, give those firings again."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ Position = tuple[int, int]
 class RecordedAligner:
     """Yields recorded firings again, each as soon as all its messages are there.
 
-    records: the operator's fire, tick and finish records in order; read one ahead, so an iterator over a file is fine.
+    records: the operator's fire, tick and finish records in order; read one ahead, so an iterator over a file
+    is fine.
 
-    Within an input the recorded positions on a stream never go back, so what lies below the last position used by
-    every input of a stream is forgotten. Messages of a stream from which records take nothing are held to the end: the
-    host bounds how far it reads ahead.
+    Within an input the recorded positions on a stream never go back, so what lies below the last position
+    used by every input of a stream is forgotten. Messages of a stream from which records take nothing are
+    held to the end: the host bounds how far it reads ahead.
     """
 
     def __init__(self, spec: AlignSpec, records: Iterable[FiringInputs]) -> None:

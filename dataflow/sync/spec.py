@@ -1,7 +1,7 @@
 """What an operator waits for: the declaration from which an aligner is built.
 
-A *stream* is named by its key. An input is usually fed by one stream; with `many` it is fed by any number of them
-(a wildcard) and its value is kept per stream. Durations are nanoseconds.
+A *stream* is named by its key. An input is usually fed by one stream; with `many` it is fed by any number of
+them (a wildcard) and its value is kept per stream. Durations are nanoseconds.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ class TriggerSpec:
 
 @dataclass(frozen=True, slots=True)
 class SampledSpec:
-    """A `Sampled`: supplies the newest message at or before the firing's stamp, and never makes the operator fire.
+    """A `Sampled`: supplies the newest message at or before the firing's stamp; never makes it fire.
 
-    `before` moves the cut into the past: None takes stamps <= t, 1 stamps strictly before t (``before=True``), D stamps
-    <= t - D. A message older than `max_age` at the firing counts as absent. If `required` and absent, there is no
-    firing: its triggers are dropped as `no_sample` (there never was a message) or `stale` (it was too old). A `many`
-    input maps each stream to its newest message, and is absent when the map is empty.
+    `before` moves the cut into the past: None takes stamps <= t, 1 stamps strictly before t
+    (``before=True``), D stamps <= t - D. A message older than `max_age` at the firing counts as absent. If
+    `required` and absent, there is no firing: its triggers are dropped as `no_sample` (there never was a
+    message) or `stale` (it was too old). A `many` input maps each stream to its newest message, and is absent
+    when the map is empty.
     """
 
     name: str
@@ -60,8 +61,8 @@ class SampledSpec:
 class BatchSpec:
     """A `Batch`: supplies every message since the last firing up to the firing's stamp, oldest first.
 
-    At the firing the newest `max` of them, and none older than `max_age`, are kept; the rest are dropped as `unused`.
-    A `many` batch is one tuple ordered by (stamp, stream).
+    At the firing the newest `max` of them, and none older than `max_age`, are kept; the rest are dropped as
+    `unused`. A `many` batch is one tuple ordered by (stamp, stream).
     """
 
     name: str
@@ -82,8 +83,8 @@ class BatchSpec:
 class AlignSpec:
     """All inputs of one operator, and how its triggers combine.
 
-    mode: "join" fires when every trigger has a message at one stamp (within `tolerance` of the first trigger, the
-        anchor); "merge" fires on every trigger message. With one trigger the two are the same.
+    mode: "join" fires when every trigger has a message at one stamp (within `tolerance` of the first trigger,
+        the anchor); "merge" fires on every trigger message. With one trigger the two are the same.
     every: period of ticks on event time, besides the triggers or without any.
     static: the streams that carry one message, valid at any stamp.
     """
@@ -125,7 +126,7 @@ class AlignSpec:
             raise ValueError(f"every must be at least 1 ns, not {self.every}")
         elif not self.bounds_of_ticks():
             raise ValueError(
-                "`every` needs an input that is neither static nor `before`: it says where ticks start and end"
+                "`every` needs an input that is neither static nor `before`, to say where ticks begin and end"
             )
 
     @property
@@ -146,7 +147,7 @@ class AlignSpec:
     def bounds_of_ticks(self) -> tuple[tuple[str, str], ...]:
         """The (input, stream) pairs between whose first and final stamps ticks lie.
 
-        Those that are not static, and not `before`: a feedback stream ends with the operator, so it cannot end it.
+        Those that are neither static nor `before`: feedback ends with the operator, so cannot end it.
         """
         return tuple(
             (spec.name, stream)

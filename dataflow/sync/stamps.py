@@ -1,7 +1,7 @@
 """Stamps, durations and the two ends of the time axis.
 
-A *stamp* is event time: integer nanoseconds since the Unix epoch. A *frontier* is a promise on a stream: no later
-message has a stamp at or below it. Both are plain `int`, because they are compared millions of times.
+A *stamp* is event time: integer nanoseconds since the Unix epoch. A *frontier* is a promise on a stream: no
+later message has a stamp at or below it. Both are plain `int`, because they are compared millions of times.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ _YEAR_9999 = 253_402_300_800 * 10**9
 
 
 def trail(frontier: int, lag: int) -> int:
-    """The frontier of a port that may emit `lag` ns behind the firing; the two ends of the axis stay where they are."""
+    """The frontier of a port that may emit `lag` ns behind the firing; the ends of time stay."""
     return frontier if frontier in (NEVER, FOREVER) else max(NEVER, frontier - lag)
 
 
 def parse_duration(value: str | int) -> int:
-    """Nanoseconds of a duration such as ``"100ms"``, ``"1.5s"``, ``"50us"``, ``"2min"``; an int is nanoseconds.
+    """Nanoseconds of a duration such as ``"100ms"``, ``"1.5s"`` or ``"2min"``; an int is nanoseconds.
 
     Decimals are exact: a duration that is not a whole number of nanoseconds is refused, never rounded.
     """
@@ -69,7 +69,7 @@ def parse_duration(value: str | int) -> int:
 
 
 def format_duration(duration: int) -> str:
-    """The shortest exact text of `duration` (ns) in one unit: 1_500_000_000 is ``"1.5s"``, 60 s is ``"60s"``."""
+    """The exact text of `duration` (ns) in the largest unit from ns to s that it fills: ``"1.5s"``."""
     sign, magnitude = ("-", -duration) if duration < 0 else ("", duration)
     unit = next(
         (u for u in ("s", "ms", "us") if magnitude >= NANOSECONDS[u]), "s" if magnitude == 0 else "ns"
@@ -80,7 +80,7 @@ def format_duration(duration: int) -> str:
 
 
 def format_stamp(stamp: int) -> str:
-    """`stamp` for people: ISO 8601 in UTC with all nine decimals, or seconds where it is clearly no calendar date."""
+    """`stamp` for people: ISO 8601 in UTC with nine decimals, or seconds where it is no calendar date."""
     if stamp == NEVER:
         return "never"
     if stamp == FOREVER:

@@ -9,9 +9,10 @@ from dataflow.sync.stamps import FOREVER, NEVER
 
 
 class Ticks:
-    """Grid points k * period between the smallest first stamp and the largest final stamp of the bounding streams.
+    """Grid points k * period from the smallest first to the largest final stamp of the bounding streams.
 
-    A final stamp is never below a frontier promised before it, so one frontier at g proves that a tick at g exists.
+    A final stamp is never below a frontier promised before it, so one frontier at g proves that a tick at g
+    exists.
     """
 
     def __init__(self, period: int, lanes: Sequence[Lane]) -> None:
@@ -23,11 +24,11 @@ class Ticks:
         self.latest_start: int | None = None
         """A grid point at or after the first tick; None while no stream has had a message."""
         self.stamp = NEVER
-        """The next tick, or while that is not known a stamp before which there is none; FOREVER once they are over."""
+        """The next tick, or a stamp before which there is none; FOREVER once ticks are over."""
         self.confirmed = False
         """Whether there is a tick at `stamp`."""
         self.reach = NEVER
-        """The farthest that any bounding stream is known to go: ticks lie at or before the final value of this."""
+        """The farthest that any bounding stream is known to go, which ticks do not exceed."""
 
     def settle(self, decided: int) -> None:
         """Finds the next tick above `decided`, the last stamp decided."""
@@ -57,7 +58,7 @@ class Ticks:
         }
 
     def _find_start(self) -> None:
-        """The grid point at or after the earliest first stamp; a stream still silent may begin above its frontier."""
+        """The grid point at or after the first stamp of all; a silent stream may begin above its frontier."""
         begin = seen = FOREVER
         for lane in self._lanes:
             if lane.state.first is not None:

@@ -6,7 +6,9 @@ process.
 
 from __future__ import annotations
 
+import os
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import TracebackType
@@ -14,11 +16,23 @@ from typing import Any, Self
 
 import zenoh
 
-from dataflow.transport.codec import Buffer, Envelope, Kind, encode_parts
-from dataflow.transport.keys import alive_key, runtime_key, static_key, stream_of
+from dataflow.transport.codec import Buffer, DecodeError, Envelope, Kind, encode_head, encode_parts, parts_size
+from dataflow.transport.keys import alive_key, runtime_key, shared_key, static_key, stream_of
 from dataflow.transport.network import NetworkConfig
+from dataflow.transport.shared import (
+    SUPPORTED,
+    THRESHOLD,
+    Board,
+    BoardReader,
+    PoolReader,
+    SharedMemoryError,
+    SharedPool,
+    is_reference,
+    machine,
+)
 
 CLOSE_WITHIN = 5.0
+MAPPED_WITHIN = 1.0
 
 Receive = Callable[[Buffer], object]
 
@@ -35,30 +49,43 @@ class Counters:
     sent_bytes: int = 0
     received_messages: int = 0
     received_bytes: int = 0
-    rejected: int = 0
-    """Samples that were not accepted: deletions, or references to shared memory that do not resolve."""
+    shared_messages: int = 0
+    """Of those sent, the ones that went through shared memory."""
+    shared_bytes: int = 0
+    shared_full: int = 0
+    """Large messages that travelled whole because the pool had no room."""
+    shared_unready: int = 0
+    """Large messages that travelled whole because not all consumers could share memory (yet)."""
+    unresolved: int = 0
+    """References received whose memory could not be opened."""
 
 
 class StreamPublisher:
     """Publishes one stream: in order, reliably; waits when a consumer's link is full."""
 
-    def __init__(self, bus: Bus, stream: str, publisher: zenoh.Publisher) -> None:
+    def __init__(self, bus: Bus, stream: str, publisher: zenoh.Publisher, sharing: _Sharing | None) -> None:
         self.stream = stream
         self._bus = bus
         self._publisher = publisher
+        self._sharing = sharing
         self._probes = 0
 
     def put(self, envelope: Envelope) -> int:
-        """Publishes an envelope; returns its bytes."""
-        return self.put_bytes(b"".join(encode_parts(envelope)))
+        """Publishes an envelope, through shared memory where all consumers can take it from there; returns its bytes.
+
+        Raises `BusError` when the bus is closed.
+        """
+        parts = encode_parts(envelope)
+        size = parts_size(parts)
+        reference = None
+        if self._sharing is not None and size >= THRESHOLD:
+            reference = self._sharing.share(envelope, parts, size)
+        self._put(b"".join(parts) if reference is None else reference, size)
+        return size
 
     def put_bytes(self, payload: bytes) -> int:
         """Publishes bytes as they are: an encoded envelope, or, on the runtime's own keys, anything."""
-        try:
-            self._publisher.put(payload)
-        except zenoh.ZError as error:
-            raise BusError(f"publishing {len(payload)} bytes on {self.stream!r}: {error}") from error
-        self._bus.count_sent(len(payload))
+        self._put(payload, len(payload))
         return len(payload)
 
     def probe(self, number: int | None = None) -> int:
@@ -67,8 +94,69 @@ class StreamPublisher:
         self.put(Envelope(Kind.PROBE, self.stream, 0, self._probes, 0))
         return self._probes
 
+    @property
+    def shares(self) -> bool:
+        """Whether large messages go through shared memory now: all consumers are known and on this machine."""
+        return self._sharing is not None and self._sharing.ready
+
     def close(self) -> None:
         undeclare(self._publisher)
+        if self._sharing is not None:
+            self._sharing.close()
+
+    def _put(self, payload: bytes, size: int) -> None:
+        try:
+            self._publisher.put(payload)
+        except zenoh.ZError as error:
+            raise BusError(f"publishing {size} bytes on {self.stream!r}: {error}") from error
+        self._bus.count_sent(size)
+
+
+class _Sharing:
+    """The consumers of one stream that can read shared memory. A reference is sent only when that is all of them."""
+
+    def __init__(self, bus: Bus, stream: str, consumers: int) -> None:
+        self._bus = bus
+        self._expected = consumers
+        self._machine = machine()
+        self._lock = threading.Lock()
+        self._boards: dict[str, BoardReader] = {}
+        self._all: tuple[BoardReader, ...] = ()
+        self._watch = bus.session.liveliness().declare_subscriber(
+            shared_key(stream, "*", "*", "*", "*"),
+            zenoh.handlers.Callback(self._on_token, indirect=False),
+            history=True,
+        )
+
+    @property
+    def ready(self) -> bool:
+        return len(self._all) == self._expected
+
+    def share(self, envelope: Envelope, parts: list[Buffer], size: int) -> bytes | None:
+        """The reference to send instead of the envelope; None when it must travel whole (counted)."""
+        claims = self._all
+        if len(claims) != self._expected:
+            self._bus.counted.shared_unready += 1
+            return None
+        return self._bus.share(envelope, parts, size, claims)
+
+    def close(self) -> None:
+        undeclare(self._watch)
+
+    def _on_token(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        machine_name, pid, descriptor, _ = key.rsplit("/", 4)[1:]
+        with self._lock:
+            if sample.kind == zenoh.SampleKind.DELETE:
+                gone = self._boards.pop(key, None)
+                if gone is not None:
+                    gone.lost = True
+            elif machine_name == self._machine and pid.isdigit() and descriptor.isdigit():
+                try:
+                    self._boards[key] = BoardReader(int(pid), int(descriptor), key)
+                except SharedMemoryError:  # it stays out: then the stream travels whole, counted as `shared_unready`
+                    return
+            self._all = tuple(self._boards.values())
 
 
 def undeclare(declared: Any) -> None:
@@ -83,11 +171,16 @@ def undeclare(declared: Any) -> None:
 class Token:
     """A declaration that lasts until `close` (or the end of the bus)."""
 
-    def __init__(self, declared: Any) -> None:
+    def __init__(self, *declared: Any, board: Board | None = None) -> None:
         self._declared = declared
+        self._board = board
 
     def close(self) -> None:
-        undeclare(self._declared)
+        for declared in self._declared:
+            undeclare(declared)
+        if self._board is not None:
+            self._board.close()
+            self._board = None
 
     def __enter__(self) -> Self:
         return self
@@ -112,40 +205,83 @@ class Bus:
         except zenoh.ZError as error:
             raise BusError(f"cannot listen on {', '.join(self.config.listen) or 'nothing'}: {error}") from error
         self.id = str(self.session.zid())
-        self._counters = Counters()
+        self.counted = Counters()
         self._lock = threading.Lock()
+        self._pool: SharedPool | None = None
+        self._pools = PoolReader()
+        self._shares = self.config.shared_memory and SUPPORTED
+        self._subscriptions: list[Token] = []
         self._declared: dict[str, zenoh.Queryable[None]] = {}
         self._static: dict[str, bytes] = {}
         self._closed = False
 
     # Streams
 
-    def publisher(self, stream: str) -> StreamPublisher:
-        """A publisher of the key `stream`: reliable, blocking, in order."""
-        return StreamPublisher(
-            self,
+    def publisher(self, stream: str, *, consumers: int = 0) -> StreamPublisher:
+        """A publisher of the key `stream`: reliable, blocking, in order.
+
+        `consumers` is the number of subscriptions to the stream (`subscribe` calls) in all other hosts, if known: when
+        all of them are on this machine, large messages go through shared memory. 0: nothing is shared.
+        """
+        publisher = self.session.declare_publisher(
             stream,
-            self.session.declare_publisher(
-                stream,
-                congestion_control=zenoh.CongestionControl.BLOCK,
-                reliability=zenoh.Reliability.RELIABLE,
-                express=True,
-            ),
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            reliability=zenoh.Reliability.RELIABLE,
+            express=True,
         )
+        sharing = _Sharing(self, stream, consumers) if consumers and self._shares else None
+        return StreamPublisher(self, stream, publisher, sharing)
 
     def subscribe(self, key: str, receive: Receive) -> Token:
         """Calls `receive(payload)` for everything published on a key (or key expression), in each publisher's order.
 
-        `payload` is read-only and stays valid for as long as anything refers to it; `decode` makes views of it. Runs on
-        Zenoh's thread: only append to a queue.
+        `payload` is read-only and stays valid for as long as anything refers to it; `decode` makes views of it, which
+        may lie in the publisher's shared memory. Runs on Zenoh's thread: only append to a queue.
         """
+        board, declared = self._offer_sharing(key)
 
         def on_sample(sample: zenoh.Sample) -> None:
-            payload = bytes(sample.payload)
-            self._count_received(len(payload))
+            received = bytes(sample.payload)
+            payload = self._resolve(received, board) if board is not None and is_reference(received) else received
+            self.counted.received_messages += 1
+            self.counted.received_bytes += len(payload)
             receive(payload)
 
-        return Token(self.session.declare_subscriber(key, zenoh.handlers.Callback(on_sample, indirect=False)))
+        subscriber = self.session.declare_subscriber(key, zenoh.handlers.Callback(on_sample, indirect=False))
+        token = Token(subscriber, *declared, board=board)
+        self._subscriptions.append(token)
+        return token
+
+    def _offer_sharing(self, key: str) -> tuple[Board | None, tuple[Any, ...]]:
+        """Tells the stream's publisher, before it can see the subscription, that we can read shared memory."""
+        if not self._shares or "*" in key or key.count("/") < 2:
+            return None, ()
+        board = Board()
+        name = shared_key(key, machine(), str(os.getpid()), str(board.descriptor), self.id)
+        return board, (self.session.liveliness().declare_token(name),)
+
+    def _resolve(self, payload: bytes, board: Board) -> Buffer:
+        """The envelope that a reference stands for; the reference itself, which `decode` refuses, when it is lost."""
+        try:
+            return self._pools.resolve(payload, board)
+        except (SharedMemoryError, DecodeError):
+            self.counted.unresolved += 1
+            return payload
+
+    def share(
+        self, envelope: Envelope, parts: list[Buffer], size: int, claims: tuple[BoardReader, ...]
+    ) -> bytes | None:
+        """Writes an envelope to the pool for `claims`; the reference to it, or None when there is no room (counted)."""
+        with self._lock:
+            if self._pool is None:
+                self._pool = SharedPool(self.config.pool_bytes)
+            block = self._pool.write(parts, size, claims)
+            if block is None:
+                self.counted.shared_full += 1
+                return None
+            self.counted.shared_messages += 1
+            self.counted.shared_bytes += size
+            return self._pool.reference(encode_head(envelope), block, size)
 
     def subscribe_keys(self, key: str, receive: Callable[[str, bytes], object]) -> Token:
         """As `subscribe`, for key expressions of the runtime's own: calls `receive(key, payload)`."""
@@ -222,17 +358,12 @@ class Bus:
     # Accounts
 
     def counters(self) -> dict[str, int]:
-        """What was moved so far: messages and bytes sent and received."""
-        counted = self._counters
-        return {name: getattr(counted, name) for name in counted.__slots__}
+        """What was moved so far, by the names of `Counters`."""
+        return {name: getattr(self.counted, name) for name in Counters.__slots__}
 
     def count_sent(self, nbytes: int) -> None:
-        self._counters.sent_messages += 1
-        self._counters.sent_bytes += nbytes
-
-    def _count_received(self, nbytes: int) -> None:
-        self._counters.received_messages += 1
-        self._counters.received_bytes += nbytes
+        self.counted.sent_messages += 1
+        self.counted.sent_bytes += nbytes
 
     # End
 
@@ -245,11 +376,27 @@ class Bus:
             if self._closed:
                 return
             self._closed = True
+        self._wait_until_mapped()
         closer = threading.Thread(target=self.session.close, name="bus close", daemon=True)
         closer.start()
         closer.join(CLOSE_WITHIN)
         if closer.is_alive():
             raise BusError(f"Zenoh did not close within {CLOSE_WITHIN:g} s")
+        for token in self._subscriptions:
+            token.close()
+        if self._pool is not None:
+            self._pool.close()
+
+    def _wait_until_mapped(self) -> None:
+        """Gives consumers that were just sent their first reference the time to map the pool before it goes."""
+        if self._pool is None:
+            return
+        base, end = self._pool.base, time.monotonic() + MAPPED_WITHIN
+        waiting = self._pool.consumers()
+        while waiting and time.monotonic() < end:
+            waiting = {c for c in waiting if not c.mapped(base)}
+            if waiting:
+                time.sleep(0.002)
 
     def __enter__(self) -> Self:
         return self

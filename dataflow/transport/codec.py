@@ -50,6 +50,8 @@ class Kind(IntEnum):
     """A new incarnation begins (`incarnation` is the new number) because of `reason`; `seq` starts at 0 again."""
     PROBE = 5
     """Start barrier: carries no data. `seq` is the probe's number."""
+    REFERENCE = 6
+    """A message that lies in shared memory: resolved by the bus, never seen by its users."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,19 +106,25 @@ class Envelope:
         return Envelope(Kind.MESSAGE, stream, incarnation, seq, message.stamp, message, "", wall)
 
 
+def encode_head(envelope: Envelope) -> bytes:
+    """The msgpack head alone; raises `ValueError` when it is longer than the prelude can say."""
+    head: bytes = msgpack.packb(
+        (envelope.stream, envelope.incarnation, envelope.seq, envelope.stamp, envelope.wall, envelope.reason)
+    )
+    if len(head) > 0xFFFF:
+        raise ValueError(f"envelope head of {len(head)} bytes on {envelope.stream[:80]!r}: at most 65535")
+    return head
+
+
 def encode_parts(envelope: Envelope) -> list[Buffer]:
     """The envelope as consecutive buffers, arrays by reference: joined, they are the wire form.
 
     Raises `ValueError` when a head or body exceeds what the prelude can say, or `message` does not fit `kind`.
     """
     message = envelope.message
-    if (message is not None) != (envelope.kind is Kind.MESSAGE):
+    if (message is not None) != (envelope.kind is Kind.MESSAGE) or envelope.kind is Kind.REFERENCE:
         raise ValueError(f"envelope of kind {envelope.kind.name} on {envelope.stream!r}: message is {message!r}")
-    head = msgpack.packb(
-        (envelope.stream, envelope.incarnation, envelope.seq, envelope.stamp, envelope.wall, envelope.reason)
-    )
-    if len(head) > 0xFFFF:
-        raise ValueError(f"envelope head of {len(head)} bytes on {envelope.stream[:80]!r}: at most 65535")
+    head = encode_head(envelope)
     if message is None:
         return [PRELUDE.pack(MAGIC, VERSION, envelope.kind, len(head), 0) + head]
     if message.stamp != envelope.stamp:
@@ -182,6 +190,8 @@ def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Envelope:
     view = _bytes_view(buffer)
     head, body_start, body_bytes = _head(view, limits)
     body_end = body_start + body_bytes
+    if head.kind is Kind.REFERENCE:
+        raise DecodeError(f"{_where(head)}: it lies in shared memory that could not be opened here")
     if head.kind is not Kind.MESSAGE:
         if body_bytes or len(view) != body_end:
             raise DecodeError(f"{_where(head)}: {len(view) - body_start} bytes after the head, expected none")
@@ -207,7 +217,7 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
         raise DecodeError(f"prelude: magic {magic.hex()}, expected {MAGIC.hex()}")
     if version != VERSION:
         raise DecodeError(f"prelude: version {version}, this decoder knows {VERSION}")
-    if not Kind.MESSAGE <= kind <= Kind.PROBE:
+    if not Kind.MESSAGE <= kind <= Kind.REFERENCE:
         raise DecodeError(f"prelude: kind {kind}, known are {', '.join(f'{k.value} ({k.name})' for k in Kind)}")
     for name, size, most in (("head", head_bytes, limits.head_bytes), ("body", body_bytes, limits.body_bytes)):
         if size > most:

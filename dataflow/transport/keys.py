@@ -27,6 +27,12 @@ def static_key(stream: str) -> str:
     return runtime_key(namespace, "static", operator, port)
 
 
+def shared_key(stream: str, machine: str, pid: str, descriptor: str, bus: str) -> str:
+    """The liveliness token of a consumer of `stream` that can read shared memory."""
+    namespace, operator, port = split_stream(stream)
+    return runtime_key(namespace, "shm", operator, port, machine, pid, descriptor, bus)
+
+
 def alive_key(namespace: str, operator: str) -> str:
     """The liveliness token of an operator."""
     return runtime_key(namespace, "alive", operator)

@@ -73,8 +73,15 @@ _BASE: dict[str, Any] = {
     "connect/timeout_ms": -1,
     "connect/retry": {"period_init_ms": 20, "period_max_ms": 500, "period_increase_factor": 1.5},
     "open/return_conditions": {"connect_scouted": False, "declares": False},
-    # Zenoh's own shared memory loses messages to a stalled receiver and leaves files behind (benchmarks/transport.md);
-    # ours is in shared.py.
+    # A process that is stopped for a while (a debugger, swapping) keeps its links; one that dies is seen at once,
+    # because its sockets close.
+    "transport/link/tx/lease": 30_000,
+    "transport/link/tx/keep_alive": 12,
+    "transport/link/tx/queue/congestion_control/block/wait_before_close": 30_000_000,
+    # Large messages are cut into pieces of 64 KB; with the default queue of two pieces 900 KB take three times as long.
+    "transport/link/tx/queue/size/data": 16,
+    "transport/link/rx/buffer_size": 1 << 20,
+    # Zenoh's own shared memory is slower here and leaves files behind (benchmarks/transport.md); ours is in shared.py.
     "transport/shared_memory/enabled": False,
 }
 

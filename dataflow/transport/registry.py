@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import psutil
+import psutil  # type: ignore[import-untyped]
 
 START_TOLERANCE = 1.0
 
@@ -113,9 +113,8 @@ def _lives(pid: int, process_started: float) -> bool:
     """Whether that very process still runs; a later process with the same id began at another time."""
     try:
         process = psutil.Process(pid)
-        return (
-            abs(process.create_time() - process_started) < START_TOLERANCE and process.status() != psutil.STATUS_ZOMBIE
-        )
+        same = abs(process.create_time() - process_started) < START_TOLERANCE
+        return bool(same and process.status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
         return False
 

@@ -2,8 +2,9 @@
 
 The memory is anonymous (memfd), so nothing is left behind however a process ends. A publisher owns a pool of blocks;
 what travels on the stream is a reference to one. A consumer maps the pool read-only, and notes on a *board*, memory of
-its own that the publisher reads, which block it no longer uses: every byte has one writer, and a block is used again only
-when all its consumers have let go of it (or their processes have ended). Linux only; elsewhere envelopes travel whole.
+its own that the publisher reads, which block it no longer uses: every byte has one writer, and a block is used again
+only when all its consumers have let go of it (or their processes have ended). Linux only; elsewhere envelopes travel
+whole.
 """
 
 from __future__ import annotations
@@ -162,7 +163,7 @@ class SharedPool:
 
     def reference(self, head: bytes, block: Block, size: int) -> bytes:
         """The envelope that stands for the one in `block`."""
-        body = msgpack.packb(
+        body: bytes = msgpack.packb(
             (self.id, self.base, os.getpid(), self._descriptor, block.offset, size, block.slot, block.generation)
         )
         return PRELUDE.pack(MAGIC, VERSION, Kind.REFERENCE, len(head), len(body)) + head + body
@@ -279,7 +280,7 @@ class PoolReader:
             raise DecodeError(f"reference to {size} bytes at {offset} of a pool of {len(pool)}")
         block = np.frombuffer(pool, np.uint8, size, offset)
         weakref.finalize(block, board.release, base, slot, generation).atexit = False
-        return memoryview(block)
+        return block.data
 
     def _map(self, pool_id: str, pid: int, descriptor: int) -> mmap.mmap:
         with self._lock:

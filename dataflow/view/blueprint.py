@@ -1,4 +1,4 @@
-"""What the viewer shows, derived from the streams: one world, the cameras with their overlays, the graph, plots, log."""
+"""What the viewer shows, derived from the streams: one world, cameras with overlays, scene graph, plots, log."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.api import VisualizerLike
 
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
-from dataflow.view.canvas import TIMELINE, Role, roles_of
+from dataflow.view.canvas import TIMELINE, Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
 from dataflow.view.scene import FRAMES, SCENE, VIEWER_LOG, Outlook, entity_of
 
@@ -67,15 +68,16 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
     for name in _with_role(shown, "space"):
         contents.append(f"+ {entity_of(name)}/space/**")
     for name in _with_role(shown, "image"):
-        camera = next((c for c in shown.cameras if c.image == name), None)
-        if camera is None or (camera.info is not None and not (camera.depth and clouds)):
+        users = [c for c in shown.cameras if name in (c.image, c.info)]
+        calibrated = [c for c in users if c.info is not None]
+        if not users or any(not (c.depth and clouds) for c in calibrated):
             contents.append(f"+ {entity_of(name)}")
     if not contents:
         return None
     forever = rr.VisibleTimeRange(
         TIMELINE, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative()
     )
-    trails = {
+    trails: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
         f"{entity_of(name)}/space/trail": rrb.VisibleTimeRanges([forever]) for name in shown.of_type(Pose, Odometry)
     }
     eye = None
@@ -140,8 +142,14 @@ def _plots(shown: Layout) -> list[Part]:
     health = shown.of_type(Diagnostics)
     parts: list[Part] = []
     for name in _with_role(shown, "plot"):
-        if name not in health:
-            parts.append(_plot(_short(name, shown), [f"+ {entity_of(name)}/plot/**"]))
+        if name in health:
+            continue
+        entity, title, apart = entity_of(name), _short(name, shown), plots_of(shown.streams[name])
+        if apart:
+            each = [_plot(f"{title} {what}", [f"+ {entity}/plot/{what}/**"]) for what in apart]
+            parts.append(rrb.Vertical(contents=each, name=title))
+        else:
+            parts.append(_plot(title, [f"+ {entity}/plot/**"]))
     if health:
         for kind, title in (("latency", "Latency"), ("rate", "Rates"), ("value", "Health")):
             parts.append(_plot(title, [f"+ {entity_of(name)}/plot/{kind}/**" for name in health]))
@@ -159,7 +167,8 @@ def _plot(name: str, contents: Sequence[str]) -> rrb.TimeSeriesView:
 
 def _log(shown: Layout) -> rrb.TextLogView:
     contents = [f"+ {entity_of(name)}/log" for name in _with_role(shown, "log")]
-    return rrb.TextLogView(origin="/", contents=[f"+ {VIEWER_LOG}", *contents], name="Log")
+    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    return rrb.TextLogView(origin="/", contents=[f"+ {VIEWER_LOG}", *contents], name="Log", columns=columns)
 
 
 def _with_role(shown: Layout, role: Role) -> list[str]:

@@ -12,7 +12,7 @@ import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 from dataflow.messages import Message
-from dataflow.view.frames import Rank
+from dataflow.view.frames import FrameCycleError, Rank
 from dataflow.view.scene import VIEWER_LOG, SceneState
 
 TIMELINE = "stamp"
@@ -22,7 +22,7 @@ NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
 
 Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor"]
-"""Which views a type appears in. `image` is drawn at the stream's entity itself, everything else at `<entity>/<role>`."""
+"""Which views a type appears in. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,17 +83,23 @@ class Canvas:
             self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level="WARN"))
 
     def place(self, parent: str, child: str, T_parent_child: npt.NDArray[np.float64], *, tree: bool = False) -> None:
-        """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which has precedence."""
-        self.scene.place(
-            self.recording,
-            parent=parent,
-            child=child,
-            T_parent_child=T_parent_child,
-            stream=self.stream,
-            rank=Rank.TREE if tree else self.scene.rank(self.stream),
-            stamp=self.stamp,
-            static=self.static,
-        )
+        """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.
+
+        What cannot be (a frame within itself) is not drawn, and said once.
+        """
+        try:
+            self.scene.place(
+                self.recording,
+                parent=parent or NAMELESS,
+                child=child or NAMELESS,
+                T_parent_child=T_parent_child,
+                stream=self.stream,
+                rank=Rank.TREE if tree else self.scene.rank(self.stream),
+                stamp=self.stamp,
+                static=self.static,
+            )
+        except FrameCycleError as error:
+            self.notice(str(error))
 
 
 M = TypeVar("M", bound=Message)
@@ -101,19 +107,22 @@ Visualizer = Callable[[Canvas, Any], None]
 
 _visualizers: dict[type[Message], Visualizer] = {}
 _roles: dict[type[Message], tuple[Role, ...]] = {}
+_plots: dict[type[Message], tuple[str, ...]] = {}
 
 
 def visualizer(
-    message_type: type[M], *roles: Role
+    message_type: type[M], *roles: Role, plots: tuple[str, ...] = ()
 ) -> Callable[[Callable[[Canvas, M], None]], Callable[[Canvas, M], None]]:
     """Registers the function that draws a message type; `roles` says in which views it appears.
 
-    A package with message types of its own registers theirs the same way. Subclasses inherit.
+    `plots`: the curves at `<entity>/plot/<name>` that get axes of their own; none: all share one plot. A package with
+    message types of its own registers theirs the same way. Subclasses inherit.
     """
 
     def register(function: Callable[[Canvas, M], None]) -> Callable[[Canvas, M], None]:
         _visualizers[message_type] = function
         _roles[message_type] = roles
+        _plots[message_type] = plots
         return function
 
     return register
@@ -129,6 +138,12 @@ def roles_of(message_type: type[Message]) -> tuple[Role, ...]:
     """In which views a type appears."""
     _load()
     return next((_roles[c] for c in message_type.__mro__ if c in _roles), ())
+
+
+def plots_of(message_type: type[Message]) -> tuple[str, ...]:
+    """The plots with axes of their own."""
+    _load()
+    return next((_plots[c] for c in message_type.__mro__ if c in _plots), ())
 
 
 def visualize(

@@ -25,6 +25,10 @@ _HISTORY = 64
 """Poses of each stream kept for aligning two of them at equal stamps."""
 
 
+class FrameCycleError(ValueError):
+    """A frame placed within itself, at once or by a chain of poses that were all given."""
+
+
 class Rank(IntEnum):
     """Whose word counts when several streams place the same frame: the lowest."""
 
@@ -105,11 +109,10 @@ class FrameTree:
         """Stream `owner` says that `child` lies at `T_parent_child` (4×4) in `parent`.
 
         When another stream of the same or better rank places `child` already, the pose only serves to align the two
-        streams' root frames, once. Raises ValueError for a frame in itself, and for a cycle of poses that were all
-        given.
+        streams' root frames, once. Raises `FrameCycleError`.
         """
         if parent == child:
-            raise ValueError(f"{owner} places the frame {child!r} in itself")
+            raise FrameCycleError(f"{owner} places the frame {child!r} in itself")
         sighting = self._sightings.setdefault((child, owner), _Sighting(parent))
         if sighting.parent != parent:
             sighting = self._sightings[child, owner] = _Sighting(parent)
@@ -165,7 +168,7 @@ class FrameTree:
         below = path[: path.index(child)]
         weak = next((frame for frame in below if self._edges[frame].assumed), None)
         if weak is None:
-            raise ValueError(
+            raise FrameCycleError(
                 f"{owner} places {child!r} in {parent!r}, but {parent!r} already hangs below it: "
                 + " in ".join(map(repr, path[: path.index(child) + 1]))
             )

@@ -2,60 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from typing import Protocol
+from collections.abc import Callable, Sequence
 
+from dataflow.graph.model import Graph
 from dataflow.messages import Message
+from dataflow.recording import Recording
 from dataflow.view.process import ViewerError
 from dataflow.view.sink import ViewerSink
 
 _PATIENCE = 30.0  # seconds without progress after which a viewer counts as stalled
 
 
-class RecordedMessage(Protocol):
-    """One message of a recording."""
-
-    @property
-    def stream(self) -> str: ...
-
-    @property
-    def message(self) -> Message: ...
-
-
-class RecordingReader(Protocol):
-    """A recording that yields its messages in stamp order, static streams first."""
-
-    def messages(self) -> Iterator[RecordedMessage]: ...
-
-
 def from_recording(
-    recording: RecordingReader,
+    recording: Recording,
     sink: ViewerSink,
-    streams: Iterable[str] | None = None,
+    streams: Sequence[str] | None = None,
     start: int | None = None,
     end: int | None = None,
+    *,
+    graph: Graph | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> int:
-    """Logs the recorded messages of `streams` (None: all) with start ≤ stamp ≤ end (ns) to an open sink; returns how many.
+    """Opens `sink` for the recorded `streams` (None: all that have a message type) and logs what they hold.
 
-    Messages of the sink's static streams are logged whatever their stamp. Waits for the viewer instead of dropping;
-    raises `ViewerError` when it takes nothing for 30 s. `progress` is called with each stamp.
+    Static streams come first and whole; of the others, messages with start ≤ stamp ≤ end (ns). `graph` says what is
+    drawn over what, and what is hidden. Waits for the viewer instead of dropping. `progress` is called with each stamp.
+    Returns how many messages were handed over; the sink stays open. Raises `ViewerError` for a viewer that cannot be
+    reached or takes nothing for 30 s, `RecordingError` for an unknown stream and for data that does not decode.
     """
-    chosen = None if streams is None else set(streams)
+    types: dict[str, type[Message]] = {
+        name: info.message_type
+        for name, info in recording.streams.items()
+        if info.message_type is not None and (streams is None or name in streams)
+    }
+    sink.open(types, graph, [name for name in types if recording.streams[name].static])
     count = 0
-    for recorded in recording.messages():
-        stamp = recorded.message.stamp
-        if chosen is not None and recorded.stream not in chosen:
-            continue
-        if not sink.is_static(recorded.stream):
-            if start is not None and stamp < start:
-                continue
-            if end is not None and stamp > end:
-                break
-        before = sink.statistics().dropped
+    for recorded in recording.messages(streams, start, end):
+        dropped = sink.statistics().dropped
         count += sink.log(recorded.stream, recorded.message, wait=_PATIENCE)
-        if sink.statistics().dropped > before:
+        if sink.statistics().dropped > dropped:
             raise ViewerError(f"the viewer took nothing for {_PATIENCE:g} s; {count:,} messages were handed over")
         if progress is not None:
-            progress(stamp)
+            progress(recorded.stamp)
     return count

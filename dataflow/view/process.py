@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import importlib.util
 import os
 import signal
 import socket
@@ -25,9 +26,10 @@ def executable() -> Path:
 
     Not the `rerun` script on PATH: that is a Python wrapper, whose death would leave the program behind.
     """
-    import rerun_cli
-
-    folder = Path(rerun_cli.__file__).parent
+    package = importlib.util.find_spec("rerun_cli")
+    if package is None or package.origin is None:
+        raise ViewerError("the Rerun program is missing (package rerun_cli); reinstall rerun-sdk")
+    folder = Path(package.origin).parent
     suffix = ".exe" if sys.platform == "win32" else ""
     named = os.environ.get("RERUN_CLI_PATH")
     choices = [Path(named)] if named else [folder / "Rerun.app/Contents/MacOS/Rerun", folder / f"rerun{suffix}"]

@@ -173,9 +173,9 @@ class SceneState:
                 del self._waiting[frame]
                 reason = self.tree.reason(frame)
                 words.append(
-                    f"frame {frame!r} is not placed by any stream: it is drawn "
-                    + (f"where {reason} agree" if reason else f"at the origin of {assumed[frame]!r}")
-                    + ". Publish a Transforms message that places it"
+                    f"frame {frame!r} is not placed by any stream: drawn so that {reason} agree at first"
+                    if reason
+                    else f"frame {frame!r} is not placed by any stream: drawn at the origin of {assumed[frame]!r}"
                 )
         return words
 
@@ -209,7 +209,7 @@ class SceneState:
         level /= np.linalg.norm(level)
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
-        position = at - level * (0.75 * reach) + up * (0.75 * reach) + side * (0.45 * reach)
+        position = at - level * (0.55 * reach) + up * (0.6 * reach) + side * (0.4 * reach)
         return Outlook(up, position, at + level * (0.55 * reach))
 
     def image_streams(self) -> tuple[str, ...]:

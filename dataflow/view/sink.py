@@ -306,7 +306,7 @@ class ViewerSink:
         if not self._settled and message.stamp - self._started_at >= SETTLE:
             self._guarded("", lambda: self._settle(recording))
         for doubt in self._scene.doubts(message.stamp):
-            self._guarded("", lambda text=doubt: recording.log(VIEWER_LOG, rr.TextLog(text, level="WARN")))
+            recording.log(VIEWER_LOG, rr.TextLog(doubt, level="WARN"))
 
     def _settle(self, recording: rr.RecordingStream) -> None:
         """Decides, once, which way is up and where to look from."""

@@ -1,6 +1,6 @@
 """Maximum a posteriori pose of a camera from point-to-plane distances, reprojections and a motion prior.
 
-Gauss-Newton on the right perturbation T_world_camera <- T_world_camera exp(x), with Cauchy weights at every step.
+Gauss-Newton on the right perturbation T_world_camera <- T_world_camera exp(x), reweighted at every step.
 Point-to-plane with projective association: Chen and Medioni, 1992; Newcombe et al., "KinectFusion", 2011.
 """
 

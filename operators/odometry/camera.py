@@ -1,4 +1,4 @@
-"""The RGB-D camera's geometry: two pinhole cameras and the motion between them. The images need no registration."""
+"""The RGB-D camera's geometry: two pinhole cameras and the motion between them; no registered images."""
 
 from dataclasses import dataclass, field
 
@@ -48,8 +48,8 @@ class RgbdCamera:
     ) -> tuple[Points, NDArray[np.bool_]]:
         """Intersect the rays of colour pixels (N, 2) with the depth image.
 
-        Returns the points (N, 3) in the depth camera's frame and which of them are known. A ray's depth is found
-        by fixed point: project its point into the depth image, read the depth there, move the point to it. A
+        Returns the points (N, 3) in the depth camera's frame and which of them are known. A ray's depth is
+        found by fixed point: project its point into the depth image, read the depth there, move the point to it. A
         pixel beside a depth edge is unknown, for which side it saw is a coin's toss.
         """
         K, (height, width) = self.K_depth, depth.shape

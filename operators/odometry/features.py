@@ -1,4 +1,4 @@
-"""Sparse features: spread corners, their pyramidal Lucas-Kanade tracks, ORB matches where tracking cannot reach."""
+"""Sparse features: spread corners, their Lucas-Kanade tracks, and ORB matches where tracking cannot reach."""
 
 import cv2
 import numpy as np

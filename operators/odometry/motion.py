@@ -22,7 +22,7 @@ class Motion:
     fresh: bool = True  # the velocity is not measured yet
 
     def predict(self, stamp: int, decay_s: float) -> Matrix:
-        """T_world_camera at a stamp. A velocity carried on blindly for seconds is worse than standing still."""
+        """T_world_camera at a stamp. Blind for seconds, standing still is the better guess."""
         dt = self._seconds(stamp)
         travel = decay_s * (np.exp(-self.blind_s / decay_s) - np.exp(-(self.blind_s + dt) / decay_s))
         return self.T_world_camera @ se3.exp(self.velocity * (dt if self.blind_s == 0 else travel))

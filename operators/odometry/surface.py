@@ -1,7 +1,7 @@
 """A depth image as a small grid of planar patches: mean points and normals, from its inverse depth.
 
-Inverse depth is affine in the pixel over a plane, n·p = d  =>  1/z = (n/d)·(x, y, 1), so averaging it is exact
-on planes, its noise does not grow with range (Nguyen et al., 2012), and its gradient is the normal.
+Inverse depth is affine in the pixel over a plane, n·p = d  =>  1/z = (n/d)·(x, y, 1), so averaging it is
+exact on planes, its noise does not grow with range (Nguyen et al., 2012), and its gradient is the normal.
 """
 
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class Surface:
 
     @cached_property
     def planes(self) -> Array32:
-        """(h·w, 4): unit normal n towards the camera and d = n·p of each patch; zeros where it is not smooth."""
+        """(h·w, 4): unit normal n towards the camera and d = n·p of each patch; zeros where not smooth."""
         q = self.inverse_depth
         h, w = q.shape
         x, y = self.rays

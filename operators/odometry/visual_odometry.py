@@ -116,7 +116,7 @@ class VisualOdometry(Operator):
 
 
 def about_fixed_axes(covariance: Matrix, T_world_camera: Matrix) -> NDArray[np.float64]:
-    """The covariance (6, 6) of (position, rotation about the world's axes) from that of a right perturbation."""
+    """Covariance (6, 6) of (position, rotation about the world's axes) from a right perturbation's."""
     A = np.zeros((6, 6))
     A[:3, :3] = A[3:, 3:] = T_world_camera[:3, :3]
     return A @ covariance @ A.T
@@ -125,7 +125,8 @@ def about_fixed_axes(covariance: Matrix, T_world_camera: Matrix) -> NDArray[np.f
 def _check(port: str, image: Image | DepthImage, info: CameraInfo) -> None:
     if (image.width, image.height) != (info.width, info.height):
         raise ValueError(
-            f"{port} has {image.width}x{image.height} pixels, but {port}_info describes {info.width}x{info.height}"
+            f"{port} has {image.width}x{image.height} pixels, "
+            f"but {port}_info describes {info.width}x{info.height}"
         )
     if image.frame != info.frame:
         raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")

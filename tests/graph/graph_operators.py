@@ -151,3 +151,21 @@ class Abstract(Operator, abstract=True):
 
 class NotAnOperator:
     """Just a class."""
+
+
+class StaticUser(Operator):
+    """Wants to be triggered by a lens."""
+
+    lens: In[Lens]
+
+    def process(self, lens: Lens) -> None:
+        return None
+
+
+class Ticker(Operator, every="1s"):
+    """Ticks beside a lens."""
+
+    lens: Sampled[Lens]
+
+    def process(self, lens: Lens) -> None:
+        return None

@@ -1,4 +1,4 @@
-"""The rules read literally: firings from streams seen whole. Slow, short, and written without looking at the aligner."""
+"""The rules read literally: firings from streams seen whole. Slow, short, and independent of the aligner."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def specs(draw: st.DrawFn) -> AlignSpec:
                 draw(st.booleans()),
                 draw(st.none() | st.just(1) | st.integers(2, 10)),
                 many,
-            )  # fmt: skip
+            )
         )
     batches = []
     for i in range(draw(st.integers(0, 2))):

@@ -34,7 +34,7 @@ PATIENCE = 20_000
 
 @dataclass
 class Graph:
-    """Operators by name, each with one output stream of its own name, fed by sources that say what they say."""
+    """Operators by name, each with one output stream of the same name, and sources with what they say."""
 
     specs: dict[str, AlignSpec]
     sources: dict[str, list[Step]]
@@ -69,7 +69,7 @@ class Graph:
 
 
 def execute(graph: Graph, seed: int) -> tuple[dict[str, list[object]], bool]:
-    """Wires the operators up, delivers in a random order, and returns every firing, and whether all operators ended."""
+    """Wires the operators up and delivers in a random order: all firings, and whether all operators ended."""
     rng = random.Random(seed)
     aligners = {name: Aligner(spec) for name, spec in graph.specs.items()}
     ports = {name: [NEVER, NEVER, 0] for name in aligners}  # last stamp, last frontier sent, seq

@@ -173,7 +173,7 @@ def test_an_anchor_is_decided_no_later_than_the_rule_says(
     fired: set[int] = set()
     for step in interleave(says, rng):
         tell(aligner, step)
-        what, stream, argument = step
+        _, stream, argument = step
         if isinstance(argument, Entry):
             seen[stream].append(argument.stamp)
         front[stream] = max(

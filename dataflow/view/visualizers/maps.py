@@ -33,7 +33,7 @@ def occupancy_grid(canvas: Canvas, message: OccupancyGrid) -> None:
             translation=message.position,
             quaternion=rr.Quaternion(xyzw=(0.0, 0.0, 0.0, 1.0) if message.orientation is None else message.orientation),
             colormap=rr.components.Colormap.RvizMap,
-            opacity=0.85,
+            opacity=0.45,
         ),
     )
 

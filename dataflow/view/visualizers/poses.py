@@ -36,12 +36,20 @@ def pose(canvas: Canvas, message: Pose) -> None:
 
 @visualizer(Odometry, "space", "plot")
 def odometry(canvas: Canvas, message: Odometry) -> None:
-    """As a pose, and curves of the speeds."""
+    """As a pose, and a curve of the speed: as given, else from one pose to the next; and of the rate of turn."""
     _moving(canvas, message.frame, message.child_frame, message.matrix(), message.pose_covariance)
-    _speeds(canvas, message.linear, message.angular)
+    speed = None if message.linear is None else float(np.linalg.norm(message.linear))
+    before = canvas.scene.remembered.get((canvas.entity, "before"))
+    canvas.scene.remembered[canvas.entity, "before"] = (message.stamp, message.position)
+    if speed is None and before is not None and message.stamp > before[0]:
+        speed = float(np.linalg.norm(message.position - before[1])) / ((message.stamp - before[0]) / 1e9)
+    if speed is not None:
+        canvas.plot("speed", [speed], ["speed m/s"])
+    if message.angular is not None:
+        canvas.plot("turn", [float(np.linalg.norm(message.angular))], ["turn rad/s"])
 
 
-@visualizer(Twist, "plot")
+@visualizer(Twist, "plot", plots=("linear", "angular"))
 def twist(canvas: Canvas, message: Twist) -> None:
     """Curves of the velocities along and about each axis."""
     canvas.plot("linear", message.linear, ["vx m/s", "vy m/s", "vz m/s"])
@@ -169,14 +177,3 @@ def _ellipsoid(
             colors=(*colors.NEUTRAL, 120),
         ),
     )
-
-
-def _speeds(canvas: Canvas, linear: npt.NDArray[np.float64] | None, angular: npt.NDArray[np.float64] | None) -> None:
-    values, names = [], []
-    if linear is not None:
-        values.append(float(np.linalg.norm(linear)))
-        names.append("speed m/s")
-    if angular is not None:
-        values.append(float(np.linalg.norm(angular)))
-        names.append("turn rad/s")
-    canvas.plot("speed", values, names)

@@ -16,7 +16,7 @@ _LATENCY = re.compile(r"latency|lag|delay|duration|age|_ms$|_s$|time")
 _RATE = re.compile(r"rate|hz|fps|frequency|throughput")
 
 
-@visualizer(Imu, "plot")
+@visualizer(Imu, "plot", plots=("gyroscope", "accelerometer"))
 def imu(canvas: Canvas, message: Imu) -> None:
     """Curves of the gyroscope and the accelerometer, and of the temperature where it is given."""
     canvas.plot("gyroscope", message.angular_velocity, ["wx rad/s", "wy rad/s", "wz rad/s"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
 import pytest
@@ -107,7 +109,7 @@ def test_boxes_hold_the_projections_of_the_balls() -> None:
 def test_the_path_is_smooth_and_closes() -> None:
     poses = [camera_path(t / 30, 16.0) for t in range(481)]
     np.testing.assert_allclose(poses[0], poses[-1], atol=1e-9)
-    for before, after in zip(poses, poses[1:], strict=False):
+    for before, after in pairwise(poses):
         step = np.linalg.inv(before) @ after
         assert np.linalg.norm(step[:3, 3]) < 0.04
         assert np.degrees(np.arccos((np.trace(step[:3, :3]) - 1) / 2)) < 2.5

@@ -1,0 +1,102 @@
+"""The catalogue finds operators, tells what they declare, and reports modules that fail."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import graph_operators
+import pytest
+from rich.console import Console, RenderableType
+
+from dataflow.graph.catalogue import describe, details, discover, overview
+
+
+def shown(renderable: RenderableType) -> str:
+    out = io.StringIO()
+    Console(file=out, width=160, color_system=None).print(renderable)
+    return out.getvalue()
+
+
+def test_every_operator_of_a_module_is_found() -> None:
+    catalogue = discover(["graph_operators"])
+    assert set(catalogue.operators) == {
+        f"graph_operators:{name}"
+        for name in (
+            "Camera", "CloudBuilder", "Detector", "Device", "Echo", "Fuse", "Log", "Mapper", "Odometry", "StaticUser",
+            "Ticker", "Watchdog",
+        )
+    }  # fmt: skip
+    assert not catalogue.failures
+    assert catalogue.find("CloudBuilder") == ["graph_operators:CloudBuilder"]
+    assert catalogue.find("Nothing") == []
+    assert "graph_operators:Fuse" in shown(overview(catalogue))
+
+
+def test_a_failing_module_is_reported_and_the_others_still_listed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = tmp_path / "half_broken"
+    package.mkdir()
+    (package / "__init__.py").write_text("from half_broken.good import Good\n")
+    (package / "good.py").write_text(
+        "from dataflow.operator import Operator, In\nfrom graph_operators import Pose\n"
+        "class Good(Operator):\n    '''Fine.'''\n    pose: In[Pose]\n    def process(self, pose): return None\n"
+    )
+    (package / "bad.py").write_text("import no_such_library_at_all\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    catalogue = discover(["half_broken"])
+    assert list(catalogue.operators) == ["half_broken:Good"]
+    (failure,) = catalogue.failures
+    assert str(failure) == "half_broken.bad: ModuleNotFoundError: No module named 'no_such_library_at_all'"
+    assert "no_such_library_at_all" in shown(overview(catalogue))
+
+
+def test_description_holds_ports_parameters_bounds_units_and_docs() -> None:
+    camera = describe("graph_operators:Camera", graph_operators.Camera)
+    assert camera["source"]
+    assert camera["params"][0] == {
+        "name": "rate",
+        "type": "float",
+        "required": False,
+        "default": 30.0,
+        "bounds": "> 0",
+        "unit": "Hz",
+        "doc": "pictures a second",
+    }
+    assert [(o["name"], o["types"], o["static"]) for o in camera["outputs"]] == [
+        ("image", ["TestPicture"], False),
+        ("depth", ["TestDepth"], False),
+        ("info", ["TestLens"], True),
+    ]
+    odometry = describe("graph_operators:Odometry", graph_operators.Odometry)
+    assert [(i["name"], i["kind"], i["required"], i["before"]) for i in odometry["inputs"]] == [
+        ("image", "in", True, 0),
+        ("map", "sampled", False, 1),
+        ("hint", "sampled", False, 0),
+    ]
+    assert describe("x:Mapper", graph_operators.Mapper)["fires"] == "on cloud and pose joined within 20ms"
+    assert describe("x:Watchdog", graph_operators.Watchdog)["fires"] == "every 100ms"
+
+
+def test_details_show_everything_declared() -> None:
+    text = shown(details("graph_operators:CloudBuilder", graph_operators.CloudBuilder))
+    for word in (
+        "CloudBuilder",
+        "In",
+        "TestDepth",
+        "depth image",
+        "stride",
+        ">= 1",
+        "fast",
+        "keep every stride-th pixel",
+    ):
+        assert word in text
+    assert "must be given" in shown(details("graph_operators:Detector", graph_operators.Detector))
+
+
+def test_the_installed_catalogue_is_json() -> None:
+    catalogue = discover()
+    assert "operators" in catalogue.found_in
+    json.dumps(catalogue.to_json(), allow_nan=False)

@@ -1,0 +1,527 @@
+"""Every fault of a graph file is reported with its place and the nearest right word, and all of them together."""
+
+# ruff: noqa: E501  (golden texts)
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph import GraphError, Problem, load_bundle, load_graph, load_text
+
+HEAD = """\
+graph: g
+operators:
+  camera: {use: "graph_operators:Camera"}
+"""
+"""Three lines: what follows begins at line 4."""
+
+
+def problems(text: str, **options: object) -> tuple[Problem, ...]:
+    with pytest.raises(GraphError) as caught:
+        load_text(text, **options)  # type: ignore[arg-type]
+    return caught.value.problems
+
+
+def operator(text: str) -> str:
+    return f"{HEAD}  {text}\n"
+
+
+CASES = {
+    "yaml_syntax": (
+        "graph: g\noperators: {a: [1, 2\nseed: 1\n",
+        "3:5: not readable as YAML: expected ',' or ']', but got ':'",
+        "",
+    ),
+    "tab": (
+        "graph: g\noperators:\n\tcamera: 1\n",
+        "3:1: not readable as YAML: found character '\\t' that cannot start any token",
+        "indent with spaces",
+    ),
+    "empty": ("# nothing\n", "1:1: the graph file is empty", "it needs at least 'operators:'"),
+    "not_a_mapping": ("- 1\n", "1:1: the graph file must be a mapping, not a list", ""),
+    "second_document": (
+        HEAD + "---\na: 1\n",
+        "4:1: not readable as YAML: a second document begins here",
+        "a graph file holds one document: remove the '---'",
+    ),
+    "control_character": (HEAD + "seed: \x00\n", "4:7: character U+0000 is not allowed", ""),
+    "undefined_anchor": (HEAD + "seed: *none\n", "4:7: not readable as YAML: found undefined alias 'none'", ""),
+    "alias_within_itself": (
+        operator('c: {use: "graph_operators:Camera", params: {path: &a [*a]}}'),
+        "4:53: an alias (*) refers to the value it is part of",
+        "",
+    ),
+    "directive": ("%YAML 1.1\n---\n" + HEAD, "1:1: YAML directives are not part of the graph language", ""),
+    "tag": (HEAD + "seed: !x 1\n", "4:7: tags (!x) are not part of the graph language", "remove the tag"),
+    "merge_key": (
+        operator('c: {use: "graph_operators:Camera", params: {<<: {rate: 1}}}'),
+        "4:47: merge keys (<<) are not part of the graph language",
+        "use graph parameters",
+    ),
+    "octal": (HEAD + "seed: 010\n", "4:7: 010 is octal to some and decimal to others", "write 10 or '010'"),
+    "nan": (
+        operator('c: {use: "graph_operators:Camera", params: {rate: .nan}}'),
+        "4:53: NaN (not a number) is no value",
+        "leave it out, or give a number",
+    ),
+    "no_name": (
+        "operators:\n  camera: {use: graph_operators:Camera}\n",
+        "1:1: the graph has no name",
+        "begin with 'graph: some_name'",
+    ),
+    "no_operators": (
+        "graph: g\n",
+        "1:1: the graph has no operators",
+        "add 'operators:' with at least one operator",
+    ),
+    "unknown_top_key": (
+        HEAD + "namespce: r\n",
+        "4:1: unknown key 'namespce' in the graph file",
+        "did you mean 'namespace'?",
+    ),
+    "unknown_operator_key": (
+        operator('c: {use: "graph_operators:Camera", parms: {}}'),
+        "4:38: unknown key 'parms' in operator 'c'",
+        "did you mean 'params'?",
+    ),
+    "bad_graph_name": (
+        "graph: my robot\noperators:\n  camera: {use: graph_operators:Camera}\n",
+        "1:8: graph name 'my robot' contains a space",
+        "a name is letters, digits, '_' and '-', and begins with a letter or '_'",
+    ),
+    "bad_namespace": (
+        HEAD + "namespace: robot1/*\n",
+        "4:12: namespace 'robot1/*': '*' contains '*'",
+        "names joined by '/', such as robot1 or site/robot1; "
+        "a name is letters, digits, '_' and '-', and begins with a letter or '_'",
+    ),
+    "bad_operator_name": (
+        operator('"a/b": {use: "graph_operators:Camera"}'),
+        "4:3: operator name 'a/b' contains '/'",
+        "a name is letters, digits, '_' and '-', and begins with a letter or '_'",
+    ),
+    "wrong_type_of_value": (
+        HEAD + "threads: yes\n",
+        "4:10: threads must be a whole number from 1 to 256, not the text 'yes'",
+        "",
+    ),
+    "process_is_a_number": (
+        operator('c: {use: "graph_operators:Camera", process: 3}'),
+        "4:47: process must be a text, not the number 3",
+        "write '3' in quotes",
+    ),
+    "no_use": (operator("c: {params: {}}"), "4:3: operator 'c' has no 'use:'", "use: package.module:Class"),
+    "unknown_module": (
+        operator("c: {use: graph_operater:Camera}"),
+        "4:12: no module 'graph_operater'",
+        "did you mean 'graph_operators'?",
+    ),
+    "unknown_class": (
+        operator('c: {use: "graph_operators:Camra"}'),
+        "4:12: module 'graph_operators' has no operator 'Camra'",
+        "did you mean 'Camera'?",
+    ),
+    "not_a_path": (
+        operator("c: {use: Camera}"),
+        "4:12: 'Camera' names no operator",
+        "write 'package.module:Class', or the path of a graph file (*.yaml)",
+    ),
+    "not_an_operator": (
+        operator('c: {use: "graph_operators:NotAnOperator"}'),
+        "4:12: 'graph_operators:NotAnOperator' is the class NotAnOperator, not an Operator",
+        "operators in 'graph_operators': Camera, CloudBuilder, Detector, Device, Echo, Fuse, Log, Mapper, Odometry, "
+        "StaticUser, Ticker, Watchdog",
+    ),
+    "abstract": (
+        operator('c: {use: "graph_operators:Abstract"}'),
+        "4:12: 'graph_operators:Abstract' is abstract: it declares no ports of its own",
+        "operators in 'graph_operators': Camera, CloudBuilder, Detector, Device, Echo, Fuse, Log, Mapper, Odometry, "
+        "StaticUser, Ticker, Watchdog",
+    ),
+    "unknown_parameter": (
+        operator('c: {use: "graph_operators:Camera", params: {rte: 3}}'),
+        "4:47: c: Camera has no parameter 'rte'",
+        "did you mean 'rate'?",
+    ),
+    "parameter_out_of_bounds": (
+        operator('c: {use: "graph_operators:Camera", params: {path: x, rate: -3}}'),
+        "4:62: c: parameter 'rate': input should be greater than 0, got -3",
+        "rate: pictures a second",
+    ),
+    "parameter_choice": (
+        operator(
+            'c: {use: "graph_operators:CloudBuilder", params: {mode: exct}, '
+            "inputs: {depth: camera/depth, image: camera/image, camera: camera/info}}"
+        ),
+        "4:59: c: parameter 'mode': input should be 'fast' or 'exact', got exct",
+        "did you mean 'exact'?",
+    ),
+    "parameter_wants_text": (
+        operator('c: {use: "graph_operators:Camera", params: {path: 0x10}}'),
+        "4:53: c: parameter 'path': input should be a valid string, got 0x10",
+        "write '0x10' in quotes",
+    ),
+    "parameter_inside_a_list": (
+        operator(
+            'd: {use: "graph_operators:Detector", inputs: {image: camera/image}, params: {model: m, labels: [a, 2]}}'
+        ),
+        "4:102: d: parameter 'labels.1': input should be a valid string, got 2",
+        "write '2' in quotes",
+    ),
+    "bad_duration_parameter": (
+        operator(
+            'c: {use: "graph_operators:CloudBuilder", params: {window: 3x}, '
+            "inputs: {depth: camera/depth, image: camera/image, camera: camera/info}}"
+        ),
+        "4:61: c: parameter 'window': duration '3x': unknown unit 'x'; the units are ns, us, ms, s, min, h, got 3x",
+        "window: how far back",
+    ),
+    "missing_parameter": (
+        operator('d: {use: "graph_operators:Detector", inputs: {image: camera/image}}'),
+        "4:3: d: parameter 'model' must be given",
+        "model: ONNX file",
+    ),
+    "unknown_input": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image, image: camera/image}}'),
+        "4:66: e: Log has no input 'image'",
+        "did you mean 'images'?",
+    ),
+    "missing_input": (
+        operator('c: {use: "graph_operators:CloudBuilder", inputs: {depth: camera/depth, image: camera/image}}'),
+        "4:44: c: input 'camera' (Sampled[TestLens]) is not wired",
+        "streams of TestLens: camera/info",
+    ),
+    "unknown_port": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/imge}}'),
+        "4:52: e.images: 'camera/imge' is no stream of this graph",
+        "did you mean 'camera/image'?",
+    ),
+    "unknown_operator_in_key": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camra/image}}'),
+        "4:52: e.images: 'camra/image' is no stream of this graph",
+        "did you mean 'camera/image'?",
+    ),
+    "operator_instead_of_port": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera}}'),
+        "4:52: e.images: 'camera' is no stream of this graph",
+        "name one of its ports: camera/image, camera/depth, camera/info",
+    ),
+    "wildcard_matches_nothing": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: lidar/*}}'),
+        "4:52: e.images: 'lidar/*' matches no stream",
+        "streams of TestPicture: camera/image",
+    ),
+    "bad_wildcard": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: cam*/image}}'),
+        "4:52: 'cam*/image' is no key expression: in 'cam*': a '*' inside a part is written '$*' "
+        "(and '*' or '**' alone is a whole part)",
+        "",
+    ),
+    "runtime_key": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: "@/camera/image"}}'),
+        "4:52: '@/camera/image' is no key expression: '@': parts that begin with '@' are the runtime's own",
+        "",
+    ),
+    "type_mismatch": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/depth}}'),
+        "4:52: e.images takes TestPicture, but 'camera/depth' (Camera.depth) carries TestDepth",
+        "streams of TestPicture: camera/image",
+    ),
+    "many_streams_for_a_single_input": (
+        operator('d: {use: "graph_operators:Detector", params: {model: m}, inputs: {image: camera/*}}'),
+        "4:76: d.image: it takes one stream, but 2 match: camera/depth, camera/image",
+        "name one, or declare the input In(many=True); streams of TestPicture: camera/image",
+    ),
+    "join_with_wildcard": (
+        operator(
+            'c: {use: "graph_operators:CloudBuilder", inputs: {depth: camera/*, image: camera/image, camera: camera/info}}'
+        ),
+        "4:60: c.depth: a joined input takes one stream, but 2 match: camera/depth, camera/image",
+        "name one of them; streams of TestDepth: camera/depth",
+    ),
+    "static_stream_triggers": (
+        operator('w: {use: "graph_operators:StaticUser", inputs: {lens: camera/info}}'),
+        "4:57: w.lens: 'camera/info' is static (one message, valid at all times), which cannot trigger",
+        "the operator should declare it lens: Sampled[TestLens]",
+    ),
+    "ticks_without_bounds": (
+        HEAD + '  t: {use: "graph_operators:Ticker", inputs: {lens: camera/info}}\n',
+        "4:38: t: Ticker ticks every 1s, but every wired input is static or 'before': nothing says when ticks begin and end",
+        "wire an input to a stream that is neither",
+    ),
+    "cycle": (
+        operator(
+            'a: {use: "graph_operators:Echo", inputs: {pose: b/echo}}\n  b: {use: "graph_operators:Echo", inputs: {pose: a/echo}}'
+        ),
+        "4:51: cycle without 'before': b -> a -> b would wait for itself (its demands sum to 0s, and must be below 0)",
+        "declare one of these inputs Sampled(before=True)",
+    ),
+    "cycle_with_tolerance": (
+        operator(
+            'o: {use: "graph_operators:Odometry", inputs: {image: camera/image, map: m/map}}\n'
+            '  m: {use: "graph_operators:Mapper", inputs: {cloud: c/cloud, pose: o/pose}}\n'
+            '  c: {use: "graph_operators:CloudBuilder", inputs: {depth: camera/depth, image: camera/image, camera: camera/info}}'
+        ),
+        "4:75: cycle whose 'before' is too short: m -> o -> m would wait for itself "
+        "(its demands sum to 19.999999ms, and must be below 0)",
+        "lengthen it by more than that sum",
+    ),
+    "unknown_reference": (
+        "graph: g\nparams: {rate: 3}\noperators:\n  camera: {use: graph_operators:Camera, params: {rate: ${rte}}}\n",
+        "4:56: unknown graph parameter 'rte'",
+        "did you mean 'rate'?",
+    ),
+    "reference_before_definition": (
+        "graph: g\nparams: {a: '${b}', b: 1}\noperators:\n  camera: {use: graph_operators:Camera}\n",
+        "2:14: graph parameter 'b' is used before it is defined",
+        "move it up in 'params:'",
+    ),
+    "parameter_without_value": (
+        "graph: g\nparams:\n  data:\noperators:\n  camera: {use: graph_operators:Camera, params: {path: ${data}/x}}\n",
+        "5:56: graph parameter 'data' has no value",
+        "give one: --set data=..., or a default below 'params:'",
+    ),
+    "environment_variable_not_set": (
+        operator('c: {use: "graph_operators:Camera", params: {path: "${env:NO_SUCH_VARIABLE_HERE}"}}'),
+        "4:54: environment variable 'NO_SUCH_VARIABLE_HERE' is not set",
+        "set it, or give a default: ${env:NO_SUCH_VARIABLE_HERE:-default}",
+    ),
+    "list_inside_a_text": (
+        "graph: g\nparams: {a: [1]}\noperators:\n  camera: {use: graph_operators:Camera, params: {path: x${a}}}\n",
+        "4:57: ${a} is a list, which cannot stand inside a text",
+        "",
+    ),
+    "bad_duration": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, live: {deadline: 100}}'),
+        "4:84: deadline must be a duration with a unit, such as 100ms, not the number 100",
+        "",
+    ),
+    "unknown_duration_unit": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, live: {deadline: 3 weeks}}'),
+        "4:84: deadline: duration '3 weeks': unknown unit 'weeks'; the units are ns, us, ms, s, min, h",
+        "",
+    ),
+    "unknown_queue": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, live: {queue: newst}}'),
+        "4:81: queue must be one of newest, oldest, block, not the text 'newst'",
+        "did you mean 'newest'?",
+    ),
+    "wait_for_unknown_input": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, live: {wait: {image: 1s}}}'),
+        "4:81: e: Log has no input 'image'",
+        "did you mean 'images'?",
+    ),
+    "bad_memory": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, live: {memory: 2 gigs}}'),
+        "4:82: memory must be a size such as 512MiB or 2GB, not the text '2 gigs'",
+        "",
+    ),
+    "tolerance_without_join": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, sync: {tolerance: 5ms}}'),
+        "4:85: e: 'tolerance' means nothing here: Log has no two inputs to join",
+        "",
+    ),
+    "every_without_ticks": (
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/image}, sync: {every: 5ms}}'),
+        "4:81: e: 'every' cannot be set: Log does not tick",
+        "its class would have to say every=... (Log fires on messages only)",
+    ),
+    "two_machines_for_one_process": (
+        operator(
+            'a: {use: "graph_operators:Camera", process: p, machine: left}\n'
+            '  b: {use: "graph_operators:Camera", process: p, machine: right}'
+        ),
+        "5:59: process 'p' is on two machines: a on left, b on right",
+        "give them the same 'machine:', or different 'process:' labels",
+    ),
+    "record_matches_nothing": (
+        HEAD + "record: {topics: [camera/imge]}\n",
+        "4:19: record: 'camera/imge' is no stream of this graph",
+        "did you mean 'camera/image'?",
+    ),
+    "record_is_a_word": (
+        HEAD + "record: some\n",
+        "4:9: record must be 'all' or a mapping with 'topics' or 'exclude', not the text 'some'",
+        "",
+    ),
+    "hide_matches_nothing": (
+        HEAD + "view: {hide: [camera/imge]}\n",
+        "4:15: hide: 'camera/imge' is no stream of this graph",
+        "did you mean 'camera/image'?",
+    ),
+    "bad_endpoint": (
+        HEAD + "network: {listen: [192.168.1.2:7447]}\n",
+        "4:20: listen: '192.168.1.2:7447' is no Zenoh endpoint",
+        "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447",
+    ),
+    "zenoh_refuses": (
+        HEAD + "network: {tls: {listen_certificat: a}}\n",
+        "4:16: tls: Zenoh refuses it: unknown field `listen_certificat`",
+        "did you mean 'listen_certificate'?",
+    ),
+    "boolean": (
+        HEAD + "network: {shared_memory: yes}\n",
+        "4:26: shared_memory must be true or false, not the text 'yes'",
+        "",
+    ),
+    "graph_input_at_the_root": (
+        "graph: g\ninputs: [depth]\noperators:\n  camera: {use: graph_operators:Camera}\n",
+        "2:10: graph input 'depth' is bound to nothing",
+        "a graph with inputs runs inside another graph: name this file there with 'use:'",
+    ),
+    "missing_nested_file": (
+        operator("n: {use: other.yaml}"),
+        "4:12: cannot read graph file 'other.yaml': not among graph.yaml",
+        "",
+    ),
+    "nests_in_itself": (
+        operator("n: {use: graph.yaml}"),
+        "4:12: graph nests in itself: graph.yaml -> graph.yaml",
+        "",
+    ),
+    "live_of_a_nested_graph": (
+        operator("n: {use: graph.yaml, live: {}}"),
+        "4:24: unknown key 'live' in the nested graph 'n'",
+        "known here: use, inputs, params, process, machine",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "said", "hint"), CASES.values(), ids=CASES.keys())
+def test_fault_is_reported_at_its_place_with_a_hint(text: str, said: str, hint: str) -> None:
+    found = [(f"{p.line}:{p.column}: {p.message}", p.hint) for p in problems(text)]
+    assert (said, hint) in found
+    if "live_of" not in said:
+        others = [f for f in found if f != (said, hint)]
+        assert len(others) <= (1 if "nested graph" in said else 0), f"one fault, several reports: {others}"
+
+
+def test_rendering_shows_file_line_column_caret_and_suggestion() -> None:
+    (problem,) = problems(
+        operator('e: {use: "graph_operators:Log", inputs: {images: camera/imge}}'), file="graphs/rgbd.yaml"
+    )
+    assert str(problem) == (
+        "graphs/rgbd.yaml:4:52: e.images: 'camera/imge' is no stream of this graph\n"
+        '    4 |   e: {use: "graph_operators:Log", inputs: {images: camera/imge}}\n'
+        "      |                                                    ^^^^^^^^^^^\n"
+        "      did you mean 'camera/image'?"
+    )
+
+
+def test_duplicate_key_names_both_places() -> None:
+    (problem,) = problems(operator('camera: {use: "graph_operators:Device"}'))
+    assert str(problem) == (
+        "graph.yaml:4:3: duplicate key 'camera'\n"
+        '    4 |   camera: {use: "graph_operators:Device"}\n'
+        "      |   ^^^^^^\n"
+        "      graph.yaml:3:3: first given here"
+    )
+
+
+def test_cycle_names_each_of_its_edges() -> None:
+    text = operator(
+        'a: {use: "graph_operators:Echo", inputs: {pose: b/echo}}\n'
+        '  b: {use: "graph_operators:Echo", inputs: {pose: a/echo}}'
+    )
+    (problem,) = problems(text)
+    assert [(place.line, word) for place, word in problem.related] == [
+        (4, "a.pose takes b/echo"),
+        (5, "b.pose takes a/echo"),
+    ]
+
+
+def test_all_faults_are_reported_together_in_file_order() -> None:
+    found = problems(
+        "graph: g\nthreads: 0\noperators:\n"
+        '  a: {use: "graph_operators:Camra"}\n'
+        '  b: {use: "graph_operators:Camera", params: {rate: 0, pth: x}}\n'
+        '  c: {use: "graph_operators:Log", inputs: {images: b/imge}, live: {queue: x}}\n'
+        "record: {topics: [b/nothing]}\n"
+    )
+    assert [(p.line, p.column) for p in found] == [(2, 10), (4, 12), (5, 53), (5, 56), (6, 52), (6, 75), (7, 19)]
+
+
+def test_streams_of_a_broken_operator_cause_no_further_faults() -> None:
+    found = problems(
+        'graph: g\noperators:\n  a: {use: "graph_operators:Camra"}\n'
+        '  c: {use: "graph_operators:Log", inputs: {images: a/image}}\n'
+        '  d: {use: "graph_operators:Log", inputs: {images: "*/image"}}\n'
+    )
+    assert [p.message for p in found] == ["module 'graph_operators' has no operator 'Camra'"]
+
+
+def test_module_that_fails_to_import_says_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "broken_operators.py").write_text("x = 1\nraise RuntimeError('no camera library')\n")
+    (tmp_path / "needy_operators.py").write_text("import no_such_library_at_all\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    failing, needy = problems(
+        "graph: g\noperators:\n  a: {use: 'broken_operators:A'}\n  b: {use: 'needy_operators:B'}\n"
+    )
+    assert failing.message == "module 'broken_operators' fails to import: RuntimeError: no camera library"
+    assert failing.hint == f"raised at {tmp_path / 'broken_operators.py'}:2"
+    assert needy.message == "module 'needy_operators' needs 'no_such_library_at_all', which is not installed"
+
+
+@pytest.mark.parametrize(
+    ("setting", "said", "hint"),
+    [
+        ("camera.rte=3", "1:1: camera: Camera has no parameter 'rte'", "did you mean 'rate'?"),
+        (
+            "camera.rate=-3",
+            "1:13: camera: parameter 'rate': input should be greater than 0, got -3",
+            "rate: pictures a second",
+        ),
+        ("camra.rate=3", "1:1: the graph has no operator 'camra'", "did you mean 'camera'?"),
+        ("rte=3", "1:1: the graph has no parameter 'rte'", "graph parameters: none"),
+        (
+            "camera.rate",
+            "1:1: 'camera.rate' sets nothing",
+            "write operator.param=value, or param=value for the graph's own",
+        ),
+        ("camera.rate=[1", "1:15: not readable as YAML: expected ',' or ']', but got 'the end of the file'", ""),
+    ],
+)
+def test_fault_of_a_setting_is_shown_in_its_own_words(setting: str, said: str, hint: str) -> None:
+    (problem,) = problems(HEAD, settings=[setting])
+    assert (problem.file, f"{problem.line}:{problem.column}: {problem.message}", problem.hint) == ("--set", said, hint)
+    assert problem.source == setting
+
+
+def test_alias_bomb_is_refused_quickly() -> None:
+    text = "graph: g\nparams:\n  a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
+    for i in range(1, 9):
+        text += f"  a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n"
+    found = problems(text)
+    assert any("aliases (*) multiply" in p.message for p in found)
+
+
+def test_deep_nesting_is_refused() -> None:
+    found = problems("graph: g\nseed: " + "[" * 5000)
+    assert "not readable as YAML" in found[0].message
+
+
+def test_file_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(GraphError, match=r"cannot read graph file .*nothing\.yaml'"):
+        load_graph(tmp_path / "nothing.yaml")
+    (tmp_path / "latin.yaml").write_bytes(b"graph: caf\xe9\n")
+    with pytest.raises(GraphError, match="is not UTF-8 text"):
+        load_graph(tmp_path / "latin.yaml")
+
+
+def test_bundle_that_is_none_is_refused() -> None:
+    with pytest.raises(GraphError, match="not a graph bundle"):
+        load_bundle("{}")
+
+
+def test_problems_are_json() -> None:
+    (problem,) = problems(operator('camera: {use: "graph_operators:Device"}'))
+    assert problem.to_json() == {
+        "file": "graph.yaml",
+        "line": 4,
+        "column": 3,
+        "message": "duplicate key 'camera'",
+        "hint": "",
+        "related": [{"file": "graph.yaml", "line": 3, "column": 3, "message": "first given here"}],
+    }

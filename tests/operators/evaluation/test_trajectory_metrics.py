@@ -1,0 +1,173 @@
+"""Trajectory scores on paths whose errors are known in closed form."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from evo.tools.file_interface import read_tum_trajectory_file
+
+from dataflow.messages import Odometry, Pose
+from dataflow.messages.geometry import quaternion_from_yaw, transform_matrix
+from operators.evaluation import TrajectoryMetrics
+
+STEP = 100_000_000  # ns: 10 Hz
+T_WORLD_ODOM = transform_matrix([4.0, -2.0, 1.0], [0.1, 0.7, -0.3, 0.64])
+
+
+def circle(count: int = 63, radius: float = 2.0) -> np.ndarray:
+    """(count, 4, 4) poses of a drive round a circle, heading along it, 0.2 m a step."""
+    angle = np.arange(count) * 0.1
+    position = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    return transform_matrix(position, quaternion_from_yaw(angle + np.pi / 2))
+
+
+def truth(T: np.ndarray, k: int, offset: int = 0, frame: str = "camera") -> Pose:
+    return Pose.from_matrix(T, stamp=k * STEP + offset, frame="world", child_frame=frame)
+
+
+def estimate(T: np.ndarray, k: int) -> Odometry:
+    return Odometry.from_matrix(T, stamp=k * STEP, frame="odom", child_frame="camera")
+
+
+def score(estimated: np.ndarray, true: np.ndarray, offset: int = 0, **params: object) -> dict[str, float | int | str]:
+    metrics = TrajectoryMetrics(**params)
+    metrics.setup()
+    for k, (T_estimate, T_truth) in enumerate(zip(estimated, true, strict=True)):
+        assert metrics.process(estimate(T_estimate, k), (truth(T_truth, k, offset),)) is None
+    assert metrics.finish() is None
+    return dict(metrics.summary())
+
+
+def test_a_path_in_another_frame_has_no_error() -> None:
+    path = circle()
+    figures = score(np.linalg.inv(T_WORLD_ODOM) @ path, path)
+    assert figures["matched"] == 63
+    assert figures["path_m"] == pytest.approx(62 * 4 * np.sin(0.05))
+    for name in ("ate_rmse_m", "ate_max_m", "rpe_1s_rmse_m", "rpe_1s_rmse_deg", "rpe_1m_rmse_m", "rpe_1m_rmse_deg"):
+        assert figures[name] == pytest.approx(0, abs=1e-5), name
+
+
+def test_noise_gives_its_own_rmse() -> None:
+    """Alternating offsets of 3 cm off the plane cannot be aligned away."""
+    path = circle(64)
+    off = path.copy()
+    off[:, 2, 3] += np.where(np.arange(64) % 2, 0.03, -0.03)
+    figures = score(off, path)
+    assert figures["ate_rmse_m"] == pytest.approx(0.03, rel=0.01)
+    assert figures["ate_median_m"] == pytest.approx(0.03, rel=0.05)
+
+
+def test_a_constant_drift_is_the_relative_error() -> None:
+    """An estimate that moves 1 % too far errs 1 cm a metre of arc, or 2 cm in a second at 2 m/s, less the chord."""
+    path = circle()
+    far = path.copy()
+    far[:, :3, 3] *= 1.01
+    figures = score(far, path)
+    assert figures["rpe_1s_rmse_m"] == pytest.approx(0.01 * 2 * 2 * np.sin(0.5), rel=1e-3)
+    assert figures["rpe_1s_rmse_deg"] == pytest.approx(0, abs=1e-5)
+    assert 0.008 < float(figures["rpe_1m_rmse_m"]) < 0.011
+    assert figures["ate_rmse_m"] == pytest.approx(0.02, rel=0.05)
+
+
+def test_scale_is_found_only_by_sim3() -> None:
+    path = circle()
+    half = path.copy()
+    half[:, :3, 3] *= 0.5
+    assert score(half, path)["ate_rmse_m"] == pytest.approx(1.0, rel=0.05)
+    found = score(half, path, alignment="sim3")
+    assert found["ate_rmse_m"] == pytest.approx(0, abs=1e-6)
+    assert found["ate_scale"] == pytest.approx(2.0)
+
+
+def test_without_alignment_an_offset_is_an_error() -> None:
+    path = circle()
+    moved = path.copy()
+    moved[:, :3, 3] += [0.3, 0.0, 0.4]
+    assert score(moved, path, alignment="none")["ate_rmse_m"] == pytest.approx(0.5)
+    assert score(moved, path)["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_pose_is_scored_against_the_truth_of_its_own_stamp() -> None:
+    """Truth at 100 Hz and batches that come late: neither the denser nor the delayed truth confuses the pairing."""
+    path = circle(1001)
+    metrics = TrajectoryMetrics(rpe_seconds=1)
+    metrics.setup()
+    dense = [truth(T, 0, i * STEP // 10) for i, T in enumerate(path)]
+    metrics.process(estimate(path[0], 0), ())
+    for k in range(1, 100):
+        metrics.process(estimate(path[10 * k], k), tuple(dense[10 * (k - 1) : 10 * k]))
+    metrics.process(estimate(path[1000], 100), tuple(dense[990:]))
+    metrics.finish()
+    figures = metrics.summary()
+    assert (figures["matched"], figures["unmatched_estimates"], figures["unmatched_truths"]) == (101, 0, 900)
+    assert figures["ate_max_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_poses_without_truth_are_counted_and_not_scored() -> None:
+    path = circle(40)
+    metrics = TrajectoryMetrics()
+    metrics.setup()
+    for k, T in enumerate(path):
+        wrong = k in (10, 11)  # far off exactly where there is no truth
+        pose = T @ transform_matrix([5.0, 0, 0], [0, 0, 0, 1]) if wrong else T
+        metrics.process(estimate(pose, k), () if wrong else (truth(T, k),))
+    metrics.finish()
+    figures = metrics.summary()
+    assert (figures["matched"], figures["unmatched_estimates"], figures["unmatched_truths"]) == (38, 2, 0)
+    assert figures["ate_max_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_truth_beyond_the_tolerance_is_no_truth() -> None:
+    path = circle(20)
+    assert score(path, path, offset=-2_000_000)["matched"] == 0
+    assert score(path, path, offset=-2_000_000, tolerance="2ms")["matched"] == 20
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_too_few_poses_are_said_and_do_not_fail(count: int) -> None:
+    figures = score(circle(count), circle(count))
+    assert "ate_rmse_m" not in figures
+    assert figures["ate"] == (
+        f"not computed for {count} matched poses: the absolute error with alignment 'se3' needs 3 matched poses or more"
+    )
+
+
+def test_a_path_that_does_not_move_cannot_be_aligned_and_says_so() -> None:
+    still = np.repeat(circle(1), 10, axis=0)
+    assert "cannot be aligned to the truth by 'se3'" in str(score(still, still)["ate"])
+    assert score(still, still, alignment="none")["ate_rmse_m"] == 0
+
+
+def test_an_estimate_that_is_not_finite_is_counted_and_not_scored() -> None:
+    path = circle(20)
+    broken = path.copy()
+    broken[7, 0, 3] = np.nan
+    figures = score(broken, path)
+    assert (figures["matched"], figures["estimates_not_finite"]) == (19, 1)
+    assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+
+
+def test_poses_of_different_frames_are_refused() -> None:
+    metrics = TrajectoryMetrics()
+    metrics.setup()
+    with pytest.raises(ValueError, match="ground truth poses 'imu' but the estimate 'camera'"):
+        metrics.process(estimate(np.eye(4), 0), (truth(np.eye(4), 0, frame="imu"),))
+
+
+def test_files_are_read_back_by_evo(tmp_path: Path) -> None:
+    path = circle(12)
+    figures = score(path, path, out=str(tmp_path / "made" / "here"))
+    folder = tmp_path / "made" / "here"
+    read = read_tum_trajectory_file(folder / "estimate.tum")
+    np.testing.assert_allclose(np.array(read.poses_se3), path, atol=1e-12)
+    assert (folder / "ground_truth.tum").read_text().splitlines()[11].startswith("1.000000000 ")
+    assert json.loads((folder / "metrics.json").read_text()) == figures
+
+
+def test_equal_trajectories_give_equal_figures() -> None:
+    noisy = circle()
+    noisy[:, :3, 3] += np.random.default_rng(5).normal(0, 0.02, (63, 3))
+    assert score(noisy, circle()) == score(noisy, circle())

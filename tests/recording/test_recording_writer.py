@@ -1,0 +1,271 @@
+"""The writer keeps what it was given: through a kill, a full disk, restarts of a source; and refuses what cannot be."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+
+from dataflow.messages import Image, Pose
+from dataflow.recording import Recording, RecordingError, RecordingWriter
+
+WRITE_UNTIL_KILLED = """
+import sys, numpy as np
+from dataflow.messages import Image, Pose
+from dataflow.recording import RecordingWriter
+rng = np.random.default_rng(0)
+writer = RecordingWriter(sys.argv[1], metadata={"graph": {"text": "graph: g"}}, chunk_bytes=100_000)
+writer.add_stream("camera/image", Image)
+writer.add_stream("odometry/pose", Pose)
+for seq in range(10**9):
+    image = Image(stamp=1000 + seq, frame="camera", data=rng.integers(0, 255, (100, 100, 3), dtype=np.uint8))
+    writer.write("camera/image", image, seq=seq)
+    pose = Pose(stamp=1000 + seq, frame="map", position=[seq, 0, 0], orientation=[0, 0, 0, 1], child_frame="camera")
+    writer.write("odometry/pose", pose, seq=seq)
+    if seq == 4:
+        writer.flush()
+        print("flushed", flush=True)
+    if seq == 60:
+        print("enough", flush=True)
+"""
+
+
+def test_a_killed_writer_leaves_everything_up_to_the_last_chunk(tmp_path: Path) -> None:
+    path = tmp_path / "killed.mcap"
+    child = subprocess.Popen([sys.executable, "-c", WRITE_UNTIL_KILLED, str(path)], stdout=subprocess.PIPE, text=True)
+    assert child.stdout is not None
+    assert child.stdout.readline() == "flushed\n"
+    assert child.stdout.readline() == "enough\n"
+    child.send_signal(signal.SIGKILL)
+    child.wait(timeout=30)
+    with Recording(path) as recording:
+        assert recording.torn
+        assert recording.metadata["graph"] == {"text": "graph: g"}
+        images = list(recording.messages(["camera/image"]))
+        poses = list(recording.messages(["odometry/pose"]))
+        assert [m.seq for m in images] == list(range(len(images)))
+        assert [m.seq for m in poses] == list(range(len(poses)))
+        assert len(images) > 50  # all but the chunk in progress, of at most four images
+        assert abs(len(images) - len(poses)) <= 1
+        assert all(m.message.child_frame == "camera" for m in poses)
+
+
+def test_flushed_messages_are_readable_while_the_writer_lives(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    path = tmp_path / "live.mcap"
+    with RecordingWriter(path, metadata={}) as writer:
+        writer.add_stream("a", Pose)
+        writer.write("a", pose(1), seq=0)
+        writer.flush()
+        writer.write("a", pose(2), seq=1)
+        with Recording(path) as recording:
+            assert recording.torn
+            assert [m.stamp for m in recording.messages()] == [1]
+    with Recording(path) as recording:
+        assert not recording.torn
+        assert [m.stamp for m in recording.messages()] == [1, 2]
+
+
+def test_an_old_chunk_is_finished_by_the_next_message(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    with RecordingWriter(tmp_path / "slow.mcap", metadata={}, chunk_seconds=0.0) as writer:
+        writer.add_stream("a", Pose)
+        writer.write("a", pose(1), seq=0)
+        before = writer.saved_bytes
+        writer.write("a", pose(2), seq=1)
+        assert writer.saved_bytes > before
+
+
+def record_until_it_fails(path: Path, noise: Callable[..., Any], limit: int = 1000) -> tuple[RecordingError, int]:
+    """Writes images until the writer raises; the error, and how many messages it had taken before."""
+    writer = RecordingWriter(path, metadata={}, chunk_bytes=50_000)
+    writer.add_stream("camera/image", Image)
+    try:
+        for seq in range(limit):
+            writer.write("camera/image", Image(stamp=seq, frame="c", data=noise(seq, 64, 64, 3)), seq=seq)
+    except RecordingError as error:
+        with pytest.raises(RecordingError, match="failed"):
+            writer.write("camera/image", Image(stamp=limit, frame="c", data=noise(0, 8, 8)), seq=limit)
+        with pytest.raises(RecordingError, match="failed"):
+            writer.flush()
+        with pytest.raises(RecordingError, match="failed"):
+            writer.close()
+        writer.close()
+        return error, seq
+    raise AssertionError("the disk was never full")
+
+
+def test_a_full_disk_is_reported_and_leaves_a_readable_file(
+    tmp_path: Path, noise: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, room = os.write, 400_000
+
+    def write(fd: int, data: Any) -> int:
+        nonlocal room
+        if room <= 0:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        count = real(fd, memoryview(data)[: max(1, room)])
+        room -= count
+        return count
+
+    monkeypatch.setattr(os, "write", write)
+    path = tmp_path / "full.mcap"
+    error, taken = record_until_it_fails(path, noise)
+    assert "No space left on device" in str(error)
+    assert str(path) in str(error)
+    with Recording(path) as recording:
+        seqs = [m.seq for m in recording.messages()]
+        assert recording.torn
+        assert recording.lost_bytes == 0
+    assert seqs == list(range(len(seqs)))
+    assert taken - 5 <= len(seqs) <= taken
+    assert f"stamps up to {seqs[-1]}" in str(error)
+
+
+def test_a_file_size_limit_of_the_system_leaves_a_finished_file(tmp_path: Path, noise: Callable[..., Any]) -> None:
+    """A real refusal by the kernel; cutting the torn chunk off makes room for the index."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    path = tmp_path / "limited.mcap"
+    handler = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (400_000, hard))
+    try:
+        error, taken = record_until_it_fails(path, noise)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        signal.signal(signal.SIGXFSZ, handler)
+    assert "File too large" in str(error)
+    with Recording(path) as recording:
+        count = sum(1 for _ in recording.messages())
+        assert not recording.torn
+    assert taken - 5 <= count <= taken
+    with path.open("rb") as file:
+        assert make_reader(file).get_summary().statistics.message_count == count
+
+
+def test_an_existing_file_is_not_overwritten_unasked(tmp_path: Path) -> None:
+    path = tmp_path / "once.mcap"
+    RecordingWriter(path, metadata={}).close()
+    before = path.read_bytes()
+    with pytest.raises(RecordingError, match="exists already"):
+        RecordingWriter(path, metadata={})
+    assert path.read_bytes() == before
+    RecordingWriter(path, metadata={}, overwrite=True).close()
+
+
+def test_a_missing_folder_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"nowhere.*No such file or directory"):
+        RecordingWriter(tmp_path / "nowhere" / "a.mcap", metadata={})
+
+
+def test_unknown_compression_is_refused_before_a_file_is_made(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="known: zstd, lz4, none"):
+        RecordingWriter(tmp_path / "a.mcap", metadata={}, compression="gzip")  # type: ignore[arg-type]
+    assert not (tmp_path / "a.mcap").exists()
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4", "none"])
+def test_every_compression_reads_back(compression: Any, record: Callable[..., Path], noise: Callable[..., Any]) -> None:
+    images = [Image(stamp=i, frame="c", data=noise(i, 40, 40)) for i in range(20)]
+    path = record([("a", m) for m in images], compression=compression, chunk_bytes=5000)
+    with Recording(path) as recording:
+        assert [m.message for m in recording.messages()] == images
+
+
+@pytest.mark.parametrize(
+    ("message", "seq", "incarnation", "complaint"),
+    [
+        (lambda pose: pose(-1), 5, 0, "before the epoch"),
+        (lambda pose: pose(10), 5, 0, "must increase"),  # the stamp of the message before
+        (lambda pose: pose(11), 4, 0, "must increase"),  # its number
+        (lambda pose: pose(11), -1, 1, "must be ≥ 0"),
+        (lambda pose: Image(stamp=11, frame="c", data=[[0]]), 5, 0, "holds Pose, got Image"),
+    ],
+    ids=["negative stamp", "same stamp", "same number", "negative number", "another type"],
+)
+def test_refused_messages_are_named_and_leave_the_recording_usable(
+    message: Any, seq: int, incarnation: int, complaint: str, tmp_path: Path, pose: Callable[..., Pose]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={}) as writer:
+        writer.add_stream("odometry/pose", Pose)
+        writer.write("odometry/pose", pose(10), seq=4)
+        with pytest.raises(RecordingError, match=complaint):
+            writer.write("odometry/pose", message(pose), seq=seq, incarnation=incarnation)
+        writer.write("odometry/pose", pose(12), seq=5)
+    with Recording(path) as recording:
+        assert [(m.seq, m.stamp) for m in recording.messages()] == [(4, 10), (5, 12)]
+
+
+def test_undeclared_and_twice_declared_streams_are_refused(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", metadata={}) as writer:
+        writer.add_stream("a", Pose)
+        with pytest.raises(RecordingError, match="declared twice"):
+            writer.add_stream("a", Pose)
+        with pytest.raises(RecordingError, match="'b' is not declared; declared are: a"):
+            writer.write("b", pose(1), seq=0)
+        with pytest.raises(RecordingError, match="extra must not set kind"):
+            writer.add_stream("c", Pose, extra={"kind": "mine"})
+
+
+def test_incarnations_and_long_sequences_keep_their_numbers(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    path = tmp_path / "a.mcap"
+    rows = [(2**32 - 1, 0, 5), (2**32, 0, 6), (2**33 + 3, 0, 7), (0, 2, 1), (1, 2, 2)]
+    with RecordingWriter(path, metadata={}) as writer:
+        writer.add_stream("a", Pose)
+        for seq, incarnation, stamp in rows:
+            writer.write("a", pose(stamp).replace(child_frame=f"base_{seq}"), seq=seq, incarnation=incarnation)
+    with Recording(path) as recording:
+        read = list(recording.messages())
+        assert [(m.seq, m.incarnation, m.stamp) for m in read] == rows
+        assert [m.message.child_frame for m in read] == [f"base_{seq}" for seq, _, _ in rows]
+        assert recording.streams["a"].incarnations == 2
+
+
+def test_firings_events_and_metadata_come_back(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={"graph": {"text": "graph: g", "name": "g"}}, namespace="robot1") as writer:
+        writer.add_stream("robot1/a/pose", Pose)
+        writer.write_firings("a", -(2**63), b"\x81setup")
+        writer.write("robot1/a/pose", pose(50), seq=0)
+        writer.write_firings("b", 60, b"one")
+        writer.write_firings("a", 2**63 - 1, b"finish")
+        writer.write_event("gap", 55, {"stream": "robot1/a/pose", "from": 3, "to": 9})
+        writer.add_metadata("graph", {"name": "h"})
+        writer.add_metadata("ends", {"robot1/a/pose": "50"})
+        with pytest.raises(RecordingError, match="written by the recording itself"):
+            writer.add_metadata("digests", {})
+        with pytest.raises(RecordingError, match="JSON values"):
+            writer.write_event("gap", 55, {"bad": {1, 2}})
+    with Recording(path) as recording:
+        assert list(recording.firings()) == [("a", b"\x81setup"), ("b", b"one"), ("a", b"finish")]
+        assert list(recording.firings("b")) == [("b", b"one")]
+        assert recording.firing_batches() == {"a": 2, "b": 1}
+        [event] = recording.events()
+        assert (event.name, event.stamp, event.data["to"]) == ("gap", 55, 9)
+        assert recording.metadata["graph"] == {"text": "graph: g", "name": "h"}
+        assert recording.metadata["ends"] == {"robot1/a/pose": "50"}
+        assert list(recording.streams) == ["robot1/a/pose"]
+    with path.open("rb") as file:
+        topics = {c.topic for _, c, _ in make_reader(file).iter_messages()}
+    assert topics == {"robot1/a/pose", "robot1/@/firings/a", "robot1/@/firings/b", "robot1/@/events"}
+
+
+def test_the_same_calls_write_the_same_bytes(record: Callable[..., Path], pose: Callable[..., Pose]) -> None:
+    rows = [("a", pose(i)) for i in range(5)]
+    assert record(rows, name="one.mcap").read_bytes() == record(rows, name="two.mcap").read_bytes()
+
+
+def test_close_is_idempotent_and_ends_writing(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    writer = RecordingWriter(tmp_path / "a.mcap", metadata={})
+    writer.add_stream("a", Pose)
+    writer.close()
+    writer.close()
+    with pytest.raises(RecordingError, match="closed"):
+        writer.write("a", pose(1), seq=0)

@@ -1,0 +1,181 @@
+"""Small operators for tests of the runtime: cheap, with every kind of input, and some that misbehave."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+
+from dataflow.messages import FeatureVector, Message
+from dataflow.operator import Batch, In, Operator, Out, Param, Sampled, Source
+
+
+def value(stamp: int, *numbers: float) -> FeatureVector:
+    """A message that holds a few numbers."""
+    return FeatureVector(stamp=stamp, vectors=np.array([numbers], np.float32).reshape(1, -1), model="test")
+
+
+def number(message: FeatureVector) -> float:
+    return float(message.vectors[0, 0])
+
+
+def nap(seconds: float) -> None:
+    """Sleeps for a random time up to `seconds`: shakes the order of arrival, never a result."""
+    if seconds > 0:
+        time.sleep(int.from_bytes(os.urandom(2)) / 65535 * seconds)
+
+
+class Counter(Source):
+    """Counts on `fast`; every `ratio`-th step also on `slow`. `padding` numbers make the messages large."""
+
+    fast: Out[FeatureVector]
+    slow: Out[FeatureVector]
+    constant: Out[FeatureVector] = Out(static=True)
+    count: int = Param(100, ge=0, doc="how many steps")
+    period: int = Param(10_000_000, gt=0, doc="step, ns")
+    ratio: int = Param(5, gt=0, doc="steps to a message on slow")
+    jitter: int = Param(0, ge=0, doc="stamps move by up to so many ns, in a fixed pattern")
+    padding: int = Param(0, ge=0, doc="numbers that follow the first")
+    sleep: float = Param(0.0, ge=0, doc="longest random sleep before a step, s")
+
+    def static_outputs(self) -> Mapping[str, Message]:
+        return {"constant": value(0, 42.0)}
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for k in range(self.count):
+            nap(self.sleep)
+            stamp = 1_000_000_000 + k * self.period + (k * 7919 % (self.jitter + 1))
+            step = {"fast": value(stamp, k, *range(self.padding))}
+            if k % self.ratio == 0:
+                step["slow"] = value(stamp, -k)
+            yield step
+
+    def length(self) -> int:
+        return self.count
+
+
+class Mix(Operator, tolerance="3ms"):
+    """Joins two streams by nearest stamp, samples the last feedback, batches a third stream, draws random numbers."""
+
+    a: In[FeatureVector]
+    b: In[FeatureVector]
+    constant: Sampled[FeatureVector]
+    feedback: Sampled[FeatureVector] = Sampled(before=True, required=False)
+    recent: Batch[FeatureVector]
+    mixed: Out[FeatureVector]
+    sleep: float = Param(0.0, ge=0, doc="longest random sleep in a firing, s")
+
+    def process(
+        self,
+        a: FeatureVector,
+        b: FeatureVector,
+        constant: FeatureVector,
+        feedback: FeatureVector | None,
+        recent: tuple[FeatureVector, ...],
+    ) -> FeatureVector:
+        nap(self.sleep)
+        return value(
+            a.stamp,
+            number(a) + 2 * number(b) + number(constant),
+            0.0 if feedback is None else number(feedback),
+            sum(number(m) for m in recent),
+            len(recent),
+            self.rng.normal(),
+            np.random.random(),
+        )
+
+
+class Smooth(Operator, every="25ms"):
+    """A running mean, on every message and on a timer: it has state, and sometimes emits nothing."""
+
+    x: In[FeatureVector]
+    mean: Out[FeatureVector]
+    sleep: float = Param(0.0, ge=0, doc="longest random sleep in a firing, s")
+
+    def setup(self) -> None:
+        self.state, self.calls = 0.0, 0
+
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+        nap(self.sleep)
+        self.calls += 1
+        if x is not None:
+            self.state = 0.9 * self.state + 0.1 * number(x)
+        if self.calls % 7 == 3:
+            return None
+        return value(context.stamp, self.state, self.calls, float(context.tick))
+
+    def finish(self) -> FeatureVector:
+        return value(10**15, self.state)
+
+
+class Merge(Operator, merge=True):
+    """Every message of every stream it can get, in stamp order."""
+
+    all: In[FeatureVector] = In(many=True)
+    seen: Out[FeatureVector]
+
+    def setup(self) -> None:
+        self.total = 0.0
+
+    def process(self, all: Mapping[str, FeatureVector]) -> FeatureVector:
+        self.total += sum(number(m) * (k + 1) for k, m in enumerate(all.values()))
+        return value(max(m.stamp for m in all.values()), self.total, len(all))
+
+
+class Sum(Operator):
+    """A sink that reports what it saw."""
+
+    x: In[FeatureVector]
+
+    def setup(self) -> None:
+        self.count, self.total = 0, 0.0
+
+    def process(self, x: FeatureVector) -> None:
+        self.count += 1
+        self.total += number(x)
+
+    def summary(self) -> Mapping[str, float]:
+        return {"count": self.count, "total": self.total}
+
+
+class Broken(Operator):
+    """Fails at one message, in one of several ways."""
+
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+    at: int = Param(20, doc="the number at which it fails")
+    how: str = Param("raise", doc="raise, die, hang, stamp, type, mutate or chatter")
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        if number(x) == self.at:
+            match self.how:
+                case "raise":
+                    raise RuntimeError("the gripper is on fire")
+                case "die":
+                    os.kill(os.getpid(), signal.SIGKILL)
+                case "hang":
+                    time.sleep(3600)
+                case "stamp":
+                    return value(x.stamp - 1, 0.0)
+                case "type":
+                    return "nothing"  # type: ignore[return-value]
+                case "mutate":
+                    x.vectors.flags.writeable = True
+                    x.vectors[0, 0] += 1
+                case "chatter":
+                    print("still here", flush=True)
+        return value(x.stamp, number(x))
+
+
+class LookAhead(Operator, tolerance="100s"):
+    """A join that cannot decide before it has seen very far ahead."""
+
+    a: In[FeatureVector]
+    b: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, a: FeatureVector, b: FeatureVector) -> FeatureVector:
+        return value(a.stamp, number(b))

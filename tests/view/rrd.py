@@ -1,0 +1,47 @@
+"""Reads what a sink saved: rows of (entity, component, stamp or None, values)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from rerun.chunk import RrdReader
+
+
+class Row(NamedTuple):
+    entity: str
+    component: str
+    stamp: int | None
+    values: list[Any]
+
+
+def rows(path: Path) -> list[Row]:
+    """Every component value in the file, the blueprint's aside."""
+    reader = RrdReader(path)
+    (recording,) = reader.recordings()
+    return [row for chunk in reader.stream(store=recording) for row in _rows(chunk)]
+
+
+def blueprint_rows(path: Path) -> list[Row]:
+    """Every component value of the blueprints in the file."""
+    reader = RrdReader(path)
+    return [row for store in reader.blueprints() for chunk in reader.stream(store=store) for row in _rows(chunk)]
+
+
+def at(found: list[Row], entity: str, component: str) -> list[Row]:
+    """The rows of one component of one entity, in file order."""
+    return [row for row in found if row.entity == entity and row.component == component]
+
+
+def _rows(chunk: Any) -> Iterator[Row]:
+    batch = chunk.to_record_batch()
+    stamps: list[Any] = [None] * batch.num_rows
+    if "stamp" in batch.schema.names:
+        stamps = batch.column("stamp").cast("int64").to_pylist()
+    for name in batch.schema.names:
+        if ":" not in name:
+            continue
+        for stamp, values in zip(stamps, batch.column(name).to_pylist(), strict=True):
+            if values is not None:
+                yield Row(chunk.entity_path, name, stamp, values)
