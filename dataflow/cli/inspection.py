@@ -19,15 +19,15 @@ def check(
     \b
     dataflow check graphs/*.yaml
     """
-    from dataflow.graph import GraphError, load_graph
+    from dataflow.graph import GraphError, Problem, load_graph
 
-    faults = []
+    faults: list[Problem] = []
     for path in graphs:
         with friendly_errors():
             try:
                 graph = load_graph(path, settings=settings or ())
             except GraphError as error:
-                faults.append((path, error))
+                faults += error.problems
                 continue
         if not json:
             out.print(f"[green]ok[/] {path}: {len(graph.nodes)} operators, {len(graph.streams)} streams")
@@ -35,16 +35,12 @@ def check(
         print_json(
             {
                 "ok": not faults,
-                "problems": [
-                    {"file": p.place.file, "line": p.place.line, "column": p.place.column, "message": p.message, "hint": p.hint}
-                    for _, error in faults
-                    for p in error.problems
-                ],
+                "problems": [problem.to_json() for problem in faults],
             }
         )
     else:
-        for _, error in faults:
-            out.print(str(error), markup=False, soft_wrap=True)
+        for problem in faults:
+            out.print(str(problem), markup=False, soft_wrap=True)
     if faults:
         raise typer.Exit(1)
 

@@ -125,13 +125,14 @@ def shown(console: Console, display: RunDisplay, *, quiet: bool) -> Iterator[Wat
 
 
 def _line_printer(console: Console, display: RunDisplay, every: float = 5.0) -> Watch:
-    state = {"due": time.monotonic() + 1.0, "phase": ""}
+    due, phase = time.monotonic() + 1.0, ""
 
     def watch(status: Status) -> None:
+        nonlocal due, phase
         display.update(status)
         now = time.monotonic()
-        if now >= float(state["due"]) or status.phase != state["phase"]:
-            state.update(due=now + every, phase=status.phase)
+        if now >= due or status.phase != phase:
+            due, phase = now + every, status.phase
             _, _, note = display._fraction(status)
             console.print(f"{status.phase:<8} {time.time() - status.started:5.1f} s  {note}")
 

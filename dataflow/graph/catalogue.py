@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import inspect
 import json
 import pkgutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -11,14 +10,17 @@ from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from typing import Any
 
+from pydantic import BeforeValidator
+from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.graph.lookup import is_concrete
+from dataflow.graph.lookup import NotFound, find_operator, is_concrete
+from dataflow.graph.problems import did_you_mean
 from dataflow.operator import InputPort, Operator, OutputPort, is_source
-from dataflow.sync.stamps import format_duration
+from dataflow.sync.stamps import format_duration, parse_duration
 
 ENTRY_POINTS = "dataflow.operators"
 """The entry-point group by which a package advertises a module or package of operators."""
@@ -46,19 +48,9 @@ class Catalogue:
     failures: tuple[Failure, ...] = ()
     found_in: tuple[str, ...] = field(default=BUILT_IN)
 
-    def find(self, name: str) -> list[str]:
-        """The import paths that `name` may mean: a path, a class name, or the end of either's module."""
-        if name in self.operators:
-            return [name]
-        return [
-            path
-            for path in self.operators
-            if path.endswith((f":{name}", f".{name}")) or path.partition(":")[0] in (name, f"operators.{name}")
-        ]
-
     def to_json(self) -> dict[str, Any]:
         return {
-            "operators": [describe(path, cls) for path, cls in self.operators.items()],
+            "operators": [Described(path, cls).to_json() for path, cls in self.operators.items()],
             "failures": [{"module": f.module, "reason": f.reason} for f in self.failures],
         }
 
@@ -118,21 +110,50 @@ def _import(name: str, failures: list[Failure]) -> Any:
         return None
 
 
-def describe(use: str, cls: type[Operator]) -> dict[str, Any]:
-    """All that an operator declares, as JSON values."""
-    spec = cls.spec
-    return {
-        "use": use,
-        "name": spec.name,
-        "doc": spec.doc,
-        "source": is_source(cls),
-        "live": bool(getattr(cls, "live", False)),
-        "external": cls.external,
-        "fires": fires(cls),
-        "inputs": [_input(port) for port in spec.inputs.values()],
-        "outputs": [_output(port) for port in spec.outputs.values()],
-        "params": [dict(row) for row in parameters(cls)],
-    }
+@dataclass(frozen=True, slots=True)
+class Described:
+    """One operator and the path it is used by."""
+
+    use: str
+    operator: type[Operator]
+
+    def to_json(self) -> dict[str, Any]:
+        """All that the operator declares, as JSON values."""
+        cls, spec = self.operator, self.operator.spec
+        return {
+            "use": self.use,
+            "name": spec.name,
+            "doc": spec.doc,
+            "source": is_source(cls),
+            "live": bool(getattr(cls, "live", False)),
+            "external": cls.external,
+            "fires": fires(cls),
+            "inputs": [_input(port) for port in spec.inputs.values()],
+            "outputs": [_output(port) for port in spec.outputs.values()],
+            "params": [dict(row) for row in parameters(cls)],
+        }
+
+
+def find(catalogue: Catalogue, name: str) -> Described:
+    """The operator of an import path or of a class name.
+
+    A path outside the catalogue is imported. Raises LookupError that names the nearest operator, or all that fit.
+    """
+    operators = catalogue.operators
+    fitting = [path for path in operators if path == name or path.endswith(f":{name}")]
+    if len(fitting) == 1:
+        return Described(fitting[0], operators[fitting[0]])
+    if fitting:
+        raise LookupError(f"several operators are called {name!r}: {', '.join(fitting)}")
+    if ":" in name:
+        found = find_operator(name)
+        if not isinstance(found, NotFound):
+            return Described(name, found)
+        raise LookupError(f"{found.message}; {found.hint}" if found.hint else found.message)
+    names = [path.partition(":")[2] for path in operators]
+    hint = did_you_mean(name, names, "operators")
+    failed = "".join(f"; failed to import {failure}" for failure in catalogue.failures)
+    raise LookupError(f"no operator {name!r}: {hint}{failed}")
 
 
 def fires(cls: type[Operator]) -> str:
@@ -183,12 +204,15 @@ def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
     for name, info in cls.spec.parameters.model_fields.items():
         required = info.is_required()
         declared = schema["properties"].get(name, {})
+        default = None if required or info.default is PydanticUndefined else declared.get("default")
+        if _is_duration(info) and isinstance(default, int):
+            default = format_duration(default)
         rows.append(
             {
                 "name": name,
-                "type": _type_text(info.annotation),
+                "type": _type_text(info),
                 "required": required,
-                "default": None if required or info.default is PydanticUndefined else declared.get("default"),
+                "default": default,
                 "bounds": _bounds(declared),
                 "unit": declared.get("unit", ""),
                 "doc": info.description or "",
@@ -197,12 +221,17 @@ def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
     return rows
 
 
-def _type_text(annotation: Any) -> str:
-    return (
-        annotation.__name__
-        if inspect.isclass(annotation) and not hasattr(annotation, "__args__")
-        else (str(annotation).replace("typing.", ""))
-    )
+def _type_text(info: FieldInfo) -> str:
+    if _is_duration(info):
+        return "duration"
+    annotation = info.annotation
+    if isinstance(annotation, type) and not hasattr(annotation, "__args__"):
+        return annotation.__name__
+    return str(annotation).replace("typing.", "")
+
+
+def _is_duration(info: FieldInfo) -> bool:
+    return any(isinstance(mark, BeforeValidator) and mark.func is parse_duration for mark in info.metadata)
 
 
 _BOUNDS = {
@@ -222,25 +251,26 @@ def _bounds(declared: Mapping[str, Any]) -> str:
     return ", ".join(f"{word} {declared[key]}" for key, word in _BOUNDS.items() if key in declared)
 
 
-def overview(catalogue: Catalogue) -> RenderableType:
+def table(catalogue: Catalogue) -> RenderableType:
     """A table of all operators: path, what goes in and out, first line of the doc; failures below."""
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for heading in ("operator", "in", "out", "what it does"):
-        table.add_column(heading, overflow="fold")
+    listed = Table(box=None, pad_edge=False, header_style="bold")
+    listed.add_column("operator", no_wrap=True)
+    for heading in ("in", "out", "what it does"):
+        listed.add_column(heading, overflow="fold")
     for path, cls in catalogue.operators.items():
         spec = cls.spec
-        takes = ", ".join(p.type_text() for p in spec.inputs.values())
-        makes = ", ".join(p.type_text() for p in spec.outputs.values())
-        table.add_row(Text(path, "cyan"), takes or "-", makes or "-", spec.doc.partition("\n")[0])
+        takes = ", ".join(dict.fromkeys(p.type_text() for p in spec.inputs.values()))
+        makes = ", ".join(dict.fromkeys(p.type_text() for p in spec.outputs.values()))
+        listed.add_row(Text(path, "cyan"), Text(takes or "-"), Text(makes or "-"), Text(spec.doc.partition("\n")[0]))
     if not catalogue.failures:
-        return table
-    return Group(table, *(Text(f"failed to import {failure}", "red") for failure in catalogue.failures))
+        return listed
+    return Group(listed, *(Text(f"failed to import {failure}", "red") for failure in catalogue.failures))
 
 
-def details(use: str, cls: type[Operator]) -> RenderableType:
+def page(described: Described) -> RenderableType:
     """One operator in full: doc, when it fires, ports and parameters."""
-    spec = cls.spec
-    parts: list[RenderableType] = [Text.assemble((spec.name, "bold"), "  ", (use, "cyan")), Text(spec.doc)]
+    cls, spec = described.operator, described.operator.spec
+    parts: list[RenderableType] = [Text.assemble((spec.name, "bold"), "  ", (described.use, "cyan")), Text(spec.doc)]
     parts.append(Text(f"fires {fires(cls)}", "dim"))
     ports = _table("port", "kind", "type", "")
     for port in spec.inputs.values():
@@ -255,7 +285,10 @@ def details(use: str, cls: type[Operator]) -> RenderableType:
             unit = f" {row['unit']}" if row["unit"] else ""
             default = "must be given" if row["required"] else json.dumps(row["default"], ensure_ascii=False) + unit
             table.add_row(
-                row["name"], row["type"], default, _notes([row["bounds"] + unit] if row["bounds"] else [], row["doc"])
+                row["name"],
+                Text(row["type"]),
+                Text(default),
+                _notes([row["bounds"] + unit] if row["bounds"] else [], row["doc"]),
             )
         parts += [Text(), table]
     return Group(*parts)

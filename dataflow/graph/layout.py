@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 
-COLUMN_GAP = 60.0
+COLUMN_GAP = 72.0
 ROW_GAP = 26.0
 LANE_GAP = 14.0
 SWEEPS = 12

@@ -97,7 +97,7 @@ def _wait(tree: Tree, default: int | None, fields: Fields) -> int | None:
 
 
 def default_wait(spec: OperatorSpec, port: InputPort, devices: bool) -> int | None:
-    """How long a live decision waits for an input: for ever where every source can wait, as DESIGN says elsewhere.
+    """How long (ns) a live decision waits for an input; None, for ever, where every source upstream can wait.
 
     Fed by a device: 0 for Sampled and Batch and for a single trigger, `JOIN_WAIT` for joined and merged triggers.
     """

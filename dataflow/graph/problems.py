@@ -51,6 +51,10 @@ class Problem:
         lines += [f"      {line}" for line in self.hint.splitlines()]
         return "\n".join(lines)
 
+    @property
+    def place(self) -> Place:
+        return Place(self.file, self.line, self.column, self.width)
+
     def to_json(self) -> dict[str, Any]:
         return {
             "file": self.file,
@@ -100,8 +104,11 @@ def nearest(word: str, choices: Iterable[str]) -> str | None:
     folded: dict[str, str] = {}
     for choice in choices:
         folded.setdefault(choice.casefold(), choice)
-    close = difflib.get_close_matches(word.casefold(), folded, n=1, cutoff=0.6)
-    return folded[close[0]] if close else None
+    wanted = word.casefold()
+    if close := difflib.get_close_matches(wanted, folded, n=1, cutoff=0.6):
+        return folded[close[0]]
+    holding = [choice for choice in folded if len(wanted) > 2 and wanted in choice]
+    return folded[holding[0]] if len(holding) == 1 else None
 
 
 def did_you_mean(word: str, choices: Iterable[str], what: str = "") -> str:

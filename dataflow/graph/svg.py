@@ -138,7 +138,7 @@ def _draw(graph: Graph, node: Node, layout: Layout, colour: tuple[str, str]) -> 
 def _type_label(graph: Graph, node: Node, port: str, layout: Layout) -> str:
     (x, y), width = layout.boxes[node.name], layout.widths[node.name]
     offset = _box(graph, node).outputs[port]
-    return _text("type", x + width + 8, y + offset - 4, _types(graph, node.outputs[port]))
+    return _text("type", x + width + 8, y + offset - 6, _types(graph, node.outputs[port]))
 
 
 def _text(kind: str, x: float, y: float, words: str, anchor: str = "start") -> str:

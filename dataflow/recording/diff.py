@@ -199,13 +199,12 @@ def _distance(left: Any, right: Any) -> float | None:
     if not x.size:
         return 0.0
     if x.dtype.kind in "iu" and y.dtype.kind in "iu":
-        return float(np.where(x > y, x - y, y - x).max())
+        return float((np.maximum(x, y).astype(np.uint64) - np.minimum(x, y).astype(np.uint64)).max())  # modulo 2^64
     x, y = x.astype(np.float64), y.astype(np.float64)
     same = (x == y) | (np.isnan(x) & np.isnan(y))
     with np.errstate(invalid="ignore", over="ignore"):
         gap = np.abs(x - y)
-    gap[~np.isfinite(gap)] = np.inf
-    return float(np.where(same, 0.0, gap).max())
+    return float(np.where(same, 0.0, np.where(np.isfinite(gap), gap, np.inf)).max())
 
 
 def _is_float(value: Any) -> bool:

@@ -59,7 +59,7 @@ def machine_facts() -> dict[str, dict[str, str]]:
         "python": platform.python_version(),
         "usable_cores": str(_usable_cores()),
     }
-    return {"machine": machine, "packages": _packages(), "threads": _threads()}
+    return {"machine": dict(sorted(machine.items())), "packages": _packages(), "threads": _threads()}
 
 
 def _cpu() -> tuple[str, frozenset[str]]:

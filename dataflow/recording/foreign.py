@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any
 
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
-from google.protobuf.json_format import ParseDict, ParseError  # type: ignore[import-untyped]
-from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
+from google.protobuf.json_format import ParseDict, ParseError
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from dataflow.messages import DepthImage, Image
 from dataflow.messages.base import Message

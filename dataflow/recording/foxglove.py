@@ -26,9 +26,9 @@ from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.Quaternion_pb2 import Quaternion as QuaternionProto
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
-from google.protobuf.descriptor_pb2 import FileDescriptorSet  # type: ignore[import-untyped]
-from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
-from google.protobuf.timestamp_pb2 import Timestamp  # type: ignore[import-untyped]
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError
+from google.protobuf.timestamp_pb2 import Timestamp
 
 from dataflow.messages import (
     CameraInfo,
@@ -142,8 +142,13 @@ def _frozen(values: Iterable[float], dtype: str, shape: tuple[int, ...]) -> npt.
     return data
 
 
+def _as_doubles(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    with np.errstate(invalid="ignore"):  # a signalling NaN becomes a quiet one; `_bits_survive` tells
+        return data.astype("<f8")
+
+
 def _bits_survive(data: npt.NDArray[Any], wider: npt.NDArray[Any]) -> bool:
-    """Whether `wider` cast back has the bits of `data` (a signalling NaN loses one on the way)."""
+    """Whether `wider` cast back has the bits of `data`."""
     return wider.astype(data.dtype).tobytes() == data.tobytes()
 
 
@@ -278,7 +283,7 @@ def _encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
     names: list[str] = []
     formats: list[Any] = []
     proto = PointCloudProto(
-        timestamp=_timestamp(message.stamp), frame_id=message.frame, pose=PoseProto(orientation=QuaternionProto(w=1.0))
+        timestamp=_timestamp(message.stamp), frame_id=message.frame, pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     )
     offset = 0
     for field, columns, dtype, numeric in _CLOUD_COLUMNS:
@@ -450,7 +455,7 @@ def _encode_scan(message: LaserScan) -> tuple[Parts, tuple[str, ...]]:
     proto = LaserScanProto(
         timestamp=_timestamp(message.stamp),
         frame_id=message.frame,
-        pose=PoseProto(orientation=QuaternionProto(w=1.0)),
+        pose=_pose((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),
         start_angle=message.angle_min,
         end_angle=message.angle_max,
     )
@@ -459,12 +464,12 @@ def _encode_scan(message: LaserScan) -> tuple[Parts, tuple[str, ...]]:
         lacks.append("range_max")
     if message.time_offsets is not None:
         lacks.append("time_offsets")
-    ranges = message.ranges.astype("<f8")
+    ranges = _as_doubles(message.ranges)
     if not _bits_survive(message.ranges, ranges):
         lacks.append("ranges")
     parts = _with_field(proto, "ranges", ranges)
     if message.intensities is not None:
-        intensities = message.intensities.astype("<f8")
+        intensities = _as_doubles(message.intensities)
         if not intensities.size or not _bits_survive(message.intensities, intensities):
             lacks.append("intensities")
         parts += _with_field(LaserScanProto(), "intensities", intensities)

@@ -219,7 +219,7 @@ class McapFile:
         data = self._pread(start, self._size - start - FOOTER_BYTES - len(MAGIC))
         indexes: list[ChunkIndex] = []
         metadata: list[MetadataIndex] = []
-        messages = 0
+        messages: int | None = None
         position = 0
         while position + _RECORD.size <= len(data):
             opcode, length = _RECORD.unpack_from(data, position)
@@ -242,7 +242,7 @@ class McapFile:
             if not index.message_index_offsets:
                 return False
             self._load_chunk_index(index)
-        return bool(self.channels or not messages) and bool(indexes or not messages)
+        return (bool(indexes) or messages == 0) and self._growing.keys() <= self.channels.keys()
 
     def _load_chunk_index(self, index: ChunkIndex) -> None:
         number = len(self.chunks)

@@ -102,9 +102,9 @@ class _Channel:
 
 
 class _Entry(NamedTuple):
-    """One message in the merged sequence: its entry in a channel, and its rank in the stream."""
+    """One message in the merged sequence: what it is merged by, its entry in a channel, its rank in the stream."""
 
-    stamp: int
+    key: int
     channel: _Channel
     position: int
     rank: int
@@ -166,8 +166,8 @@ class Recording:
     ) -> Iterator[Recorded]:
         """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream), whatever their order in the file.
 
-        Static streams come first and whole, whatever `start` and `end`. Each stream keeps its own order, incarnation
-        after incarnation: where stamps jump back between two, so does the merged sequence. Memory holds the index and
+        Static streams come first and whole, whatever `start` and `end`. Each stream keeps its own order; an incarnation
+        whose clock has jumped back is merged as if it followed directly on the one before. Memory holds the index and
         at most 256 MiB of decompressed chunks. Without `streams`, those that have no message type are left out.
 
         Raises `RecordingError` for an unknown stream, one without a message type, and data that does not decode.
@@ -382,7 +382,7 @@ class Recording:
         ordered = sorted(streams, key=lambda s: s.info.name)
         cursors = [self._cursor(stream, start, end, log_time=log_time) for stream in ordered]
         heads = [next(cursor, None) for cursor in cursors]
-        heap = [(head.stamp, i) for i, head in enumerate(heads) if head is not None]
+        heap = [(head.key, i) for i, head in enumerate(heads) if head is not None]
         heapq.heapify(heap)
         while heap:
             _, i = heap[0]
@@ -393,12 +393,16 @@ class Recording:
             if following is None:
                 heapq.heappop(heap)
             else:
-                heapq.heapreplace(heap, (following.stamp, i))
+                heapq.heapreplace(heap, (following.key, i))
 
     def _cursor(self, stream: _Stream, start: int | None, end: int | None, *, log_time: bool) -> Iterator[_Entry]:
-        """The entries of one stream in its own order: incarnation after incarnation, by stamp in each."""
+        """The entries of one stream in its own order: incarnation after incarnation, by stamp in each.
+
+        An incarnation whose clock has jumped back is merged as if it followed directly on the one before.
+        """
         groups = [[c] for c in stream.channels] if stream.own else [stream.channels]
         rank = 0
+        newest: int | None = None
         for group in groups:
             times = np.concatenate([c.entries.times if log_time else self._stamps(stream, c) for c in group])
             chunks = np.concatenate([c.entries.chunks for c in group])
@@ -406,13 +410,18 @@ class Recording:
             owners = np.concatenate([np.full(len(c.entries), i) for i, c in enumerate(group)])
             positions = np.concatenate([np.arange(len(c.entries)) for c in group])
             order = np.lexsort((offsets, chunks, times))
+            if not len(order):
+                continue
+            first, last = int(times[order[0]]), int(times[order[-1]])
+            shift = 0 if newest is None or first > newest else newest + 1 - first
+            newest = last + shift
             low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
             high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
             for at in range(low, high, BLOCK):
                 block = order[at : min(at + BLOCK, high)]
                 rows = zip(times[block].tolist(), owners[block].tolist(), positions[block].tolist(), strict=True)
                 for i, (time, owner, position) in enumerate(rows, at):
-                    yield _Entry(time, group[owner], position, rank + i)
+                    yield _Entry(time + shift, group[owner], position, rank + i)
             rank += len(order)
 
     def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:

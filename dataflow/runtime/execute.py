@@ -49,11 +49,11 @@ def replay(
 
 def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunReport:
     """Runs a plan under a supervisor; Ctrl-C asks it for an orderly end, a second one ends it at once."""
+    for file in (plan.record, plan.view_file):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
     if plan.record is not None:
         plan = replace(plan, metadata=_metadata(plan, mode))
-        plan.record.parent.mkdir(parents=True, exist_ok=True)
-    if plan.view_file is not None:
-        plan.view_file.parent.mkdir(parents=True, exist_ok=True)
     supervisor = Supervisor(plan)
     with _interrupts(supervisor.stop), _watching(supervisor, watch):
         return supervisor.run()

@@ -168,6 +168,11 @@ class Host:
         self._since_promise = 0
         self._step_done = 0
 
+    @property
+    def makers(self) -> list[SourceRunner | OperatorRunner]:
+        """Everything that emits, sources first."""
+        return [*self.sources, *self.runners]
+
     # Life
 
     def open(self) -> None:
@@ -191,9 +196,8 @@ class Host:
         if self.config.replay is not None:
             self._make_log(self.config.replay)
         limit_threads(self.graph.threads)
-        for runner in (*self.sources, *self.runners):
-            runner.operator_alive = self.bus.alive(self.graph.namespace, runner.node.name)
-        for maker in (*self.sources, *self.runners):
+        for maker in self.makers:
+            self.bus.alive(self.graph.namespace, maker.node.name)
             maker.setup()
         for feed in self.feeds:
             if isinstance(feed, LogFeed):
@@ -454,7 +458,7 @@ class Host:
 
     def _final_report(self) -> dict[str, Any]:
         streams: dict[str, list[Any]] = {}
-        for maker in (*self.sources, *self.runners):
+        for maker in self.makers:
             for state in maker.ports.states.values():
                 assert state.digest is not None
                 streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
@@ -525,7 +529,7 @@ class Host:
         """Closes every operator and the network; the first error is raised when all are closed."""
         self._stopping.set()
         first: Exception | None = None
-        for maker in (*self.sources, *self.runners):
+        for maker in self.makers:
             try:
                 maker.operator.close()
             except Exception as error:

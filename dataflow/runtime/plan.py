@@ -100,7 +100,7 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
     if plan.record is not None:
         recorded = tuple(s for s in graph.record.streams if s in streams)
-        options = {
+        options: dict[str, Any] = {
             "path": str(plan.record),
             "metadata": {name: dict(values) for name, values in plan.metadata.items()},
             "compression": plan.compression,
@@ -130,12 +130,12 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
             tuple(sorted({made_in[s] for s in subscribe})),
             has_log=bool(replaced & set(nodes)),
         )
-    for label, (kind, taken, options) in sinks.items():
+    for label, (kind, taken, chosen) in sinks.items():
         upstream = {made_in[s] for s in taken}
         if kind == "record":
             upstream |= set(hosts)
         plans[label] = HostPlan(
-            label, (), {}, (), tuple(sorted(upstream)), sink=kind, streams=tuple(sorted(taken)), options=options
+            label, (), {}, (), tuple(sorted(upstream)), sink=kind, streams=tuple(sorted(taken)), options=chosen
         )
     return plans
 

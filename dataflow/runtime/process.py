@@ -1,10 +1,9 @@
-"""The entry point of every host process: `python -m dataflow.runtime.process DESCRIPTOR`."""
+"""What every host process does from its first to its last moment. Forked by the nursery."""
 
 from __future__ import annotations
 
 import os
 import queue
-import signal
 import sys
 import threading
 import time
@@ -67,7 +66,6 @@ def _await_leave(inbox: queue.SimpleQueue[tuple[Any, ...]]) -> str:
 
 def main(descriptor: int) -> int:
     """Runs one host to its end; returns the exit code."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the supervisor decides what Ctrl-C means
     channel = Channel(descriptor)
     inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
     try:
@@ -99,10 +97,3 @@ def main(descriptor: int) -> int:
     except ChannelClosed:
         code = code or SUPERVISOR_GONE
     return code
-
-
-if __name__ == "__main__":
-    status = main(int(sys.argv[1]))
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(status)  # libraries' threads must not be able to hold up the end

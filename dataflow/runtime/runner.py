@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -295,7 +295,7 @@ class SourceRunner:
         self.busy_ns = 0
         self.overflow = 0
         self.last = NEVER
-        self._steps = iter(())  # type: ignore[var-annotated]
+        self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
 
     def setup(self) -> None:

@@ -7,9 +7,7 @@ channels, at once, when a process dies.
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import subprocess
 import sys
 import threading
 import time
@@ -18,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import IO, Any
 
 from dataflow.runtime.control import Channel, ChannelClosed, ready
+from dataflow.runtime.nursery import Child, Nursery, NurseryFailed
 from dataflow.runtime.plan import RunPlan, expected_probes, host_plans
 from dataflow.runtime.threads import environment
 from dataflow.sync import FOREVER, NEVER
@@ -95,8 +94,7 @@ class RunFailed(RuntimeError):
 class _Process:
     label: str
     nodes: tuple[str, ...]
-    process: subprocess.Popen[bytes]
-    channel: Channel
+    child: Child
     config: dict[str, Any]
     kind: str
     words: list[str] = field(default_factory=list)
@@ -109,6 +107,10 @@ class _Process:
     closed: dict[str, Any] | None = None
     state: dict[str, Any] | None = None
     gone: bool = False
+
+    @property
+    def channel(self) -> Channel:
+        return self.child.channel
 
     def describe(self) -> str:
         what = ", ".join(self.nodes)
@@ -133,6 +135,7 @@ class Supervisor:
         self._stop_sent = False
         self._released_at = 0.0
         self._asked_at = 0.0
+        self._nursery: Nursery | None = None
         self._reserved: Reservation | None = None
         self._endpoints: dict[str, str] = {}
 
@@ -150,6 +153,9 @@ class Supervisor:
                 self._release()
                 self._watch()
             return self._finish()
+        except NurseryFailed as failure:
+            self._abandon(str(failure))
+            raise RunFailed(str(failure)) from failure
         except RunFailed as failure:
             self._abandon(str(failure).splitlines()[0])
             raise
@@ -165,11 +171,12 @@ class Supervisor:
 
     def _start(self) -> None:
         graph = self.plan.graph
+        self._nursery = Nursery(environment(graph.threads))
         self._reserved = reserve_endpoints(len(self._plans))
         endpoints = dict(zip(self._plans, self._reserved.endpoints, strict=True))
         for label, host in self._plans.items():
             connect = [endpoints[up] for up in host.upstream]
-            common = {"label": label, "graph": graph.to_json(), "connect": connect}
+            common: dict[str, Any] = {"label": label, "graph": graph.to_json(), "connect": connect}
             if host.sink is not None:
                 config = common | {
                     "kind": host.sink,
@@ -209,26 +216,13 @@ class Supervisor:
         }
 
     def _spawn(self, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]) -> None:
-        channel, descriptor = Channel.pair()
-        try:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "dataflow.runtime.process", str(descriptor)],
-                pass_fds=(descriptor,),
-                env=environment(self.plan.graph.threads),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                process_group=0,
-            )
-        finally:
-            os.close(descriptor)
-        spawned = _Process(label, nodes, process, channel, config, kind)
+        assert self._nursery is not None
+        child = self._nursery.spawn()
+        spawned = _Process(label, nodes, child, config, kind)
         self._processes[label] = spawned
-        assert process.stdout is not None
-        spawned.reader = threading.Thread(target=self._read_words, args=(spawned, process.stdout), daemon=True)
+        spawned.reader = threading.Thread(target=self._read_words, args=(spawned, child.words), daemon=True)
         spawned.reader.start()
-        with contextlib.suppress(ChannelClosed):  # a process that dies this early is noticed by the barrier
-            channel.send(kind, **config)
+        self._send(spawned, kind, **config)
 
     def _read_words(self, process: _Process, stream: IO[bytes]) -> None:
         for line in stream:
@@ -241,6 +235,7 @@ class Supervisor:
         """Every host ready, and every edge proven by a probe that arrived."""
         deadline = time.monotonic() + self.plan.start_timeout
         probing = False
+        assert self._reserved is not None
         while True:
             self._receive(TICK)
             if self._stop_asked:
@@ -288,12 +283,18 @@ class Supervisor:
                 raise RunFailed("stopped before everything was drained")
             quiet = time.monotonic() - self._heard
             if quiet > self.plan.stall_timeout:
-                stuck = [p.describe() for p in self._processes.values() if p.report is None]
-                raise RunFailed(
-                    f"no progress for {self.plan.stall_timeout:g} s; still busy: {'; '.join(stuck)}", self._last_words()
-                )
+                self._fail_stalled()
             if quiet > QUIET:
                 self._poll_quiescence()
+
+    def _fail_stalled(self) -> None:
+        """Names the hosts that do not answer and kills them: they could not leave in order."""
+        silent = [p for p in self._processes.values() if p.state is None or p.state["round"] != self._round]
+        busy = silent or [p for p in self._processes.values() if p.report is None]
+        for process in silent:
+            process.child.kill()
+        names = "; ".join(p.describe() for p in busy)
+        raise RunFailed(f"no progress for {self.plan.stall_timeout:g} s; still busy: {names}", self._last_words())
 
     def _poll_quiescence(self) -> None:
         """Two rounds with everything idle, every envelope received and nothing new prove that nothing will happen."""
@@ -418,16 +419,18 @@ class Supervisor:
 
     def _on_death(self, process: _Process) -> None:
         process.gone = True
-        try:
-            code = process.process.wait(timeout=LEAVE_TIMEOUT)
-        except subprocess.TimeoutExpired:
-            process.process.kill()
-            code = process.process.wait(timeout=LEAVE_TIMEOUT)
+        code = process.child.wait(timeout=LEAVE_TIMEOUT)
+        if code is None:
+            process.child.kill()
+            code = process.child.wait(timeout=LEAVE_TIMEOUT)
         if process.closed is not None:
             return
         if process.reader is not None:
             process.reader.join(timeout=1.0)
-        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with code {code}"
+        if code is None:
+            how = "closed its channel and did not end"
+        else:
+            how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with code {code}"
         at = [f"{n} had reached stamp {f}" for n, f in process.done.items() if f not in (NEVER, FOREVER)]
         phase = f" while {self.status.phase}" + (f" ({'; '.join(at)})" if at else "")
         raise RunFailed(f"{process.describe()} {how}{phase}", "\n".join(process.words[-20:]))
@@ -483,23 +486,23 @@ class Supervisor:
 
     def _reap(self) -> None:
         for process in self._processes.values():
-            if process.process.poll() is None:
-                process.process.kill()
-            process.process.wait(timeout=LEAVE_TIMEOUT)
+            process.child.kill()
+            process.child.wait(timeout=LEAVE_TIMEOUT)
             if process.reader is not None:
                 process.reader.join(timeout=1.0)
-            if process.process.stdout is not None:
-                process.process.stdout.close()
+            process.child.words.close()
             process.channel.close()
+        if self._nursery is not None:
+            self._nursery.close()
 
     # Talking
 
-    def _send(self, process: _Process, kind: str, **fields: Any) -> None:
+    def _send(self, process: _Process, kind: str, /, **fields: Any) -> None:
         if not process.gone:
             with contextlib.suppress(ChannelClosed):  # its death is noticed, with its cause, by _receive
                 process.channel.send(kind, **fields)
 
-    def _send_all(self, kind: str, **fields: Any) -> None:
+    def _send_all(self, kind: str, /, **fields: Any) -> None:
         for process in self._processes.values():
             self._send(process, kind, **fields)
 

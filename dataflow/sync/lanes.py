@@ -71,7 +71,7 @@ class StreamState:
             final_stamp = self.promised if self.promised != NEVER else None
         elif final_stamp < self.promised:
             raise StreamOrderError(
-                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, below the "
+                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, below "
                 f"frontier {format_stamp(self.promised)} it promised: pass the larger of last stamp and frontier"
             )
         self.ended = True

@@ -17,7 +17,7 @@ from typing import Any, Self
 import zenoh
 
 from dataflow.transport.codec import Buffer, DecodeError, Envelope, Kind, encode_head, encode_parts, parts_size
-from dataflow.transport.keys import alive_key, runtime_key, shared_key, static_key, stream_of
+from dataflow.transport.keys import RUNTIME, alive_key, runtime_key, shared_key, static_key, stream_of
 from dataflow.transport.network import NetworkConfig
 from dataflow.transport.shared import (
     SUPPORTED,
@@ -210,7 +210,7 @@ class Bus:
         self._pool: SharedPool | None = None
         self._pools = PoolReader()
         self._shares = self.config.shared_memory and SUPPORTED
-        self._subscriptions: list[Token] = []
+        self._tokens: list[Token] = []
         self._declared: dict[str, zenoh.Queryable[None]] = {}
         self._static: dict[str, bytes] = {}
         self._closed = False
@@ -229,7 +229,7 @@ class Bus:
             reliability=zenoh.Reliability.RELIABLE,
             express=True,
         )
-        sharing = _Sharing(self, stream, consumers) if consumers and self._shares else None
+        sharing = _Sharing(self, stream, consumers) if consumers and self._can_share(stream) else None
         return StreamPublisher(self, stream, publisher, sharing)
 
     def subscribe(self, key: str, receive: Receive) -> Token:
@@ -248,17 +248,19 @@ class Bus:
             receive(payload)
 
         subscriber = self.session.declare_subscriber(key, zenoh.handlers.Callback(on_sample, indirect=False))
-        token = Token(subscriber, *declared, board=board)
-        self._subscriptions.append(token)
-        return token
+        return self._keep(Token(subscriber, *declared, board=board))
 
     def _offer_sharing(self, key: str) -> tuple[Board | None, tuple[Any, ...]]:
         """Tells the stream's publisher, before it can see the subscription, that we can read shared memory."""
-        if not self._shares or "*" in key or key.count("/") < 2:
+        if not self._can_share(key):
             return None, ()
         board = Board()
         name = shared_key(key, machine(), str(os.getpid()), str(board.descriptor), self.id)
         return board, (self.session.liveliness().declare_token(name),)
+
+    def _can_share(self, key: str) -> bool:
+        """Shared memory is for single streams: neither key expressions nor the runtime's own keys."""
+        return self._shares and "*" not in key and key.count("/") >= 2 and f"/{RUNTIME}/" not in key
 
     def _resolve(self, payload: bytes, board: Board) -> Buffer:
         """The envelope that a reference stands for; the reference itself, which `decode` refuses, when it is lost."""
@@ -289,7 +291,15 @@ class Bus:
         def on_sample(sample: zenoh.Sample) -> None:
             receive(str(sample.key_expr), bytes(sample.payload))
 
-        return Token(self.session.declare_subscriber(key, zenoh.handlers.Callback(on_sample, indirect=False)))
+        return self._keep(
+            Token(self.session.declare_subscriber(key, zenoh.handlers.Callback(on_sample, indirect=False)))
+        )
+
+    def _keep(self, token: Token) -> Token:
+        """A declaration lasts until it is closed, also when the caller does not keep its token."""
+        with self._lock:
+            self._tokens.append(token)
+        return token
 
     # Static streams
 
@@ -337,7 +347,7 @@ class Bus:
 
     def alive(self, namespace: str, name: str) -> Token:
         """Declares the presence of an operator (or host, or supervisor) until the token or the bus is closed."""
-        return Token(self.session.liveliness().declare_token(alive_key(namespace, name)))
+        return self._keep(Token(self.session.liveliness().declare_token(alive_key(namespace, name))))
 
     def watch_liveliness(self, namespace: str, changed: Callable[[str, bool], object]) -> Token:
         """Calls `changed(name, alive)` for those present already, and on every change. Runs on Zenoh's thread."""
@@ -345,9 +355,11 @@ class Bus:
         def on_sample(sample: zenoh.Sample) -> None:
             changed(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
 
-        return Token(
-            self.session.liveliness().declare_subscriber(
-                alive_key(namespace, "*"), zenoh.handlers.Callback(on_sample, indirect=False), history=True
+        return self._keep(
+            Token(
+                self.session.liveliness().declare_subscriber(
+                    alive_key(namespace, "*"), zenoh.handlers.Callback(on_sample, indirect=False), history=True
+                )
             )
         )
 
@@ -382,7 +394,7 @@ class Bus:
         closer.join(CLOSE_WITHIN)
         if closer.is_alive():
             raise BusError(f"Zenoh did not close within {CLOSE_WITHIN:g} s")
-        for token in self._subscriptions:
+        for token in self._tokens:
             token.close()
         if self._pool is not None:
             self._pool.close()

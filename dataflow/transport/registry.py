@@ -11,10 +11,11 @@ import secrets
 import stat
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil  # type: ignore[import-untyped]
 
@@ -30,7 +31,7 @@ class RunningGraph:
     """A graph that runs on this machine.
 
     `endpoints` are the Zenoh endpoints of all its hosts: a tool connects to every one. `started` is the wall time
-    (seconds since the epoch) at which the graph was registered.
+    (seconds since the epoch) at which the graph was registered. `graph` is the resolved graph as JSON values.
     """
 
     name: str
@@ -40,6 +41,7 @@ class RunningGraph:
     process_started: float
     endpoints: tuple[str, ...]
     started: float
+    graph: Mapping[str, Any]
 
 
 def registry_folder() -> Path:
@@ -66,10 +68,20 @@ def registry_folder() -> Path:
 
 
 @contextmanager
-def register(name: str, namespace: str, endpoints: Sequence[str]) -> Iterator[RunningGraph]:
-    """Makes this process's graph known to tools for as long as the block runs."""
+def register(
+    name: str, namespace: str, endpoints: Sequence[str], graph: Mapping[str, Any] | None = None
+) -> Iterator[RunningGraph]:
+    """Makes this process's graph known to tools for as long as the block runs. `graph` must be JSON values."""
     pid = os.getpid()
-    entry = RunningGraph(name, namespace, pid, psutil.Process(pid).create_time(), tuple(endpoints), started=time.time())
+    entry = RunningGraph(
+        name,
+        namespace,
+        pid,
+        psutil.Process(pid).create_time(),
+        tuple(endpoints),
+        started=time.time(),
+        graph=dict(graph or {}),
+    )
     path = registry_folder() / f"{pid}-{secrets.token_hex(4)}.json"
     written = path.with_suffix(".new")
     written.write_text(json.dumps(asdict(entry)))
@@ -104,6 +116,7 @@ def _read(path: Path) -> RunningGraph | None:
             process_started=float(data["process_started"]),
             endpoints=tuple(str(e) for e in data["endpoints"]),
             started=float(data["started"]),
+            graph=dict(data["graph"]),
         )
     except (OSError, ValueError, TypeError, KeyError):
         return None

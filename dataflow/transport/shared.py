@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import msgpack  # type: ignore[import-untyped]
+import msgpack
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 
@@ -98,7 +98,10 @@ class BoardReader:
         self.key = key
         self.lost = False
         """Set when its liveliness token is gone: then its process is asked for."""
-        self._process = psutil.Process(pid)
+        try:
+            self._process = psutil.Process(pid)
+        except psutil.Error as error:
+            raise SharedMemoryError(f"board of process {pid}: {error}") from error
         memory = _open(pid, descriptor, _BOARD_NAME)
         if len(memory) != BOARD_BYTES:
             raise SharedMemoryError(f"board of process {pid}: {len(memory)} bytes, expected {BOARD_BYTES}")
@@ -112,7 +115,10 @@ class BoardReader:
         return self._cells[SLOTS] == base or not self._runs()
 
     def _runs(self) -> bool:
-        return bool(self._process.is_running() and self._process.status() != psutil.STATUS_ZOMBIE)
+        try:
+            return bool(self._process.is_running() and self._process.status() != psutil.STATUS_ZOMBIE)
+        except psutil.NoSuchProcess:
+            return False
 
 
 @dataclass(slots=True)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any, Final, Self
 
-import msgpack  # type: ignore[import-untyped]
+import msgpack
 import zenoh
 
 from dataflow.transport.bus import Bus, undeclare

@@ -180,15 +180,17 @@ class FrameTree:
         a, b = self._sightings.get((child, first)), self._sightings.get((child, second))
         if a is None or b is None:
             return []
+        changes: list[Change] = []
         if self._to_top(a.parent)[0] == self._to_top(b.parent)[0]:
             links = [frame for frame in self._path(a.parent) + self._path(b.parent) if self._is_blind(frame)]
             if not links:
                 return []
             del self._edges[links[0]]
+            changes.append(Detach(links[0]))
         top_a, T_topa_a = self._to_top(a.parent)
         top_b, T_topb_b = self._to_top(b.parent)
         if top_a == top_b:
-            return []
+            return changes
         _, T_a, T_b = min(
             ((abs(sa - sb), Ta, Tb) for sa, Ta in a.poses for sb, Tb in b.poses),
             key=lambda candidate: candidate[0],
@@ -199,7 +201,7 @@ class FrameTree:
         else:
             lower, upper, T = top_a, top_b, invert(T_a_b)
         self._edges[lower] = _Edge(upper, T, f"{first} and {second}", None)
-        return [Attach(lower, upper, T, assumed=True)]
+        return [*changes, Attach(lower, upper, T, assumed=True)]
 
     def _is_blind(self, frame: str) -> bool:
         """Whether `frame` hangs where it does only because it had to hang somewhere."""

@@ -214,6 +214,11 @@ class ViewerSink:
         """What became of the messages so far."""
         return SinkStatistics(self._counts["drawn"], self._counts["dropped"], self._counts["failed"])
 
+    def backlog(self) -> int:
+        """How many messages wait to be drawn."""
+        with self._waiting.changed:
+            return len(self._waiting.static) + len(self._waiting.messages)
+
     def close(self, timeout: float = 10.0) -> bool:
         """Draws what waits, flushes and lets go of the viewer; returns whether all arrived within `timeout` seconds."""
         if self._recording is None or self._thread is None:

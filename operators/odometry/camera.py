@@ -49,8 +49,8 @@ class RgbdCamera:
         """Intersect the rays of colour pixels (N, 2) with the depth image.
 
         Returns the points (N, 3) in the depth camera's frame and which of them are known. A ray's depth is
-        found by fixed point: project its point into the depth image, read the depth there, move the point to it. A
-        pixel beside a depth edge is unknown, for which side it saw is a coin's toss.
+        found by fixed point: project its point into the depth image, read the depth there, move the point to
+        it. A pixel beside a depth edge is unknown, for which side it saw is a coin's toss.
         """
         K, (height, width) = self.K_depth, depth.shape
         rays = unproject(pixels_color, self.K_color) @ self.T_depth_color[:3, :3].T

@@ -22,12 +22,12 @@ from operators.odometry.motion import Motion
 from operators.odometry.se3 import Matrix
 from operators.odometry.surface import DepthNoise, Surface, scaled_intrinsics
 
-# Share of the summed information that is believed. Neighbouring residuals err together (structured-light depth
-# is smooth over several pixels, tracks share motion blur), so they do not average like independent draws.
+# Share of the summed information that is believed. Neighbouring residuals err together (depth noise is smooth
+# over several pixels, tracks share motion blur), so they do not average like independent draws.
 PLANE_STRENGTH = 0.1
 PIXEL_STRENGTH = 0.2
-# Calibration, rolling shutters and unsynchronised images err alike in every residual, so no count of them averages
-# it out: variances are this much larger than the residuals say (calibrated against truth, see the benchmark).
+# Calibration, rolling shutters and unsynchronised images err alike in every residual, so no count averages it
+# out: variances are this much larger than the residuals say (calibrated against truth, see the benchmark).
 SYSTEMATIC = 20.0
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
 
@@ -62,7 +62,7 @@ class RgbdOdometryConfig:
     refine: bool = True  # False: features only
     references: int = 2  # keyframes whose surfaces a frame is aligned with
     keyframes: int = 12  # remembered
-    keyframe_distance: float = 0.15  # radians of view change that make a new keyframe
+    keyframe_distance: float = 0.1  # radians of view change that make a new keyframe
     acceleration: float = 5.0  # m/s²
     angular_acceleration: float = 20.0  # rad/s²
     decay_s: float = 0.3  # of the velocity while nothing is measured

@@ -53,7 +53,7 @@ class VisualOdometry(Operator):
     min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
     refine: bool = Param(True, doc="refine with the depth image; off leaves the features alone")
     keyframe_distance: float = Param(
-        0.15, gt=0, doc="change of view that makes a new keyframe: angle plus baseline over depth", unit="rad"
+        0.1, gt=0, doc="change of view that makes a new keyframe: angle plus baseline over depth", unit="rad"
     )
     keyframes: int = Param(12, ge=1, doc="keyframes remembered")
     patience: float = Param(

@@ -10,7 +10,7 @@ import graph_operators
 import pytest
 from rich.console import Console, RenderableType
 
-from dataflow.graph.catalogue import describe, details, discover, overview
+from dataflow.graph.catalogue import Described, discover, find, page, parameters, table
 
 
 def shown(renderable: RenderableType) -> str:
@@ -29,9 +29,13 @@ def test_every_operator_of_a_module_is_found() -> None:
         )
     }  # fmt: skip
     assert not catalogue.failures
-    assert catalogue.find("CloudBuilder") == ["graph_operators:CloudBuilder"]
-    assert catalogue.find("Nothing") == []
-    assert "graph_operators:Fuse" in shown(overview(catalogue))
+    assert find(catalogue, "CloudBuilder").operator is graph_operators.CloudBuilder
+    assert find(catalogue, "graph_operators:Fuse").use == "graph_operators:Fuse"
+    with pytest.raises(LookupError, match="no operator 'CloudBilder': did you mean 'CloudBuilder'"):
+        find(catalogue, "CloudBilder")
+    with pytest.raises(LookupError, match="has no operator 'Fus'; did you mean 'Fuse'"):
+        find(catalogue, "graph_operators:Fus")
+    assert "graph_operators:Fuse" in shown(table(catalogue))
 
 
 def test_a_failing_module_is_reported_and_the_others_still_listed(
@@ -50,11 +54,11 @@ def test_a_failing_module_is_reported_and_the_others_still_listed(
     assert list(catalogue.operators) == ["half_broken:Good"]
     (failure,) = catalogue.failures
     assert str(failure) == "half_broken.bad: ModuleNotFoundError: No module named 'no_such_library_at_all'"
-    assert "no_such_library_at_all" in shown(overview(catalogue))
+    assert "no_such_library_at_all" in shown(table(catalogue))
 
 
 def test_description_holds_ports_parameters_bounds_units_and_docs() -> None:
-    camera = describe("graph_operators:Camera", graph_operators.Camera)
+    camera = Described("graph_operators:Camera", graph_operators.Camera).to_json()
     assert camera["source"]
     assert camera["params"][0] == {
         "name": "rate",
@@ -70,18 +74,18 @@ def test_description_holds_ports_parameters_bounds_units_and_docs() -> None:
         ("depth", ["TestDepth"], False),
         ("info", ["TestLens"], True),
     ]
-    odometry = describe("graph_operators:Odometry", graph_operators.Odometry)
+    odometry = Described("graph_operators:Odometry", graph_operators.Odometry).to_json()
     assert [(i["name"], i["kind"], i["required"], i["before"]) for i in odometry["inputs"]] == [
         ("image", "in", True, 0),
         ("map", "sampled", False, 1),
         ("hint", "sampled", False, 0),
     ]
-    assert describe("x:Mapper", graph_operators.Mapper)["fires"] == "on cloud and pose joined within 20ms"
-    assert describe("x:Watchdog", graph_operators.Watchdog)["fires"] == "every 100ms"
+    assert Described("x:Mapper", graph_operators.Mapper).to_json()["fires"] == "on cloud and pose joined within 20ms"
+    assert Described("x:Watchdog", graph_operators.Watchdog).to_json()["fires"] == "every 100ms"
 
 
 def test_details_show_everything_declared() -> None:
-    text = shown(details("graph_operators:CloudBuilder", graph_operators.CloudBuilder))
+    text = shown(page(Described("graph_operators:CloudBuilder", graph_operators.CloudBuilder)))
     for word in (
         "CloudBuilder",
         "In",
@@ -93,7 +97,11 @@ def test_details_show_everything_declared() -> None:
         "keep every stride-th pixel",
     ):
         assert word in text
-    assert "must be given" in shown(details("graph_operators:Detector", graph_operators.Detector))
+    (window,) = [row for row in parameters(graph_operators.CloudBuilder) if row["name"] == "window"]
+    assert (window["type"], window["default"]) == ("duration", "0s")
+    text = shown(page(Described("graph_operators:Detector", graph_operators.Detector)))
+    assert "must be given" in text
+    assert "list[str]" in text
 
 
 def test_the_installed_catalogue_is_json() -> None:

@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 
-from dataflow.graph import Graph, load_graph, load_text
+from dataflow.graph import Graph, load_graph
 
 HERE = Path(__file__).resolve().parent
-
-
-@pytest.fixture(autouse=True)
-def _operators_importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.syspath_prepend(str(HERE))
+sys.path.append(str(HERE))
 
 
 @pytest.fixture(autouse=True)
@@ -32,20 +29,4 @@ def _no_orphans() -> Iterator[None]:
 def mixed() -> Graph:
     """Every kind of input; small."""
     return load_graph(HERE / "mixed.yaml")
-
-
-def chain(*operators: str, count: int = 60, source: str = "") -> Graph:
-    """left (a Counter) → operators given as YAML lines."""
-    body = "\n".join(f"  {line}" for line in operators)
-    text = f"""
-graph: chain
-namespace: test
-operators:
-  left:
-    use: runtime_operators:Counter
-    params: {{count: {count}{source}}}
-{body}
-"""
-    return load_text(text)
-
 

@@ -56,6 +56,18 @@ def test_what_has_been_promised_downstream_is_decided() -> None:
     assert aligner.drops == {("a", "late"): 1}
 
 
+def test_a_matched_message_is_not_given_to_an_anchor_that_comes_late() -> None:
+    aligner = Aligner(AlignSpec((A, B), tolerance=10))
+    push(aligner, "a", 0)
+    push(aligner, "b", 4, 5)
+    aligner.force("a", 10)
+    assert stamps(poll_all(aligner)) == [0]
+    aligner.push("a", Entry(2, seq=1))  # not late: above the last decided stamp, but its nearest, 4, is taken
+    aligner.push("a", Entry(30, seq=2))
+    assert poll_all(aligner) == []
+    assert aligner.drops["a", "unmatched"] == 1
+
+
 def test_a_late_sample_serves_the_next_firing_and_is_flagged() -> None:
     aligner = Aligner(AlignSpec((A,), (SampledSpec("x", ("x",), required=False),)))
     push(aligner, "a", 10)

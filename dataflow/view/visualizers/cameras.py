@@ -37,7 +37,13 @@ def image(canvas: Canvas, message: Image) -> None:
     if message.data.size == 0:
         canvas.clear("")
         return
-    picture = rr.Image(message.data, color_model="RGB" if message.is_color else "L")
+    picture = rr.Image(  # not from the array itself: of that, Rerun drops extents of 1
+        bytes=message.data.tobytes(),
+        width=message.width,
+        height=message.height,
+        color_model="RGB" if message.is_color else "L",
+        datatype="U8",
+    )
     quality = canvas.scene.options.jpeg_quality
     canvas.draw("", canvas.plane, picture if quality is None else picture.compress(jpeg_quality=quality))
 

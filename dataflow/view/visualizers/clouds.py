@@ -12,6 +12,8 @@ from dataflow.messages import Clusters, PointCloud
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 
+_FARTHEST = 1e30  # metres
+
 
 @visualizer(PointCloud, "space")
 def point_cloud(canvas: Canvas, message: PointCloud) -> None:
@@ -63,10 +65,10 @@ def clusters(canvas: Canvas, message: Clusters) -> None:
 
 
 def finite_rows(*arrays: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Indices of the rows in which every array is finite."""
+    """Indices of the rows in which every array is finite, as float32 too, which is what Rerun keeps."""
     good = np.ones(len(arrays[0]), bool)
     for data in arrays:
-        good &= np.isfinite(data.reshape(len(data), -1)).all(axis=1)
+        good &= (np.abs(data) < _FARTHEST).all(axis=tuple(range(1, data.ndim)))
     return np.flatnonzero(good)
 
 

@@ -17,6 +17,7 @@ from dataflow.view.visualizers.clouds import finite_rows
 MANY_LABELS = 40  # more labels than this are shown only on hovering
 _RAY = 10.0  # metres: how far a bearing without a range is drawn
 _PATH_VERTICES = 200
+_STILL = 0.05  # m/s
 
 
 @visualizer(Detections2D, "overlay")
@@ -78,11 +79,11 @@ def tracks(canvas: Canvas, message: Tracks) -> None:
     paint = colors.of_identities(message.ids.tolist())
     paint[message.states == TrackState.COASTING] //= 2
     if message.boxes is not None:
-        shown = alive[np.isfinite(message.boxes[alive]).all(axis=1)]
+        shown = alive[np.isin(alive, finite_rows(message.boxes))]
         _boxes_2d(canvas, message.boxes[shown], paint[shown], [labels[i] for i in shown])
     if message.positions is None:
         return
-    shown = alive[np.isfinite(message.positions[alive]).all(axis=1)]
+    shown = alive[np.isin(alive, finite_rows(message.positions))]
     centers = message.positions[shown]
     names_shown = [labels[i] for i in shown]
     if message.sizes is not None:
@@ -188,7 +189,7 @@ def _velocities(
     if velocities is None:
         return
     vectors = velocities[shown]
-    moving = np.isfinite(vectors).all(axis=1) & (np.linalg.norm(np.nan_to_num(vectors), axis=1) > 0.05)
+    moving = (np.abs(vectors) < 1e4).all(axis=1) & (np.abs(vectors) > _STILL).any(axis=1)
     canvas.draw(
         "space/velocity",
         frame,

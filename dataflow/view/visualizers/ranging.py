@@ -41,7 +41,7 @@ def radar_scan(canvas: Canvas, message: RadarScan) -> None:
         message.frame,
         rr.Arrows3D(
             origins=points,
-            vectors=away * np.nan_to_num(speeds)[:, None],
+            vectors=away * np.clip(np.nan_to_num(speeds), -1e3, 1e3)[:, None],
             colors=paint,
             radii=rr.Radius.ui_points(1.0),
         ),

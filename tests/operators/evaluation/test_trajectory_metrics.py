@@ -76,7 +76,9 @@ def test_scale_is_found_only_by_sim3() -> None:
     path = circle()
     half = path.copy()
     half[:, :3, 3] *= 0.5
-    assert score(half, path)["ate_rmse_m"] == pytest.approx(1.0, rel=0.05)
+    unscaled = score(half, path)
+    assert unscaled["ate_rmse_m"] == pytest.approx(1.0, rel=0.05)
+    assert unscaled["rpe_1m_rmse_m"] == pytest.approx(0.5, rel=0.05)  # a metre of the true path, not of the estimate
     found = score(half, path, alignment="sim3")
     assert found["ate_rmse_m"] == pytest.approx(0, abs=1e-6)
     assert found["ate_scale"] == pytest.approx(2.0)

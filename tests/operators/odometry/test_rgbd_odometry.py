@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -30,7 +31,7 @@ CRATE = np.array([[0.3, 0.4, 1.4], [0.9, 1.2, 2.0]])
 Frame = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
 
-# -- a room to look at ----------------------------------------------------------------------------------------------
+# -- a room to look at ---------------------------------------------------------------------------------------
 
 
 def box_texture() -> NDArray[np.uint8]:
@@ -49,23 +50,29 @@ TEXTURE = box_texture()
 
 def render(T_world_camera: NDArray[np.float64], K: NDArray[np.float64]) -> Frame:
     """Grey image and depth (z) of the room and the crate in it, by casting a ray through every pixel."""
-    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], axis=-1)
-    d = rays @ T_world_camera[:3, :3].T
-    d = np.where(np.abs(d) < 1e-9, 1e-9, d)
-    o = T_world_camera[:3, 3]
-    walls = np.maximum((ROOM[0] - o) / d, (ROOM[1] - o) / d)
-    near = np.minimum((CRATE[0] - o) / d, (CRATE[1] - o) / d)
-    far = np.maximum((CRATE[0] - o) / d, (CRATE[1] - o) / d)
-    on_crate = (near.max(-1) < far.min(-1)) & (near.max(-1) > 0)
-    z = np.where(on_crate, near.max(-1), walls.min(-1))
-    face = np.where(on_crate, near.argmax(-1), walls.argmin(-1))
-    p = o + d * z[..., None]
-    across = np.where(face == 0, p[..., 1], p[..., 0])
-    along = np.where(face == 2, p[..., 1], p[..., 2])
-    side = face + np.where(on_crate, 7, 3 * (np.take_along_axis(d, face[..., None], -1)[..., 0] > 0))
-    map_x = ((across * 200 + 137 * side) % 1023).astype(np.float32)
-    map_y = ((along * 200 + 331 * side) % 1023).astype(np.float32)
+    u, v = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
+    x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
+    R, o = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    d = [
+        (R[k, 0] * x + R[k, 1] * y + R[k, 2] + 1e-9).astype(np.float32) for k in range(3)
+    ]  # z = 1 in the camera
+    walls = [np.maximum((ROOM[0][k] - o[k]) / d[k], (ROOM[1][k] - o[k]) / d[k]) for k in range(3)]
+    near = [np.minimum((CRATE[0][k] - o[k]) / d[k], (CRATE[1][k] - o[k]) / d[k]) for k in range(3)]
+    far = [np.maximum((CRATE[0][k] - o[k]) / d[k], (CRATE[1][k] - o[k]) / d[k]) for k in range(3)]
+    entry, wall = np.maximum.reduce(near), np.minimum.reduce(walls)
+    on_crate = (entry < np.minimum.reduce(far)) & (entry > 0)
+    z = np.where(on_crate, entry, wall)
+    faces, sides = (
+        [],
+        [],
+    )  # the axis that each pixel's face is normal to, and a number of its own for each face
+    for k in range(3):
+        faces.append(np.where(on_crate, near[k] == entry, walls[k] == wall))
+        sides.append(np.where(on_crate, 7 + k, k + 3 * (d[k] > 0)))
+    px, py, pz = (o[k] + d[k] * z for k in range(3))
+    side = np.select(faces, sides)
+    map_x = ((np.where(faces[0], py, px) * 200 + 137 * side) % 1023).astype(np.float32)
+    map_y = ((np.where(faces[2] & ~faces[0], py, pz) * 200 + 331 * side) % 1023).astype(np.float32)
     return cv2.remap(TEXTURE, map_x, map_y, cv2.INTER_LINEAR), z.astype(np.float32)
 
 
@@ -73,14 +80,28 @@ def handheld(count: int, speed: float = 1.0) -> list[NDArray[np.float64]]:
     """T_world_camera of a camera that sways and turns; the first is the identity."""
     s = speed * np.arange(count) / 30.0
     twists = np.column_stack(
-        [0.3 * np.sin(s), 0.1 * np.sin(1.7 * s), 0.2 * (1 - np.cos(s)), 0.1 * np.sin(1.3 * s), 0.4 * s, 0.1 * s]
+        [
+            0.3 * np.sin(s),
+            0.1 * np.sin(1.7 * s),
+            0.2 * (1 - np.cos(s)),
+            0.1 * np.sin(1.3 * s),
+            0.4 * s,
+            0.1 * s,
+        ]
     )
     return [se3.exp(x) for x in twists]
 
 
+Sequence = tuple[list[Frame], list[NDArray[np.float64]]]
+
+
+def sequence(count: int, speed: float = 1.0, offset: float = 0.0) -> Sequence:
+    """Frames with noisy, quantised depth; the colour camera sits `offset` metres to the right."""
+    return rendered(count, speed, offset)
+
+
 @cache
-def sequence(count: int, speed: float = 1.0, offset: float = 0.0) -> tuple[list[Frame], list[NDArray[np.float64]]]:
-    """Frames with noisy, quantised depth; the colour camera sits `offset` metres to the right of the depth camera."""
+def rendered(count: int, speed: float, offset: float) -> Sequence:
     poses = handheld(count, speed)
     T_depth_color = camera(offset).T_depth_color
     rng = np.random.default_rng(7)
@@ -131,7 +152,7 @@ def without_depth(frame: Frame) -> Frame:
     return frame[0], np.full_like(frame[1], np.nan)
 
 
-# -- accuracy -------------------------------------------------------------------------------------------------------
+# -- accuracy ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -182,7 +203,8 @@ def test_pure_rotation_is_followed() -> None:
 def test_exposure_changes_are_followed() -> None:
     frames, poses = sequence(40)
     flicker = [
-        (cv2.convertScaleAbs(gray, alpha=0.6 + 0.4 * (i % 5 != 0)), depth) for i, (gray, depth) in enumerate(frames)
+        (cv2.convertScaleAbs(gray, alpha=0.6 + 0.4 * (i % 5 != 0)), depth)
+        for i, (gray, depth) in enumerate(frames)
     ]
     results = follow(flicker)
     assert all(r.status is Status.TRACKED for r in results[1:])
@@ -207,7 +229,7 @@ def test_covariance_covers_the_error_and_grows_with_the_way() -> None:
     assert np.trace(results[-1].covariance) > np.trace(results[1].covariance)
 
 
-# -- failures -------------------------------------------------------------------------------------------------------
+# -- failures ------------------------------------------------------------------------------------------------
 
 
 def test_black_images_fall_back_to_depth() -> None:
@@ -233,7 +255,7 @@ def test_blindness_is_bridged_and_recovered_from() -> None:
     results = follow(frames)
     assert {r.status for r in results[10:20]} == {Status.PREDICTED}
     sigmas = [np.sqrt(np.trace(r.covariance[:3, :3])) for r in results[9:20]]
-    assert all(b > a for a, b in zip(sigmas, sigmas[1:], strict=False))
+    assert all(b > a for a, b in pairwise(sigmas))
     assert sigmas[-1] > 3 * sigmas[0]
     assert results[20].status is Status.RELOCALISED
     assert errors(results[20:], poses[20:])[0] < 0.03
@@ -292,9 +314,19 @@ def test_depth_out_of_range_is_not_used() -> None:
     ("image", "depth", "stamp", "message"),
     [
         (np.zeros((240, 320, 4), np.uint8), np.ones((240, 320), np.float32), 5, "image must be"),  # RGBA
-        (np.zeros((240, 320), np.float32), np.ones((240, 320), np.float32), 5, "image must be"),  # float image
+        (
+            np.zeros((240, 320), np.float32),
+            np.ones((240, 320), np.float32),
+            5,
+            "image must be",
+        ),  # float image
         (np.zeros((240, 320), np.uint8), np.ones((240, 320), np.uint16), 5, "depth must be"),  # raw depth
-        (np.zeros((240, 320), np.uint8), np.ones((240, 320, 1), np.float32), 5, "depth must be"),  # extra axis
+        (
+            np.zeros((240, 320), np.uint8),
+            np.ones((240, 320, 1), np.float32),
+            5,
+            "depth must be",
+        ),  # extra axis
         (np.zeros((120, 160), np.uint8), np.ones((240, 320), np.float32), 5, "sizes changed"),  # other size
         (np.zeros((240, 320), np.uint8), np.ones((240, 320), np.float32), 0, "does not follow"),  # same stamp
     ],
@@ -319,21 +351,22 @@ def test_wrong_camera_or_configuration_is_refused() -> None:
         RgbdOdometryConfig(near=2.0, far=1.0)
 
 
-# -- determinism and state ------------------------------------------------------------------------------------------
+# -- determinism and state -----------------------------------------------------------------------------------
 
 
 def test_same_frames_give_the_same_bytes_after_other_random_draws() -> None:
     frames, _ = sequence(25, 3.0)
     first = digest(follow(frames))
     cv2.setRNGSeed(12345)
-    np.random.seed(5)  # noqa: NPY002
+    np.random.seed(5)
     assert digest(follow(frames)) == first
 
 
 def test_same_frames_give_the_same_bytes_in_another_process(repository: Path) -> None:
     script = (
         "import importlib.util as u;"
-        f"s=u.spec_from_file_location('rendered', {__file__!r});m=u.module_from_spec(s);s.loader.exec_module(m);"
+        f"s=u.spec_from_file_location('rendered', {__file__!r});"
+        "m=u.module_from_spec(s);s.loader.exec_module(m);"
         "print(m.digest(m.follow(m.sequence(25, 3.0)[0][:12])))"
     )
     other = subprocess.run(
@@ -359,7 +392,7 @@ def test_results_are_not_views_of_the_state() -> None:
     assert np.abs(odometry.track(*frames[1], 33_000_000).T_world_camera).max() < 1.1
 
 
-# -- the operator ---------------------------------------------------------------------------------------------------
+# -- the operator --------------------------------------------------------------------------------------------
 
 
 def info(frame: str, K: NDArray[np.float64]) -> CameraInfo:
@@ -395,7 +428,7 @@ def test_operator_refuses_an_image_that_its_calibration_does_not_describe() -> N
         )
 
 
-# -- recorded data --------------------------------------------------------------------------------------------------
+# -- recorded data -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.data

@@ -61,6 +61,8 @@ def test_7scenes_frames_are_read_as_they_were_written(tmp_path: Path) -> None:
     assert isinstance(depth, DepthImage)
     np.testing.assert_array_equal(image.data, COLOR)
     assert depth.data[0, :5].tolist() == [0, 0, 6, 0, 1.5]  # no return, invalid, the farthest, beyond, ordinary
+    unlimited = read(tmp_path, max_depth=100)[1][1]["depth"]
+    assert unlimited.data[0, :4].tolist() == [0, 0, 6, np.float32(6.001)]  # type: ignore[attr-defined]
     statics = source.static_outputs()
     depth_info, image_info, extrinsics = (statics[p] for p in ("depth_info", "image_info", "extrinsics"))
     assert isinstance(depth_info, CameraInfo)

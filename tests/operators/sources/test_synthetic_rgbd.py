@@ -96,14 +96,16 @@ def test_boxes_hold_the_projections_of_the_balls() -> None:
             assert isinstance(ball, Ball)
             x, y, z = T[:3, :3] @ ball.center + T[:3, 3]
             radius = info.fx * ball.radius / z
-            left, top, right, bottom = found.boxes[row]
-            center = info.fx * x / z + info.cx, info.fy * y / z + info.cy
-            assert left <= center[0] + radius
-            assert right >= center[0] - radius
-            assert right - left <= 2.4 * radius + 2  # a ball off the axis is drawn as an ellipse
-            assert bottom - top <= 2.4 * radius + 2
+            assert found.pixel_counts is not None
+            if found.pixel_counts[row] < 0.99 * np.pi * radius**2:
+                continue  # partly hidden
+            # Pixel centres are whole numbers, box edges lie half a pixel out; off the axis a ball is drawn larger.
+            center = np.array([info.fx * x / z + info.cx, info.fy * y / z + info.cy]) + 0.5
+            low, high = found.boxes[row, :2], found.boxes[row, 2:]
+            assert ((center - 1.15 * radius - 1 <= low) & (low <= center - radius + 1)).all()
+            assert ((center + radius - 1 <= high) & (high <= center + 1.15 * radius + 1)).all()
             seen += 1
-    assert seen >= 6
+    assert seen >= 3
 
 
 def test_the_path_is_smooth_and_closes() -> None:

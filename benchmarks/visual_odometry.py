@@ -1,0 +1,218 @@
+"""Accuracy and time of RGB-D odometry on a 7-Scenes folder, beside two peers in the same process, one thread.
+
+Peers: frame-to-frame ORB + RANSAC PnP (OpenCV), and depth-only generalised ICP to a local map (small_gicp).
+Decoding is excluded. The methods take turns frame by frame, so load on the machine falls on all alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPOSITORY))
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+import small_gicp  # noqa: E402
+from evo.core import metrics  # noqa: E402
+from evo.core.trajectory import PosePath3D  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+
+from dataflow.messages.geometry import invert  # noqa: E402
+from operators.odometry import se3  # noqa: E402
+from operators.odometry.camera import RgbdCamera  # noqa: E402
+from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, TrackResult  # noqa: E402
+
+Matrix = NDArray[np.float64]
+Track = Callable[[NDArray[np.uint8], NDArray[np.float32], int], Matrix]
+
+
+class OrbFrameToFrame:
+    """ORB matched with the last frame, RANSAC PnP on its depth: the usual first thing to try."""
+
+    def __init__(self, camera: RgbdCamera) -> None:
+        self.camera, self.T = camera, np.eye(4)
+        self.orb = cv2.ORB.create(1000)
+        self.matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
+        self.last: Any = None
+
+    def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> Matrix:
+        keypoints, descriptors = self.orb.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+        pixels = np.array([k.pt for k in keypoints]).reshape(-1, 2)
+        points, known = self.camera.depth_at(pixels, depth, 0.3, 6.0)
+        if self.last is not None:
+            last_points, last_known, last_descriptors = self.last
+            pairs = [(m.queryIdx, m.trainIdx) for m in self.matcher.match(last_descriptors, descriptors)]
+            a, b = np.array([p for p in pairs if last_known[p[0]]]).T
+            ok, r, t, _ = cv2.solvePnPRansac(
+                last_points[a],
+                pixels[b],
+                self.camera.K_color,
+                None,
+                iterationsCount=200,
+                reprojectionError=3.0,
+            )
+            if ok:
+                T = np.eye(4)
+                T[:3, :3], T[:3, 3] = cv2.Rodrigues(r)[0], t.ravel()
+                self.T = se3.orthonormalised(self.T @ invert(T))
+        self.last = points, known, descriptors
+        return self.T
+
+
+class GicpLocalMap:
+    """Generalised ICP of the thinned depth cloud to a map of the last keyframes; constant velocity start."""
+
+    def __init__(self, camera: RgbdCamera) -> None:
+        K = camera.K_depth
+        self.K, self.T, self.step = K, np.eye(4), np.eye(4)
+        self.keyframes: list[tuple[Matrix, NDArray[np.float64]]] = []
+        self.target: Any = None
+
+    def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> Matrix:
+        z = depth[::8, ::8].astype(np.float64)
+        v, u = np.nonzero((z > 0.3) & (z < 6.0))
+        z = z[v, u]
+        x, y = (8 * u - self.K[0, 2]) / self.K[0, 0], (8 * v - self.K[1, 2]) / self.K[1, 1]
+        points = np.column_stack([x * z, y * z, z])
+        cloud, _ = small_gicp.preprocess_points(points, downsampling_resolution=0.04, num_threads=1)
+        if self.target is not None:
+            fit = small_gicp.align(
+                *self.target[:1], cloud, self.target[1], init_T_target_source=self.T @ self.step,
+                max_correspondence_distance=0.1, num_threads=1, max_iterations=20,
+            )  # fmt: skip
+            T = se3.orthonormalised(np.asarray(fit.T_target_source))
+            self.step, self.T = invert(self.T) @ T, T
+        if not self.keyframes or self._moved():
+            self.keyframes = [*self.keyframes, (self.T, points)][-8:]
+            local = np.concatenate([p @ T[:3, :3].T + T[:3, 3] for T, p in self.keyframes])
+            self.target = small_gicp.preprocess_points(local, downsampling_resolution=0.04, num_threads=1)
+        return self.T
+
+    def _moved(self) -> bool:
+        x = se3.log(invert(self.keyframes[-1][0]) @ self.T)
+        return bool(np.linalg.norm(x[:3]) > 0.1 or np.linalg.norm(x[3:]) > 0.1)
+
+
+def read(folder: Path) -> tuple[list[tuple[NDArray[np.uint8], NDArray[np.float32]]], list[Matrix]]:
+    frames, truth = [], []
+    for file in sorted(folder.glob("*.color.jpg")):
+        stem = file.name.split(".")[0]
+        raw = cv2.imread(str(folder / f"{stem}.depth.png"), cv2.IMREAD_UNCHANGED)
+        depth = np.where(raw == 65535, 0, raw).astype(np.float32) / np.float32(1000)
+        frames.append((np.asarray(cv2.imread(str(file), cv2.IMREAD_COLOR_RGB), np.uint8), depth))
+        truth.append(se3.orthonormalised(np.loadtxt(folder / f"{stem}.pose.txt")))
+    if not frames:
+        raise SystemExit(f"no frame-NNNNNN.color.jpg in {folder}: give a 7-Scenes folder with --data")
+    return frames, truth
+
+
+def score(estimate: list[Matrix], truth: list[Matrix], delta: int) -> dict[str, float]:
+    """ATE RMSE after SE(3) alignment, and RPE RMSE over `delta` frames."""
+    reference, path = PosePath3D(poses_se3=truth), PosePath3D(poses_se3=estimate)
+    out = {}
+    for name, relation in (
+        ("rpe_cm", metrics.PoseRelation.translation_part),
+        ("rpe_deg", metrics.PoseRelation.rotation_angle_deg),
+    ):
+        rpe = metrics.RPE(relation, delta, metrics.Unit.frames, all_pairs=True)
+        rpe.process_data((reference, path))
+        out[name] = rpe.get_statistic(metrics.StatisticsType.rmse) * (100 if name == "rpe_cm" else 1)
+    path.align(reference)
+    ape = metrics.APE(metrics.PoseRelation.translation_part)
+    ape.process_data((reference, path))
+    return {"ate_cm": 100 * ape.get_statistic(metrics.StatisticsType.rmse), **out}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "rgbd_7scenes"
+    parser.add_argument(
+        "--data", type=Path, default=data, help="a 7-Scenes folder (default: the project's data)"
+    )
+    parser.add_argument("--stride", type=int, default=1, help="use every stride-th frame: faster motion")
+    parser.add_argument(
+        "--color-focal", type=float, default=525.0, help="focal length of the colour camera, px"
+    )
+    parser.add_argument("--delta", type=int, default=30, help="frames over which RPE is taken")
+    parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+
+    frames, truth = read(arguments.data)
+    frames, truth = frames[:: arguments.stride], truth[:: arguments.stride]
+    K_depth = np.loadtxt(arguments.data / "camera-intrinsics.txt")
+    K_color = K_depth.copy()
+    K_color[0, 0] = K_color[1, 1] = arguments.color_focal
+    camera = RgbdCamera(K_color, K_depth)
+
+    results: dict[str, list[TrackResult]] = {"full": [], "features only": []}
+
+    def ours(name: str, config: RgbdOdometryConfig) -> Track:
+        odometry = RgbdOdometry(camera, config)
+
+        def track(image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> Matrix:
+            results[name].append(odometry.track(image, depth, stamp))
+            return results[name][-1].T_world_camera
+
+        return track
+
+    methods: dict[str, Track] = {
+        "full": ours("full", RgbdOdometryConfig()),
+        "features only": ours("features only", RgbdOdometryConfig(refine=False)),
+        "ORB frame to frame": OrbFrameToFrame(camera).track,
+        "small_gicp depth only": GicpLocalMap(camera).track,
+    }
+    poses: dict[str, list[Matrix]] = {name: [] for name in methods}
+    times: dict[str, list[float]] = {name: [] for name in methods}
+    period = arguments.stride * 1_000_000_000 // 30
+    for i, (image, depth) in enumerate(frames):
+        for name, track in methods.items():
+            start = time.perf_counter()
+            T = track(image, depth, i * period)
+            times[name].append(1e3 * (time.perf_counter() - start))
+            poses[name].append(T)
+
+    base = float(np.median(times["full"]))
+    table = []
+    for name in methods:
+        median = float(np.median(times[name]))
+        row: dict[str, Any] = {
+            "method": name,
+            **score(poses[name], truth, min(arguments.delta, len(frames) - 1)),
+        }
+        row |= {
+            "median_ms": median,
+            "p95_ms": float(np.percentile(times[name], 95)),
+            "time_ratio": median / base,
+        }
+        if name in results:
+            row["statuses"] = dict(Counter(str(r.status) for r in results[name]))
+            row["keyframes"] = sum(r.keyframe for r in results[name])
+        table.append(row)
+    if arguments.json:
+        print(json.dumps({"frames": len(frames), "stride": arguments.stride, "methods": table}, indent=2))
+        return
+    print(f"{len(frames)} frames, stride {arguments.stride}; RPE over {arguments.delta} frames; one thread\n")
+    print("| method | ATE cm | RPE cm | RPE deg | median ms | p95 ms | time / full |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for row in table:
+        print(
+            f"| {row['method']} | {row['ate_cm']:.2f} | {row['rpe_cm']:.2f} | {row['rpe_deg']:.2f} "
+            f"| {row['median_ms']:.1f} | {row['p95_ms']:.1f} | {row['time_ratio']:.2f} |"
+        )
+
+
+if __name__ == "__main__":
+    main()

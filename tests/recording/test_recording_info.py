@@ -1,0 +1,61 @@
+"""describe tells what a recording holds; machine facts are complete and stable."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+from rich.console import Console
+
+from dataflow.messages import Pose
+from dataflow.recording import Recording, RecordingWriter, describe, machine_facts
+
+
+def test_a_description_counts_rates_sizes_firings_and_metadata(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={"graph": {"text": "line one\nline two"}}) as writer:
+        writer.add_stream("robot/odometry", Pose, extra={"operator": "odometry"})
+        writer.add_stream("robot/[mount]", Pose, static=True)
+        writer.write("robot/[mount]", pose(1), seq=0)
+        for seq in range(21):
+            writer.write("robot/odometry", pose(10**18 + seq * 50_000_000), seq=seq)
+        writer.write_firings("odometry", 10**18, b"1")
+        writer.write_event("gap", 10**18, {})
+    with Recording(path) as recording:
+        found = describe(recording)
+    mount, odometry = found.streams
+    assert (odometry.count, odometry.rate, odometry.type) == (21, 20.0, "Pose")
+    assert mount.static
+    assert (found.start, found.duration) == (10**18, 10**9)  # static streams do not stretch it
+    assert (found.messages, found.firings, found.events, found.torn) == (22, {"odometry": 1}, {"gap": 1}, False)
+    assert found.bytes == path.stat().st_size
+    assert json.loads(json.dumps(found.as_json()))["streams"][1]["name"] == "robot/odometry"
+    console = Console(width=160, file=io.StringIO(), record=True)
+    console.print(found.render())
+    text = console.export_text()
+    for expected in ("20.00 Hz", "foxglove.PoseInFrame (protobuf)", "static", "line one …", "robot/[mount]", "1s"):
+        assert expected in text
+
+
+def test_a_torn_recording_says_so(tmp_path: Path, record: Callable[..., Path], pose: Callable[..., Pose]) -> None:
+    path = record([("a", pose(i)) for i in range(1, 9)], chunk_bytes=1)
+    path.write_bytes(path.read_bytes()[:-400])
+    with Recording(path) as recording:
+        found = describe(recording)
+    assert found.torn
+    console = Console(width=160, file=io.StringIO(), record=True)
+    console.print(found.render())
+    assert "its writer died" in console.export_text()
+
+
+def test_machine_facts_are_text_sorted_and_repeatable() -> None:
+    facts = machine_facts()
+    assert facts == machine_facts()
+    assert facts["machine"]["python"].count(".") == 2
+    assert int(facts["machine"]["cores"]) >= 1
+    assert {"numpy", "mcap", "eclipse-zenoh"} <= facts["packages"].keys()
+    for mapping in facts.values():
+        assert list(mapping) == sorted(mapping)
+        assert all(isinstance(value, str) for value in mapping.values())

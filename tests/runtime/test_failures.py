@@ -1,0 +1,192 @@
+"""What goes wrong ends the run in bounded time, names the first cause, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import psutil
+import pytest
+from tests_runtime_graphs import chain
+
+from dataflow.graph import Graph
+from dataflow.recording import Recording
+from dataflow.runtime.plan import RunPlan
+from dataflow.runtime.supervisor import RunFailed, Supervisor
+
+HERE = Path(__file__).resolve().parent
+
+
+def broken(how: str) -> Graph:
+    return chain(
+        f"bad: {{use: runtime_operators:Broken, params: {{how: {how}}}, inputs: {{x: left/fast}}}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: bad/y}}",
+    )
+
+
+def fails(graph: Graph, **options: object) -> RunFailed:
+    with pytest.raises(RunFailed) as caught:
+        Supervisor(RunPlan(graph, **options)).run()  # type: ignore[arg-type]
+    return caught.value
+
+
+@pytest.mark.parametrize("placement", ["one_host", "host_each"])
+def test_an_operator_that_raises_is_named_with_its_traceback(placement: str) -> None:
+    failure = fails(broken("raise"), placement=placement)
+
+    assert failure.operator == "bad"
+    assert "operator 'bad' failed in fire at stamp 1200000000: RuntimeError: the gripper is on fire" in str(failure)
+    assert "runtime_operators.py" in failure.details
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("stamp", "bad.y emitted stamp 1199999999; it must lie at or after the firing's 1200000000"),
+        ("type", "Broken returned a str; return a message, a mapping or None"),
+        ("mutate", "bad changed the memory of its input 'x' (FeatureVector at stamp 1200000000)"),
+    ],
+)
+def test_a_broken_contract_is_named(how: str, words: str) -> None:
+    failure = fails(broken(how), placement="one_host", paranoid=True)
+
+    assert failure.operator == "bad"
+    assert words in str(failure)
+
+
+def test_a_host_that_dies_is_named_with_the_signal_and_how_far_it_was() -> None:
+    failure = fails(broken("die"), placement="host_each")
+
+    assert "host 'bad' was killed by SIGKILL while running" in str(failure)
+
+
+def test_an_operator_that_hangs_ends_the_run_within_the_stall_timeout() -> None:
+    failure = fails(broken("hang"), placement="host_each", stall_timeout=1.0)
+
+    assert "no progress for 1 s; still busy: host 'bad'" in str(failure)
+
+
+def test_a_failure_leaves_a_recording_that_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "failed.mcap"
+
+    fails(broken("raise"), record=path)
+
+    with Recording(path) as recording:
+        assert recording.metadata["dataflow:outcome"]["outcome"].startswith("failed: operator 'bad'")
+        assert recording.streams["test/left/fast"].count > 0
+        assert not recording.torn
+
+
+def test_what_operators_print_reaches_the_user() -> None:
+    said: list[tuple[str, str]] = []
+
+    Supervisor(RunPlan(broken("chatter")), on_output=lambda label, line: said.append((label, line))).run()
+
+    assert ("bad", "still here") in said
+
+
+class Running:
+    """`dataflow run` or the like in a process of its own."""
+
+    def __init__(self, *arguments: str, cwd: Path) -> None:
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "dataflow.cli.main", *arguments],
+            cwd=cwd,
+            env={**os.environ, "PYTHONPATH": str(HERE), "XDG_RUNTIME_DIR": str(cwd)},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        self.folder = cwd
+        self.family: list[psutil.Process] = []
+
+    def until_running(self, hosts: int) -> None:
+        """Waits until all host processes exist and sources are released."""
+        deadline = time.monotonic() + 30
+        me = psutil.Process(self.process.pid)
+        while time.monotonic() < deadline:
+            self.family = me.children(recursive=True)
+            if len(self.family) >= hosts + 1 and any((self.folder / "dataflow").glob("*.json")):
+                return
+            time.sleep(0.05)
+        raise AssertionError("the graph did not start")
+
+    def end(self, timeout: float = 30) -> tuple[int, str, str]:
+        out, err = self.process.communicate(timeout=timeout)
+        return self.process.returncode, out, err
+
+    def survivors(self, within: float = 20.0) -> list[psutil.Process]:
+        _, alive = psutil.wait_procs(self.family, timeout=within)
+        return [p for p in alive if p.status() != psutil.STATUS_ZOMBIE]
+
+
+GRAPH = """
+graph: long
+namespace: test
+operators:
+  left: {use: runtime_operators:Counter, params: {count: 1000000}}
+  smooth: {use: runtime_operators:Smooth, inputs: {x: left/fast}, params: {sleep: 0.002}}
+  sum: {use: runtime_operators:Sum, inputs: {x: smooth/mean}}
+"""
+
+
+@pytest.fixture()
+def long_run(tmp_path: Path) -> Running:
+    (tmp_path / "long.yaml").write_text(GRAPH)
+    running = Running("run", "long.yaml", "--record", "run.mcap", "-q", cwd=tmp_path)
+    running.until_running(hosts=4)
+    return running
+
+
+def test_ctrl_c_drains_and_completes_the_recording(long_run: Running, tmp_path: Path) -> None:
+    long_run.process.send_signal(signal.SIGINT)
+    code, out, err = long_run.end()
+
+    assert code == 130, err
+    assert "interrupted" in out
+    assert not long_run.survivors()
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert not recording.torn
+        assert recording.metadata["dataflow:outcome"]["outcome"] == "interrupted"
+        counts = {s: i.count for s, i in recording.streams.items()}
+        assert counts["test/left/fast"] > 0
+
+
+def test_killing_the_supervisor_leaves_no_process_and_a_readable_recording(long_run: Running, tmp_path: Path) -> None:
+    time.sleep(0.5)
+    long_run.process.kill()
+    long_run.end()
+
+    assert not long_run.survivors()
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert recording.streams["test/left/fast"].count > 0
+
+
+@pytest.mark.parametrize("victim", ["recorder", "operator"])
+def test_killing_a_host_ends_the_run_and_names_it(long_run: Running, tmp_path: Path, victim: str) -> None:
+    time.sleep(1.2)
+    recorder = [p for p in long_run.family if any(f.path.endswith("run.mcap") for f in p.open_files())]
+    others = [p for p in long_run.family if p.children() == [] and p not in recorder]
+    (recorder if victim == "recorder" else others)[0].kill()
+    code, _, err = long_run.end()
+
+    assert code == 1
+    assert "was killed by SIGKILL" in err
+    assert not long_run.survivors()
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert recording.torn == (victim == "recorder")
+        assert recording.streams["test/left/fast"].count > 0
+
+
+def test_nothing_is_left_in_shared_memory(tmp_path: Path) -> None:
+    before = set(os.listdir("/dev/shm")) if Path("/dev/shm").is_dir() else set()
+
+    Supervisor(RunPlan(chain("sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}"), placement="host_each")).run()
+
+    assert {n for n in (os.listdir("/dev/shm") if before else []) if "dataflow" in n or "zenoh" in n} <= before
+    assert threading.active_count() < 20

@@ -1,0 +1,227 @@
+"""The bus between processes: order, no loss, start barrier, statics, presence, and nothing reachable from outside."""
+
+from __future__ import annotations
+
+import gc
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dataflow.messages import DepthImage
+from dataflow.transport import Bus, BusError, Envelope, Kind, NetworkConfig, NetworkError, decode, encode
+from dataflow.transport.network import is_local, reserve_endpoints
+
+DEPTH = "robot1/camera/depth"
+
+
+def depth_image(stamp: int, side: int = 4) -> DepthImage:
+    return DepthImage(stamp=stamp, frame="camera", data=np.full((side, side), stamp, np.float32))
+
+
+def test_messages_and_frontiers_of_another_process_arrive_in_order_and_complete(
+    peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str
+) -> None:
+    bus = open_bus(listen=(endpoint,))
+    consumer = peer("consume", endpoint)
+    publisher = bus.publisher(DEPTH)
+    probe_until(publisher, consumer)
+    expected = []
+    for i in range(5000):
+        publisher.put(Envelope.of(depth_image(2 * i), DEPTH, i))
+        publisher.put(Envelope(Kind.FRONTIER, DEPTH, 0, i + 1, 2 * i + 1))
+        expected += [["MESSAGE", i, 2 * i], ["FRONTIER", i + 1, 2 * i + 1]]
+    publisher.put(Envelope(Kind.END, DEPTH, 0, 5000, 9998, reason="done"))
+    ended = consumer.expect("ended")
+    assert ended["seen"] == [*expected, ["END", 5000, 9998]]
+    assert ended["damaged"] == 0
+    assert consumer.leave() == 0
+
+
+def probe_until(publisher: Any, consumer: Any) -> None:
+    """The start barrier, as a supervisor runs it: numbered probes until the consumer has reported one."""
+    for _ in range(1000):
+        publisher.probe()
+        try:
+            assert consumer.expect("probed", timeout=0.02)["number"] >= 1
+        except Exception as error:
+            if isinstance(error, AssertionError):
+                raise
+            continue
+        return
+    raise AssertionError("no probe arrived")
+
+
+def test_a_late_joiner_gets_the_static_streams_it_asks_for(
+    peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str, eventually: Callable[..., None]
+) -> None:
+    producer = peer("live", endpoint)
+    producer.expect("up")
+    bus = open_bus(connect=(endpoint,))
+    eventually(lambda: "robot1/camera/info" in bus.query_static("robot1", timeout=0.5))
+    answered = bus.query_static("robot1", "robot1/*/info")
+    message = decode(answered["robot1/camera/info"]).message
+    assert message is not None
+    assert message == depth_image(3)
+    assert bus.query_static("robot1", "robot1/*/depth") == {}
+    assert bus.query_static("robot2") == {}
+
+
+def test_the_loss_of_a_killed_process_is_seen(
+    peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str, eventually: Callable[..., None]
+) -> None:
+    bus = open_bus(connect=(endpoint,))
+    changes: list[tuple[str, bool]] = []
+    bus.watch_liveliness("robot1", lambda name, alive: changes.append((name, alive)))
+    child = peer("live", endpoint)
+    child.expect("up")
+    eventually(lambda: changes == [("camera", True)])
+    child.kill()
+    eventually(lambda: changes == [("camera", True), ("camera", False)], timeout=5.0)
+
+
+def test_a_declaration_lasts_without_its_token_being_kept(
+    pair: tuple[Bus, Bus], eventually: Callable[..., None]
+) -> None:
+    first, second = pair
+    changes: list[tuple[str, bool]] = []
+    second.watch_liveliness("robot1", lambda name, alive: changes.append((name, alive)))
+    first.alive("robot1", "camera")
+    with first.alive("robot1", "lidar"):
+        eventually(lambda: sorted(changes) == [("camera", True), ("lidar", True)])
+    gc.collect()
+    eventually(lambda: changes[-1] == ("lidar", False))
+    assert ("camera", False) not in changes
+
+
+def test_a_process_that_comes_back_is_connected_again(
+    peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str, eventually: Callable[..., None]
+) -> None:
+    bus = open_bus(connect=(endpoint,))
+    changes: list[bool] = []
+    bus.watch_liveliness("robot1", lambda _, alive: changes.append(alive))
+    for _ in range(2):
+        child = peer("live", endpoint)
+        child.expect("up")
+        eventually(lambda: changes[-1:] == [True])
+        child.kill()
+        eventually(lambda: changes[-1:] == [False])
+    assert changes == [True, False, True, False]
+
+
+def test_wildcards_do_not_match_the_runtimes_own_keys(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
+    first, second = pair
+    everything: list[str] = []
+    runtime: list[str] = []
+    for expression in ("**", "robot1/**", "robot1/*/*/*"):
+        second.subscribe_keys(expression, lambda key, _: everything.append(key))
+    second.subscribe_keys("robot1/@/**", lambda key, _: runtime.append(key))
+    keys = ("robot1/@/firings/camera", "robot1/camera/depth")
+    publishers = {key: first.publisher(key) for key in keys}
+
+    def both_arrive() -> bool:
+        for key in keys:
+            publishers[key].put_bytes(b"x")
+        return len(runtime) > 2 and len(everything) > 4
+
+    eventually(both_arrive)
+    assert set(runtime) == {"robot1/@/firings/camera"}
+    assert set(everything) == {"robot1/camera/depth"}
+
+
+def test_a_later_static_message_replaces_the_earlier(pair: tuple[Bus, Bus], eventually: Callable[..., None]) -> None:
+    first, second = pair
+    for stamp in (1, 2):
+        first.declare_static("a/b/camera/info", encode(Envelope.of(depth_image(stamp), "a/b/camera/info", 0)))
+    eventually(lambda: bool(second.query_static("a/b", timeout=0.5)))
+    assert decode(second.query_static("a/b")["a/b/camera/info"]).stamp == 2
+
+
+def test_payloads_stay_valid_after_the_bus_is_closed(endpoint: str, eventually: Callable[..., None]) -> None:
+    inbox: deque[Any] = deque()
+    with Bus(NetworkConfig(listen=(endpoint,))) as first, Bus(NetworkConfig(connect=(endpoint,))) as second:
+        second.subscribe(DEPTH, inbox.append)
+        publisher = first.publisher(DEPTH)
+
+        def arrives() -> bool:
+            publisher.put(Envelope.of(depth_image(1), DEPTH, 0))
+            return bool(inbox)
+
+        eventually(arrives)
+    assert decode(inbox[0]).message == depth_image(1)
+
+
+def test_closing_ends_threads_and_further_use_is_refused(endpoint: str) -> None:
+    before = threading.active_count()
+    bus = Bus(NetworkConfig(listen=(endpoint,)))
+    publisher = bus.publisher(DEPTH)
+    bus.close()
+    bus.close()
+    assert threading.active_count() == before
+    with pytest.raises(BusError, match="robot1/camera/depth"):
+        publisher.put(Envelope(Kind.PROBE, DEPTH, 0, 0, 0))
+
+
+def test_a_subscription_that_was_closed_receives_nothing_more(
+    pair: tuple[Bus, Bus], eventually: Callable[..., None]
+) -> None:
+    first, second = pair
+    ended: deque[Any] = deque()
+    lasting: deque[Any] = deque()
+    token = second.subscribe(DEPTH, ended.append)
+    second.subscribe(DEPTH, lasting.append)
+    publisher = first.publisher(DEPTH)
+    eventually(lambda: bool(publisher.probe()) and bool(ended))
+    token.close()
+    token.close()
+    last = publisher.probe()
+    eventually(lambda: decode(lasting[-1]).seq == last)
+    count = len(ended)
+    last = publisher.probe()
+    eventually(lambda: decode(lasting[-1]).seq == last)
+    assert len(ended) == count
+
+
+def test_an_endpoint_in_use_is_an_error_that_names_it(open_bus: Callable[..., Bus], endpoint: str) -> None:
+    open_bus(listen=(endpoint,))
+    with pytest.raises(BusError, match=endpoint):
+        open_bus(listen=(endpoint,))
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "local"),
+    [
+        ("tcp/127.0.0.1:0", True),
+        ("tcp/[::1]:7447", True),
+        ("tls/localhost:7447", True),
+        ("unixsock-stream//run/user/1000/graph.sock", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:0", False),
+        ("tcp/192.168.1.2:7447", False),
+        ("tcp/robot.local:7447", False),
+        ("tcp/127.0.0.1:0#iface=eth0", False),
+    ],
+)
+def test_only_loopback_is_listened_on_unless_the_graph_says_so(endpoint: str, local: bool) -> None:
+    assert is_local(endpoint) == local
+    if not local:
+        with pytest.raises(NetworkError, match="can be reached from other machines"):
+            NetworkConfig(listen=(endpoint,))
+    assert NetworkConfig(listen=(endpoint,), exposed=True).listen == (endpoint,)
+    assert NetworkConfig(connect=(endpoint,)).connect == (endpoint,)
+
+
+def test_a_malformed_endpoint_or_setting_is_named() -> None:
+    with pytest.raises(NetworkError, match=r"'127\.0\.0\.1:7447'"):
+        NetworkConfig(listen=("127.0.0.1:7447",))
+    with pytest.raises(NetworkError, match="no/such/setting"):
+        NetworkConfig(zenoh={"no/such/setting": 1}).zenoh_config()
+
+
+def test_reserved_endpoints_differ_and_can_be_listened_on_at_once(open_bus: Callable[..., Bus]) -> None:
+    with reserve_endpoints(3) as reserved:
+        assert len(set(reserved.endpoints)) == 3
+        assert open_bus(listen=reserved.endpoints).id

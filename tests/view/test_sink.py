@@ -1,0 +1,246 @@
+"""A sink takes what it is given without waiting, survives what it cannot draw, and saves what a viewer needs."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun.blueprint as rrb
+from rrd_rows import at, blueprint_rows, rows
+
+from dataflow.messages import (
+    CameraInfo,
+    DepthImage,
+    Detections2D,
+    Diagnostics,
+    Image,
+    Imu,
+    Message,
+    Pose,
+    SceneGraph,
+    array,
+)
+from dataflow.recording import Recording, RecordingWriter
+from dataflow.view import (
+    Connect,
+    Save,
+    Serve,
+    Spawn,
+    ViewerError,
+    ViewerSink,
+    blueprint,
+    from_recording,
+    parse_target,
+    visualizer,
+)
+from dataflow.view.sink import Bounds
+
+STAMP = 1_700_000_000_000_000_000
+SECOND = 1_000_000_000
+
+
+class Unwilling(Message, schema="test.view.Unwilling"):
+    """A message whose visualiser fails."""
+
+
+class Slow(Message, schema="test.view.Slow"):
+    """A message whose visualiser waits."""
+
+    data: np.ndarray = array("uint8", "N", "ballast")
+
+
+gate = threading.Event()
+
+
+@visualizer(Unwilling, "log")
+def _unwilling(canvas: object, message: Unwilling) -> None:
+    raise RuntimeError(f"no, not {message.stamp}")
+
+
+@visualizer(Slow, "log")
+def _slow(canvas: object, message: Slow) -> None:
+    assert gate.wait(30)
+
+
+def imu(stamp: int) -> Imu:
+    return Imu(stamp=stamp, frame="imu", angular_velocity=[0, 0, 1], linear_acceleration=[0, 0, 9.81])
+
+
+def pose(stamp: int, x: float = 0.0) -> Pose:
+    return Pose(stamp=stamp, frame="world", child_frame="optical", position=[x, 0, 0], orientation=[0, 0, 0, 1])
+
+
+def test_a_saved_file_holds_the_messages_at_their_stamps(tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    with ViewerSink(Save(path)) as sink:
+        sink.open({"r/imu/data": Imu})
+        for t in range(20):
+            assert sink.log("r/imu/data", imu(STAMP + t), wait=10.0)
+    assert sink.statistics().drawn == 20
+    found = at(rows(path), "/r/imu/data/plot/gyroscope", "Scalars:scalars")
+    assert [row.stamp for row in found] == [STAMP + t for t in range(20)]
+
+
+def test_a_visualizer_that_fails_is_reported_once_and_counted(tmp_path: Path) -> None:
+    path, said = tmp_path / "a.rrd", []
+    sink = ViewerSink(Save(path), report=said.append)
+    sink.open({"bad": Unwilling, "worse": Unwilling, "imu": Imu})
+    for t in range(5):
+        sink.log("bad", Unwilling(stamp=t), wait=10.0)
+        sink.log("imu", imu(t), wait=10.0)
+    sink.log("worse", Unwilling(stamp=0), wait=10.0)
+    assert sink.close()
+    assert (sink.statistics().failed, sink.statistics().drawn) == (6, 5)
+    assert said == ["cannot draw bad: RuntimeError: no, not 0", "cannot draw worse: RuntimeError: no, not 0"]
+    assert len(at(rows(path), "/imu/plot/gyroscope", "Scalars:scalars")) == 5
+
+
+def test_a_slow_viewer_costs_the_caller_nothing_and_the_oldest_messages(tmp_path: Path) -> None:
+    gate.clear()
+    said: list[str] = []
+    sink = ViewerSink(Save(tmp_path / "a.rrd"), report=said.append, bounds=Bounds(messages=10, bytes=1000))
+    sink.open({"slow": Slow, "imu": Imu})
+    sink.log("slow", Slow(stamp=0, data=np.zeros(1, np.uint8)))
+    deadline = time.monotonic() + 10
+    while sink.backlog() and time.monotonic() < deadline:
+        time.sleep(0.001)
+    began = time.monotonic()
+    for t in range(1000):
+        sink.log("imu", imu(t))
+    assert time.monotonic() - began < 5.0
+    assert sink.backlog() == 10
+    assert sink.statistics().dropped == 990
+    assert len(said) == 1
+    gate.set()
+    assert sink.close()
+    stamps = [row.stamp for row in at(rows(tmp_path / "a.rrd"), "/imu/plot/gyroscope", "Scalars:scalars")]
+    assert stamps == list(range(990, 1000))
+
+
+def test_closing_a_stalled_viewer_is_bounded(tmp_path: Path) -> None:
+    gate.clear()
+    said: list[str] = []
+    sink = ViewerSink(Save(tmp_path / "a.rrd"), report=said.append)
+    sink.open({"slow": Slow})
+    sink.log("slow", Slow(stamp=0, data=np.zeros(1, np.uint8)))
+    began = time.monotonic()
+    assert not sink.close(timeout=0.2)
+    assert time.monotonic() - began < 5.0
+    assert "did not take everything" in said[0]
+    gate.set()
+
+
+def views(part: rrb.Blueprint | rrb.Container | rrb.View) -> list[tuple[str, str]]:
+    """(kind, name) of every view in a blueprint."""
+    if isinstance(part, rrb.Blueprint):
+        part = part.root_container
+    if isinstance(part, rrb.View):
+        return [(str(part.class_identifier), str(part.name))]
+    return [view for inner in part.contents for view in views(inner)]
+
+
+STREAMS = {
+    "r/camera/image": Image,
+    "r/camera/depth": DepthImage,
+    "r/camera/info": CameraInfo,
+    "r/detector/boxes": Detections2D,
+    "r/odometry/pose": Pose,
+    "r/scene/graph": SceneGraph,
+    "r/imu/data": Imu,
+    "r/monitor/health": Diagnostics,
+}
+
+
+def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
+    assert views(blueprint(STREAMS)) == [
+        ("3D", "World"),
+        ("2D", "camera/image"),
+        ("2D", "camera/depth"),
+        ("Graph", "scene/graph"),
+        ("TimeSeries", "imu/data gyroscope"),
+        ("TimeSeries", "imu/data accelerometer"),
+        ("TimeSeries", "Latency"),
+        ("TimeSeries", "Rates"),
+        ("TimeSeries", "Health"),
+        ("TextLog", "Log"),
+    ]
+    assert views(blueprint({"r/imu/data": Imu}))[-1] == ("TextLog", "Log")
+    assert ("3D", "World") not in views(blueprint({"r/imu/data": Imu}))
+
+
+def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
+    def contents(name: str, part: rrb.Container | rrb.View) -> list[str]:
+        if isinstance(part, rrb.View):
+            return list(part.contents) if part.name == name else []
+        return [line for inner in part.contents for line in contents(name, inner)]
+
+    root = blueprint(STREAMS).root_container
+    assert contents("camera/image", root) == ["+ /r/camera/image", "+ /r/detector/boxes/overlay"]
+    assert "+ /r/odometry/pose/space/**" in contents("World", root)
+    assert not any("detector" in line for line in contents("World", root))
+
+
+@pytest.mark.parametrize("optical_world", [True, False])
+def test_the_viewer_finds_out_which_way_is_up(optical_world: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    sink = ViewerSink(Save(path))
+    sink.open({"c/info": CameraInfo, "c/truth": Pose}, static=["c/info"])
+    info = CameraInfo.from_intrinsics(stamp=0, frame="optical", width=64, height=48, fx=50, fy=50, cx=32, cy=24)
+    sink.log("c/info", info)
+    turn = [0, 0, 0, 1] if optical_world else [-0.5, 0.5, -0.5, 0.5]
+    for t in range(3):
+        sink.log("c/truth", pose(STAMP + t * SECOND).replace(orientation=turn))
+    assert sink.close()
+    up = at(rows(path), "/scene", "ViewCoordinates:xyz")[-1].values[0]
+    assert up == ([3, 2, 5] if optical_world else [3, 5, 1])  # right, down, forward; or right, forward, up
+    (eye,) = [row.values[0] for row in blueprint_rows(path) if row.component == "EyeControls3D:position"]
+    assert (eye[1] < 0 and eye[2] < 0) if optical_world else (eye[2] > 0 and eye[0] < 0)  # above and behind
+
+
+def test_hidden_and_unknown_streams_are_passed_over(tmp_path: Path) -> None:
+    with ViewerSink(Save(tmp_path / "a.rrd")) as sink:
+        with pytest.raises(ViewerError, match="not open"):
+            sink.log("imu", imu(0))
+        sink.open({"imu": Imu})
+        assert not sink.log("other", imu(0))
+
+
+def test_a_recording_is_played_with_its_static_streams_whole(tmp_path: Path) -> None:
+    info = CameraInfo.from_intrinsics(stamp=5, frame="optical", width=64, height=48, fx=50, fy=50, cx=32, cy=24)
+    with RecordingWriter(tmp_path / "a.mcap", metadata={}) as writer:
+        writer.add_stream("r/c/info", CameraInfo, static=True)
+        writer.add_stream("r/c/truth", Pose)
+        writer.write("r/c/info", info, seq=0)
+        for t in range(10):
+            writer.write("r/c/truth", pose(STAMP + t, float(t)), seq=t)
+    with Recording(tmp_path / "a.mcap") as recording, ViewerSink(Save(tmp_path / "a.rrd")) as sink:
+        assert from_recording(recording, sink, start=STAMP + 3, end=STAMP + 5) == 4
+    found = rows(tmp_path / "a.rrd")
+    assert [row.stamp for row in at(found, "/r/c/info", "Pinhole:resolution")] == [None]
+    assert [r.stamp - STAMP for r in at(found, "/r/c/truth/space/axes", "Arrows3D:vectors")] == [3, 4, 5]
+
+
+def test_targets_are_named_in_words() -> None:
+    assert parse_target("spawn") == Spawn()
+    assert parse_target("serve") == Serve()
+    assert parse_target("rerun+http://10.0.0.2:9876/proxy") == Connect("rerun+http://10.0.0.2:9876/proxy")
+    assert parse_target("out/run.rrd") == Save(Path("out/run.rrd"))
+    with pytest.raises(ViewerError, match=r"expected spawn, serve, .*\.rrd"):
+        parse_target("browser")
+
+
+def test_what_cannot_be_reached_is_said_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ViewerError, match="there is no folder"):
+        ViewerSink(Save(tmp_path / "none" / "a.rrd")).open({"imu": Imu})
+    with pytest.raises(ViewerError, match=r"no viewer listens on 127\.0\.0\.1:1\b"):
+        ViewerSink(Connect("rerun+http://127.0.0.1:1/proxy")).open({"imu": Imu})
+    with pytest.raises(ViewerError, match="expected rerun"):
+        ViewerSink(Connect("rerun+http://127.0.0.1:9876")).open({"imu": Imu})
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(ViewerError, match="no display"):
+        ViewerSink(Spawn()).open({"imu": Imu})

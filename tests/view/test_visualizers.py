@@ -1,0 +1,228 @@
+"""Every message type can be drawn, at its stamp, with its values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rerun as rr
+from rrd_rows import Row, at, rows
+
+from dataflow import messages
+from dataflow.messages import (
+    Boxes3D,
+    CameraInfo,
+    CompressedDepth,
+    DepthImage,
+    Detections2D,
+    Diagnostics,
+    Image,
+    Imu,
+    Message,
+    OccupancyGrid,
+    Odometry,
+    PointCloud,
+    SegmentationMap,
+    Tracks,
+    Transforms,
+)
+from dataflow.messages.example import example
+from dataflow.view import SceneState, ViewOptions, visualize, visualizers
+from dataflow.view.layout import layout
+
+TYPES = [
+    value
+    for value in vars(messages).values()
+    if isinstance(value, type) and issubclass(value, Message) and value is not Message
+]
+STAMP = 1_700_000_000_123_456_789
+
+
+def draw(
+    tmp_path: Path, *drawn: tuple[str, Message], static: tuple[str, ...] = (), options: ViewOptions | None = None
+) -> list[Row]:
+    """What a viewer gets when these messages of these streams are drawn in order."""
+    types: Mapping[str, type[Message]] = {stream: type(message) for stream, message in drawn}
+    scene = SceneState(layout(types, static=static), options or ViewOptions())
+    path = tmp_path / "drawn.rrd"
+    with rr.RecordingStream("test", recording_id="test") as recording:
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        recording.save(path)
+        for stream, message in drawn:
+            visualize(recording, f"/{stream}", message, scene, stream)
+    return rows(path)
+
+
+def test_every_message_type_has_a_visualizer_of_its_own() -> None:
+    assert len(TYPES) > 30
+    assert [t.__name__ for t in TYPES if t not in visualizers()] == []
+
+
+@pytest.mark.parametrize("message_type", TYPES, ids=lambda t: t.__name__)
+def test_awkward_messages_of_every_type_are_drawn(message_type: type[Message], tmp_path: Path) -> None:
+    for seed in range(6):  # all fields, no elements, no optional fields, mixtures; NaN and infinities throughout
+        message = example(message_type, seed)
+        found = draw(tmp_path, ("a/b", message))
+        assert {row.stamp for row in found} <= {None, message.stamp}
+    assert draw(tmp_path, *[("a/b", example(message_type, seed)) for seed in (0, 1, 2, 0)])
+
+
+def test_an_image_is_sent_as_jpeg_or_as_it_is(tmp_path: Path) -> None:
+    image = Image(stamp=STAMP, frame="camera", data=np.arange(48, dtype=np.uint8).reshape(4, 4, 3))
+    found = draw(tmp_path, ("camera/image", image))
+    (blob,) = at(found, "/camera/image", "EncodedImage:blob")
+    assert blob.stamp == STAMP
+    assert bytes(blob.values[0][:2]) == b"\xff\xd8"
+    found = draw(tmp_path, ("camera/image", image), options=ViewOptions(jpeg_quality=None))
+    (buffer,) = at(found, "/camera/image", "Image:buffer")
+    assert bytes(buffer.values[0]) == image.data.tobytes()
+
+
+def test_depth_survives_to_the_millimetre_and_no_return_stays_none(tmp_path: Path) -> None:
+    import cv2
+
+    depth = np.array([[0.0, np.nan, 0.5], [1.2345, 6.0, np.inf]], np.float32)
+    found = draw(tmp_path, ("camera/depth", DepthImage(stamp=STAMP, frame="camera", data=depth)))
+    (blob,) = at(found, "/camera/depth", "EncodedDepthImage:blob")
+    (meter,) = at(found, "/camera/depth", "EncodedDepthImage:meter")
+    back = cv2.imdecode(np.array(blob.values[0], np.uint8), cv2.IMREAD_UNCHANGED) / meter.values[0]
+    np.testing.assert_allclose(back, [[0, 0, 0.5], [1.2345, 6.0, 0]], atol=0.0005001)
+
+
+def test_inverse_depth_is_decoded(tmp_path: Path) -> None:
+    import cv2
+
+    png = cv2.imencode(".png", np.array([[0, 110, 210]], np.uint16))[1].ravel()
+    message = CompressedDepth(stamp=STAMP, frame="c", quantizer="inverse", scale=100.0, offset=10.0, data=png)
+    found = draw(tmp_path, ("camera/depth", message), options=ViewOptions(compress_depth=False))
+    (buffer,) = at(found, "/camera/depth", "DepthImage:buffer")
+    np.testing.assert_allclose(np.frombuffer(bytes(buffer.values[0]), np.float32), [0.0, 1.0, 0.5])
+
+
+def test_detections_lie_in_the_plane_of_their_camera(tmp_path: Path) -> None:
+    info = CameraInfo.from_intrinsics(stamp=STAMP, frame="optical", width=64, height=48, fx=50, fy=50, cx=32, cy=24)
+    image = Image(stamp=STAMP, frame="optical", data=np.zeros((48, 64, 3), np.uint8))
+    boxes = Detections2D(
+        stamp=STAMP, frame="optical", width=64, height=48, class_names=("cup", "chair"),
+        boxes=[[10, 20, 30, 40]], scores=[0.75], class_ids=[1],
+    )  # fmt: skip
+    found = draw(tmp_path, ("camera/info", info), ("camera/image", image), ("detector/boxes", boxes))
+    (plane,) = at(found, "/camera/info", "Pinhole:child_frame")
+    assert at(found, "/camera/info", "Pinhole:parent_frame")[0].values == ["optical"]
+    assert at(found, "/camera/image", "CoordinateFrame:frame")[0].values == plane.values
+    assert at(found, "/detector/boxes/overlay", "CoordinateFrame:frame")[0].values == plane.values
+    assert at(found, "/detector/boxes/overlay", "Boxes2D:centers")[0].values == [[20.0, 30.0]]
+    assert at(found, "/detector/boxes/overlay", "Boxes2D:labels")[0].values == ["chair 0.75"]
+
+
+def test_a_class_has_one_colour_whatever_its_number(tmp_path: Path) -> None:
+    def boxes(names: tuple[str, ...], chosen: int) -> Boxes3D:
+        return Boxes3D(
+            stamp=STAMP, frame="map", class_names=names, centers=[[0, 0, 0]], sizes=[[1, 1, 1]],
+            orientations=[[0, 0, 0, 1]], scores=[1.0], class_ids=[chosen],
+        )  # fmt: skip
+
+    found = draw(
+        tmp_path, ("a/x", boxes(("cup", "chair"), 1)), ("b/x", boxes(("chair",), 0)), ("c/x", boxes(("cup",), 0))
+    )
+    a, b, c = (at(found, f"/{name}/x/space", "Boxes3D:colors")[0].values for name in "abc")
+    assert a == b != c
+
+
+def test_points_are_thinned_only_with_notice(tmp_path: Path) -> None:
+    points = np.arange(300, dtype=np.float32).reshape(100, 3)
+    cloud = PointCloud(stamp=STAMP, frame="lidar", points=points)
+    found = draw(tmp_path, ("l/c", cloud))
+    assert at(found, "/l/c/space", "Points3D:positions")[0].values == points.tolist()
+    assert not at(found, "/viewer/log", "TextLog:text")
+    found = draw(tmp_path, ("l/c", cloud), ("l/c", cloud.replace(stamp=STAMP + 1)), options=ViewOptions(max_points=40))
+    assert [len(row.values) for row in at(found, "/l/c/space", "Points3D:positions")] == [34, 34]
+    (notice,) = at(found, "/viewer/log", "TextLog:text")
+    assert "at most 40 points" in notice.values[0]
+
+
+def odometry(t: int, x: float, **fields: object) -> Odometry:
+    return Odometry(
+        stamp=STAMP + t, frame="odom", child_frame="base", position=[x, 0, 0], orientation=[0, 0, 0, 1], **fields
+    )
+
+
+def test_a_moving_robot_carries_its_sensors_and_leaves_a_trail(tmp_path: Path) -> None:
+    fixed = Transforms(
+        stamp=0, frames=["base"], child_frames=["lidar"], translations=[[0, 0, 1]], rotations=[[0, 0, 0, 1]]
+    )
+    drawn = [("tf/static", fixed)] + [("w/odom", odometry(i, x)) for i, x in enumerate((0.0, 1.0, 1.001, 3.0))]
+    found = draw(tmp_path, *drawn, static=("tf/static",))
+    (mounted,) = at(found, "/frames/lidar", "Transform3D:translation")
+    assert mounted.stamp is None  # static
+    moved = at(found, "/frames/base", "Transform3D:translation")
+    assert [row.values[0][0] for row in moved if row.stamp >= STAMP][-1] == 3.0
+    trail = at(found, "/w/odom/space/trail", "LineStrips3D:strips")
+    assert [row.values for row in trail] == [[[[0, 0, 0], [1, 0, 0]]], [[[1, 0, 0], [3, 0, 0]]]]
+    assert [row.stamp for row in trail] == [STAMP + 1, STAMP + 3]
+
+
+def test_a_lost_pose_is_not_drawn_and_breaks_the_trail(tmp_path: Path) -> None:
+    found = draw(tmp_path, ("w/o", odometry(0, 0.0)), ("w/o", odometry(1, np.nan)), ("w/o", odometry(2, 1.0)))
+    assert not at(found, "/w/o/space/trail", "LineStrips3D:strips")
+    assert all(np.isfinite(row.values[0]).all() for row in at(found, "/frames/base", "Transform3D:translation"))
+
+
+def test_ended_tracks_disappear_and_paths_are_bounded_in_time(tmp_path: Path) -> None:
+    def tracks(t: int, state: int) -> Tracks:
+        return Tracks(
+            stamp=STAMP + t * 1_000_000_000, frame="map", ids=[7], states=[state], scores=[1.0], class_ids=[0],
+            ages=[1.0], unseen=[0.0], positions=[[float(t), 0, 0]],
+        )  # fmt: skip
+
+    found = draw(tmp_path, *[("t/t", tracks(t, 1)) for t in range(9)], ("t/t", tracks(9, 3)))
+    paths = at(found, "/t/t/space/paths", "LineStrips3D:strips")
+    assert [x for x, _, _ in paths[8].values[0]] == [3, 4, 5, 6, 7, 8]
+    assert at(found, "/t/t/space", "Points3D:positions")[9].values == []
+
+
+def test_segmentation_names_its_classes_and_hides_void(tmp_path: Path) -> None:
+    message = SegmentationMap(
+        stamp=STAMP, frame="c", class_names=("road", "tree"), void=255, classes=np.array([[0, 1, 255]], np.uint8)
+    )
+    found = draw(tmp_path, ("s/m", message), ("s/m", message.replace(stamp=STAMP + 1)))
+    (context,) = at(found, "/s/m/overlay", "AnnotationContext:context")
+    table = {e["class_id"]: e["class_description"]["info"] for e in context.values[0]}
+    assert [table[i]["label"] for i in (0, 1, 255)] == ["road", "tree", "void"]
+    assert table[255]["color"] & 0xFF == 0
+    assert len(at(found, "/s/m/overlay", "SegmentationImage:buffer")) == 2
+
+
+def test_a_grid_lies_with_its_first_row_at_the_origin(tmp_path: Path) -> None:
+    grid = OccupancyGrid(
+        stamp=STAMP, frame="map", resolution=0.5, cells=np.array([[0, 100], [-1, 50]], np.int8), position=[1, 2, 0]
+    )
+    found = draw(tmp_path, ("m/g", grid))
+    (data,) = at(found, "/m/g/space", "GridMap:data")
+    assert data.values[0] == [255, 50, 0, 100]  # an image has its first row at the top
+    assert at(found, "/m/g/space", "GridMap:translation")[0].values == [[1, 2, 0]]
+
+
+def test_curves_carry_names_and_values(tmp_path: Path) -> None:
+    imu = Imu(stamp=STAMP, frame="imu", angular_velocity=[1, 2, np.nan], linear_acceleration=[0, 0, 9.81])
+    found = draw(tmp_path, ("i/d", imu))
+    (gyro,) = at(found, "/i/d/plot/gyroscope", "Scalars:scalars")
+    np.testing.assert_array_equal(gyro.values, [1, 2, np.nan])
+    assert at(found, "/i/d/plot/accelerometer", "SeriesLines:names")[0].values == ["ax m/s²", "ay m/s²", "az m/s²"]
+
+
+def test_diagnostics_are_told_when_they_change_and_plotted_by_kind(tmp_path: Path) -> None:
+    def health(t: int, level: int) -> Diagnostics:
+        return Diagnostics(
+            stamp=STAMP + t, names=("camera",), messages=("fine" if level == 0 else "hot",), levels=[level],
+            keys=("rate_hz", "latency", "note"), values=("30", "4.5 ms", "x"), owners=[0, 0, 0],
+        )  # fmt: skip
+
+    found = draw(tmp_path, *[("d/d", health(t, level)) for t, level in enumerate((0, 0, 2, 2))])
+    assert [row.values[0] for row in at(found, "/d/d/log", "TextLog:text")] == ["camera: OK fine", "camera: ERROR hot"]
+    assert [row.values[0] for row in at(found, "/d/d/log", "TextLog:level")] == ["INFO", "ERROR"]
+    assert at(found, "/d/d/plot/rate/camera/rate_hz", "Scalars:scalars")[0].values == [30.0]
+    assert at(found, "/d/d/plot/latency/camera/latency", "Scalars:scalars")[0].values == [4.5]
