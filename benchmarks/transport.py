@@ -35,6 +35,16 @@ ACK = struct.Struct("<QQ")
 MODES: dict[str, Mapping[str, Any]] = {
     "network": {"shared_memory": False},
     "shared": {"shared_memory": True},
+    "zenoh-defaults": {
+        "shared_memory": False,
+        "zenoh": {
+            "transport/link/tx/lease": 10_000,
+            "transport/link/tx/keep_alive": 4,
+            "transport/link/tx/queue/congestion_control/block/wait_before_close": 5_000_000,
+            "transport/link/tx/queue/size/data": 2,
+            "transport/link/rx/buffer_size": 65_535,
+        },
+    },
     "zenoh-shm": {
         "shared_memory": False,
         "zenoh": {

@@ -130,7 +130,11 @@ class ContainerWriter:
         self._failure: str | None = None
         self._position = 0
         self._fd = self._open(overwrite)
-        self._append(MAGIC, record_bytes(Header(profile="", library=library)))
+        try:
+            self._append(MAGIC, record_bytes(Header(profile="", library=library)))
+        except RecordingError:
+            os.close(self._fd)
+            raise
 
     def _open(self, overwrite: bool) -> int:
         flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_TRUNC if overwrite else os.O_EXCL)

@@ -427,13 +427,41 @@ def _decode_transforms(proto: FrameTransforms) -> Fields:
     }
 
 
+_WIRE_POSE = np.dtype(
+    [
+        ("pose", "V2"),
+        ("position", "V2"),
+        *((part, kind) for axis in "xyz" for part, kind in ((f"p{axis}_tag", "u1"), (f"p{axis}", "<f8"))),
+        ("orientation", "V2"),
+        *((part, kind) for axis in "xyzw" for part, kind in ((f"q{axis}_tag", "u1"), (f"q{axis}", "<f8"))),
+    ]
+)
+"""A `PosesInFrame.poses` entry on the wire, every number written out, so that entries have one length."""
+
+
+def _wire_poses(positions: npt.NDArray[Any], orientations: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
+    """The `poses` field of a `PosesInFrame`: a path of thousands of poses is one array operation, not objects."""
+    rows = np.zeros(len(positions), _WIRE_POSE)
+    size, position, orientation = _WIRE_POSE.itemsize - 2, 3 * 9, 4 * 9
+    rows["pose"] = np.void(bytes([PosesInFrame.POSES_FIELD_NUMBER << 3 | 2, size]))
+    rows["position"] = np.void(bytes([PoseProto.POSITION_FIELD_NUMBER << 3 | 2, position]))
+    rows["orientation"] = np.void(bytes([PoseProto.ORIENTATION_FIELD_NUMBER << 3 | 2, orientation]))
+    for i, axis in enumerate("xyzw"):
+        rows[f"q{axis}_tag"] = (i + 1) << 3 | 1
+        rows[f"q{axis}"] = float(axis == "w") if orientations is None else orientations[:, i]
+        if axis != "w":
+            rows[f"p{axis}_tag"] = (i + 1) << 3 | 1
+            rows[f"p{axis}"] = positions[:, i]
+    return rows
+
+
 def _encode_path(message: Path) -> tuple[Parts, tuple[str, ...]]:
-    orientations = message.orientations
-    proto = PosesInFrame(timestamp=_timestamp(message.stamp), frame_id=message.frame)
-    turned = [[0.0, 0.0, 0.0, 1.0]] * len(message.positions) if orientations is None else orientations.tolist()
-    proto.poses.extend(_pose(p, q) for p, q in zip(message.positions.tolist(), turned, strict=True))
-    lacks = (("orientations",) if orientations is None else ()) + (() if message.stamps is None else ("stamps",))
-    return [proto.SerializeToString()], lacks
+    head = PosesInFrame(timestamp=_timestamp(message.stamp), frame_id=message.frame).SerializeToString()
+    poses = _wire_poses(message.positions, message.orientations)
+    lacks = (("orientations",) if message.orientations is None else ()) + (
+        () if message.stamps is None else ("stamps",)
+    )
+    return [head, poses.tobytes()], lacks
 
 
 def _decode_path(proto: PosesInFrame) -> Fields:

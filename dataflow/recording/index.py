@@ -11,10 +11,9 @@ import struct
 import zlib
 from array import array
 from collections import OrderedDict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -30,7 +29,7 @@ from dataflow.recording.errors import RecordingError
 
 FOOTER_BYTES = 9 + 20
 UNCHUNKED = -1
-MAX_CHUNK_BYTES = 4 * 2**30
+MAX_CHUNK_BYTES = 2**30
 CACHE_BYTES = 256 * 2**20
 
 _RECORD = struct.Struct("<BQ")
@@ -38,7 +37,6 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_BODY = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
 _ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
-_R = TypeVar("_R")
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +120,9 @@ class McapFile:
             raise RecordingError(f"cannot open the recording {path}: {error.strerror}") from error
         try:
             self._load()
+        except struct.error as error:
+            self.close()
+            raise self._damaged(f"a record is too short: {error}") from error
         except BaseException:
             self.close()
             raise
@@ -137,8 +138,8 @@ class McapFile:
         """The message that an entry of the index points to."""
         data = memoryview(self._chunk(chunk)) if chunk != UNCHUNKED else self._unchunked(offset)
         start = offset if chunk != UNCHUNKED else 0
-        if start + _MESSAGE.size > len(data):
-            raise self._damaged(f"an index entry points to byte {offset}, beyond the end of chunk {chunk}")
+        if start < 0 or start + _MESSAGE.size > len(data):
+            raise self._damaged(f"an index entry points to byte {offset}, outside chunk {chunk}")
         opcode, length, channel, sequence, log_time, _ = _MESSAGE.unpack_from(data, start)
         end = start + _RECORD.size + length
         if opcode != Opcode.MESSAGE or length < _MESSAGE_BODY.size or end > len(data):
@@ -159,7 +160,9 @@ class McapFile:
         ends[:-1] = offsets[1:]
         last = np.ones(len(chunks), bool)
         last[:-1] = chunks[1:] != chunks[:-1]
-        limits = np.array([c.uncompressed_size for c in self.chunks] + [0], np.int64)  # UNCHUNKED is the last
+        limits = np.array(
+            [min(c.uncompressed_size, MAX_CHUNK_BYTES) for c in self.chunks] + [0], np.int64
+        )  # UNCHUNKED is the last
         ends[last] = limits[chunks[last]]
         sizes = np.maximum(ends - offsets - _MESSAGE.size, 0)
         for i in np.flatnonzero(chunks == UNCHUNKED):
@@ -356,6 +359,8 @@ class McapFile:
         ref = self.chunks[number]
         body = self._pread(ref.offset, ref.length)
         where = f"chunk {number} at byte {ref.offset}"
+        if len(body) < _CHUNK.size:
+            raise self._damaged(f"{where} is too short")
         _, _, size, crc, name_length = _CHUNK.unpack_from(body)
         at = _CHUNK.size + name_length
         name = body[_CHUNK.size : at].decode("ascii", "replace")
@@ -406,11 +411,6 @@ class McapFile:
 
     def _damaged(self, what: str) -> RecordingError:
         return RecordingError(f"{self.path} is damaged: {what}; `mcap recover` may save what is left")
-
-
-def iterate(entries: Entries) -> Iterator[tuple[int, int]]:
-    """(chunk, offset) of every entry, in file order."""
-    return zip(entries.chunks.tolist(), entries.offsets.tolist(), strict=True)
 
 
 def _signed(log_time: int) -> int:

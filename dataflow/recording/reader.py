@@ -192,9 +192,9 @@ class Recording:
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order."""
         channels = {
-            c.id: c.metadata["operator"]
+            c.id: c.metadata.get("operator", "")
             for c in self._channels_of(Kind.FIRINGS)
-            if operator is None or c.metadata["operator"] == operator
+            if operator is None or c.metadata.get("operator", "") == operator
         }
         for raw in self._in_file_order(list(channels)):
             yield channels[raw.channel], bytes(raw.data)
@@ -203,7 +203,7 @@ class Recording:
         """Number of batches of firing records by operator."""
         counts: dict[str, int] = {}
         for channel in self._channels_of(Kind.FIRINGS):
-            name = channel.metadata["operator"]
+            name = channel.metadata.get("operator", "")
             counts[name] = counts.get(name, 0) + len(self._entries(channel.id))
         return dict(sorted(counts.items()))
 

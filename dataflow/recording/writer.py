@@ -79,9 +79,13 @@ class RecordingWriter:
         self._firings: dict[str, tuple[int, int]] = {}
         self._events: tuple[int, int] | None = None
         self._newest = 0
-        self._file.add_metadata(RECORDING, {"format": FORMAT, "namespace": namespace})
-        for name, mapping in metadata.items():
-            self.add_metadata(name, mapping)
+        try:
+            self._file.add_metadata(RECORDING, {"format": FORMAT, "namespace": namespace})
+            for name, mapping in metadata.items():
+                self.add_metadata(name, mapping)
+        except BaseException:
+            self._file.close()
+            raise
 
     @property
     def path(self) -> Path:

@@ -152,7 +152,7 @@ class Aligner:
 
         What it then sends at or below the last stamp of earlier incarnations is late, for every input. A
         stream that had ended is open again. `push` does this by itself on a message of a higher incarnation.
-        Firings are repeatable across a restart if the old incarnation promised nothing above its last message.
+        Firings are repeatable across a restart if the old incarnation promised nothing above its last stamp.
         """
         state = self._stream(stream)
         state.reset(incarnation)

@@ -71,8 +71,8 @@ class StreamState:
             final_stamp = self.promised if self.promised != NEVER else None
         elif final_stamp < self.promised:
             raise StreamOrderError(
-                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, below "
-                f"frontier {format_stamp(self.promised)} it promised: pass the larger of last stamp and frontier"
+                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, below its "
+                f"promised frontier {format_stamp(self.promised)}: pass the larger of last stamp and frontier"
             )
         self.ended = True
         self.final = final_stamp

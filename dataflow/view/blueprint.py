@@ -106,7 +106,13 @@ def _camera(camera: Camera, shown: Layout) -> rrb.Spatial2DView:
 
 def _graphs(shown: Layout) -> list[Part]:
     return [
-        rrb.GraphView(origin=f"{entity_of(name)}/graph", name=_short(name, shown))
+        rrb.GraphView(
+            origin=f"{entity_of(name)}/graph",
+            name=_short(name, shown),
+            force_link=rrb.archetypes.ForceLink(enabled=True, distance=70.0),
+            force_many_body=rrb.archetypes.ForceManyBody(enabled=True, strength=-400.0),
+            force_collision_radius=rrb.archetypes.ForceCollisionRadius(enabled=True),
+        )
         for name in _with_role(shown, "graph")
     ]
 

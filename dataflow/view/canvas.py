@@ -12,6 +12,7 @@ import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
 from dataflow.messages import Message
+from dataflow.view import colors
 from dataflow.view.frames import FrameCycleError, Rank
 from dataflow.view.scene import VIEWER_LOG, SceneState
 
@@ -70,7 +71,8 @@ class Canvas:
         if not len(values):
             return
         if self.scene.changed(self.entity, where, tuple(names)):
-            self.log(where, rr.SeriesLines(names=list(names)), static=True)
+            paint = colors.AXES if len(names) == 3 else colors.of_identities(range(len(names)))
+            self.log(where, rr.SeriesLines(names=list(names), colors=paint), static=True)
         self.log(where, rr.Scalars(np.asarray(values, np.float64)))
 
     def text(self, text: str, level: str = "INFO") -> None:

@@ -209,8 +209,8 @@ class SceneState:
         level /= np.linalg.norm(level)
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
-        position = at - level * (0.55 * reach) + up * (0.6 * reach) + side * (0.4 * reach)
-        return Outlook(up, position, at + level * (0.55 * reach))
+        position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
+        return Outlook(up, position, at + level * (0.75 * reach))
 
     def image_streams(self) -> tuple[str, ...]:
         """Every stream of images, colour and depth."""

@@ -16,7 +16,7 @@ from operators.detection.fit import Fit, FitMode
 from operators.detection.nms import class_wise_nms
 
 if TYPE_CHECKING:
-    import onnxruntime  # type: ignore[import-untyped]
+    import onnxruntime
 
 
 class ModelError(ValueError):

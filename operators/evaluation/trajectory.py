@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from operators.association import mutually_nearest
 
 if TYPE_CHECKING:
-    from evo.core.trajectory import PoseTrajectory3D  # type: ignore[import-untyped]
+    from evo.core.trajectory import PoseTrajectory3D
 
 Alignment = Literal["se3", "sim3", "none"]
 
@@ -79,8 +79,8 @@ def absolute_error(matches: Matches, alignment: Alignment) -> dict[str, float]:
 
     Needs one pair without alignment, otherwise three that are not all in one place. Raises ValueError.
     """
-    from evo.core.geometry import GeometryException  # type: ignore[import-untyped]
-    from evo.core.metrics import APE, PoseRelation  # type: ignore[import-untyped]
+    from evo.core.geometry import GeometryException
+    from evo.core.metrics import APE, PoseRelation
 
     needed = 1 if alignment == "none" else 3
     if len(matches.estimate) < needed:
@@ -105,7 +105,7 @@ def relative_errors(matches: Matches, seconds: float, metres: float) -> dict[str
 
     A span that the trajectory does not contain is left out. Time is counted in frames of the median interval.
     """
-    from evo.core.filters import FilterException  # type: ignore[import-untyped]
+    from evo.core.filters import FilterException
     from evo.core.metrics import RPE, PoseRelation, Unit
 
     figures: dict[str, float] = {}

@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from dataflow.messages import CompressedImage, DepthImage, Image, Pose, Transforms
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, register_decoder
+from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, index, register_decoder
 from dataflow.recording.codecs import SchemaText, build
 from dataflow.recording.foxglove import file_descriptor_set
 
@@ -119,6 +119,18 @@ def test_digests_are_over_the_message_digests_in_stream_order(
         assert recording.digests() == recording.written_digests() == {"a": expected.hexdigest()}
     with Recording(record([("a", m) for m in messages[:-1]])) as recording:
         assert recording.digests()["a"] != expected.hexdigest()
+
+
+def test_chunks_that_do_not_stay_in_memory_are_read_again(
+    record: Callable[..., Path], noise: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Streams written one after the other: the merge goes to and fro between distant chunks."""
+    rows = [(n, Image(stamp=i, frame=n, data=noise(i, 20, 20))) for n in "abcd" for i in range(12)]
+    path = record(rows, chunk_bytes=1000)
+    monkeypatch.setattr(index, "CACHE_BYTES", 2500)
+    with Recording(path) as recording:
+        got = [(m.stamp, m.stream, m.message) for m in recording.messages()]
+    assert got == sorted(((m.stamp, n, m) for n, m in rows), key=lambda row: row[:2])
 
 
 def test_an_empty_recording_opens(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ def prune_at_once() -> Iterator[None]:
         yield
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=250, deadline=None)
 @given(scenarios(), seeds)
 def test_firings_and_drops_follow_the_rules_for_every_interleaving(scenario: Scenario, seed: int) -> None:
     expected, expected_drops = reference.firings(scenario.spec, scenario.streams, scenario.finals)
@@ -52,7 +52,7 @@ def test_firings_and_drops_follow_the_rules_for_every_interleaving(scenario: Sce
     assert tested.output_frontier() == FOREVER
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(scenarios(), seeds, seeds)
 def test_values_given_to_firings_are_independent_of_arrival_order(
     scenario: Scenario, one: int, two: int

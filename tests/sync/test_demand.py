@@ -163,7 +163,7 @@ def graphs(draw: st.DrawFn) -> Graph:
     return Graph(specs, sources, lags)
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(graphs(), st.integers(0, 2**32 - 1))
 def test_accepted_graphs_run_to_their_end_the_same_way_in_any_order_of_delivery(
     graph: Graph, seed: int
@@ -194,7 +194,7 @@ def worst_simple_cycle(edges: list[Edge]) -> int | None:
 nodes = st.sampled_from("pqrst")
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.lists(
         st.builds(

@@ -151,7 +151,7 @@ def decided_by_rule(
     return any(a > anchor and a >= near for a in anchors) or a_front >= 2 * near - anchor - 1
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
     st.integers(0, 10),
     st.lists(st.integers(0, 40), unique=True, max_size=8).map(sorted),

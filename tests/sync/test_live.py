@@ -155,7 +155,7 @@ def with_restarts(says: dict[str, list[Step]], spec: AlignSpec, rng: random.Rand
     return changed
 
 
-@settings(max_examples=250, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(scenarios(), seeds)
 def test_firings_of_a_live_run_can_be_had_again_from_their_refs(scenario: Scenario, seed: int) -> None:
     rng = random.Random(seed)
@@ -200,7 +200,7 @@ def poll_all_recorded(recorded: RecordedAligner) -> list[Firing]:
     return fired
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(scenarios(), seeds)
 def test_forcing_what_is_waited_for_decides_the_stamp(scenario: Scenario, seed: int) -> None:
     rng = random.Random(seed)

@@ -135,7 +135,8 @@ def landmark_sightings(canvas: Canvas, message: LandmarkSightings) -> None:
                 rr.LineStrips3D(strips, colors=paint[shown], labels=[labels[i] for i in shown]),
             )
             return
-        points = rays * ranges[:, None]
+        with np.errstate(invalid="ignore", over="ignore"):
+            points = rays * ranges[:, None]
     if points is None:
         assert ranges is not None  # polar without bearings
         turn = np.linspace(0, 2 * np.pi, 65)
