@@ -145,7 +145,7 @@ def measure(producer: Producer, shape: tuple[int, int], rounds: int) -> tuple[fl
 
 
 def stall(producer: Producer, consumer: int, seconds: float) -> tuple[int, int]:
-    """Stops the consumer while messages go out at 10 Hz; (messages sent, messages it got)."""
+    """Stops the consumer while 60 images go out, then sends 20 more; (messages sent, messages it got)."""
     images = make_images((480, 640))
     os.kill(consumer, signal.SIGSTOP)
     resume = threading.Timer(seconds, os.kill, (consumer, signal.SIGCONT))

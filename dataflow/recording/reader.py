@@ -99,6 +99,8 @@ class _Channel:
     decode: Decode | None
     stamps: npt.NDArray[np.int64] | None = None
     """By entry; of foreign channels only known after a pass."""
+    by_log_time: bool = False
+    """Foreign messages whose own times are not usable."""
 
 
 class _Entry(NamedTuple):
@@ -425,11 +427,16 @@ class Recording:
             rank += len(order)
 
     def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:
-        """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass."""
+        """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
+
+        Foreign messages of which two carry the same time are stamped with their log times instead.
+        """
         if channel.stamps is None:
             count = len(channel.entries)
             decoded = (self._decode(stream.info.name, channel, i)[0].stamp for i in range(count))
             channel.stamps = np.fromiter(decoded, np.int64, count)
+            if len(np.unique(channel.stamps)) < count:
+                channel.stamps, channel.by_log_time = channel.entries.times, True
         return channel.stamps
 
     def _decode(self, stream: str, channel: _Channel, position: int) -> tuple[Message, int]:
@@ -438,7 +445,10 @@ class Recording:
         try:
             if channel.decode is None:
                 raise RecordingError(f"no decoder for {channel.record.message_encoding} of this schema")
-            return channel.decode(raw, self._companion(channel, raw)), raw.sequence
+            message = channel.decode(raw, self._companion(channel, raw))
+            if channel.by_log_time:
+                message = message.replace(stamp=raw.log_time)
+            return message, raw.sequence
         except (RecordingError, MessageError) as error:
             raise RecordingError(
                 f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {error}"

@@ -13,6 +13,7 @@ from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
 from dataflow.transport.registry import RunningGraph, running
 
 POLL = 0.1
+CONNECT_WITHIN = 5.0
 
 
 class NotRunning(LookupError):
@@ -51,8 +52,20 @@ def still_runs(found: RunningGraph) -> bool:
 def tap(found: RunningGraph, expressions: Sequence[str], window: TapWindow | None = None) -> Iterator[TapClient]:
     """A lossy copy of the streams that match `expressions` (relative to the namespace, absolute with a leading `/`)."""
     absolute = [e[1:] if e.startswith("/") else f"{found.namespace}/{e}" for e in expressions]
-    with Bus(NetworkConfig(connect=found.endpoints)) as bus, TapClient(bus, found.namespace, absolute, window) as client:
-        yield client
+    with Bus(NetworkConfig(connect=found.endpoints)) as bus:
+        _until_connected(bus, found)
+        with TapClient(bus, found.namespace, absolute, window) as client:
+            yield client
+
+
+def _until_connected(bus: Bus, found: RunningGraph) -> None:
+    """Waits (bounded) until every host is reached and answers for its static streams."""
+    expected = {s.name for s in graph_of(found).streams.values() if s.static}
+    deadline = time.monotonic() + CONNECT_WITHIN
+    while len(bus.peers()) < len(found.endpoints) and time.monotonic() < deadline:
+        time.sleep(POLL / 5)
+    while not expected <= set(bus.query_static(found.namespace, timeout=1.0)) and time.monotonic() < deadline:
+        time.sleep(POLL)
 
 
 @contextlib.contextmanager

@@ -261,7 +261,7 @@ class Supervisor:
     def _registered(self) -> Iterator[None]:
         graph = self.plan.graph
         endpoints = [self._endpoints[label] for label, p in self._processes.items() if p.kind == "host"]
-        with registry.register(graph.name, graph.namespace, endpoints):
+        with registry.register(graph.name, graph.namespace, endpoints, graph=graph.to_json()):
             yield
 
     def _release(self) -> None:

@@ -78,7 +78,7 @@ _BASE: dict[str, Any] = {
     "transport/link/tx/lease": 30_000,
     "transport/link/tx/keep_alive": 12,
     "transport/link/tx/queue/congestion_control/block/wait_before_close": 30_000_000,
-    # Large messages are cut into pieces of 64 KB; with the default queue of two pieces 900 KB take three times as long.
+    # Large messages are cut into pieces of 64 KB; Zenoh's default queue is two pieces (benchmarks/transport.md).
     "transport/link/tx/queue/size/data": 16,
     "transport/link/rx/buffer_size": 1 << 20,
     # Zenoh's own shared memory is slower here and leaves files behind (benchmarks/transport.md); ours is in shared.py.

@@ -308,6 +308,11 @@ class RgbdOdometry:
             return Status.RELOCALISED if self._motion.blind_s > 0 else Status.TRACKED
         if fit.depth_agrees and fit.weakest_sigma < 0.05:
             return Status.DEPTH
+        newest = self._keyframes[-1]
+        if len(newest.points) < self.config.min_inliers and not (
+            self.config.refine and newest.surface.coverage > 0.05
+        ):
+            return Status.RESTARTED  # a keyframe of nothing, taken in the dark: waiting for it is in vain
         blind_s = self._motion.blind_s + (stamp - self._motion.stamp) * 1e-9
         if blind_s <= self.config.patience_s:
             return Status.PREDICTED

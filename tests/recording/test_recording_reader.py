@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -209,7 +209,7 @@ def transforms_proto(stamp: int) -> bytes:
     return bytes(proto.SerializeToString())
 
 
-def write_foreign(path: Path, **options: Any) -> None:
+def write_foreign(path: Path, stamps: Sequence[int] = (30, 10, 20, 50, 40), **options: Any) -> None:
     """A file as another program writes it: log times in receiving order, event times within the messages."""
     with path.open("wb") as file:
         writer = Writer(file, chunk_size=200, **options)
@@ -217,7 +217,7 @@ def write_foreign(path: Path, **options: Any) -> None:
         schema = writer.register_schema("foxglove.FrameTransforms", "protobuf", file_descriptor_set(FrameTransforms))
         known = writer.register_channel("/tf", "protobuf", schema)
         unknown = writer.register_channel("/secret", "cbor", 0)
-        for i, stamp in enumerate([30, 10, 20, 50, 40]):
+        for i, stamp in enumerate(stamps):
             writer.add_message(known, log_time=1000 + i, publish_time=0, data=transforms_proto(stamp))
             writer.add_message(unknown, log_time=1000 + i, publish_time=0, data=b"?" * i)
         writer.finish()
@@ -253,6 +253,12 @@ def test_foreign_files_are_read_in_the_order_of_their_event_times(options: dict[
         assert [r.data for r in recording.raw(["/secret"], start=1002)] == [b"??", b"???", b"????"]
         with pytest.raises(RecordingError, match=r"'/secret' holds cbor messages.*raw\(\)"):
             list(recording.messages(["/secret"]))
+
+
+def test_foreign_messages_of_equal_event_times_are_stamped_by_log_time(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.mcap"
+    write_foreign(path, stamps=[30, 10, 10])
+    assert read(path) == [("/tf", 1000), ("/tf", 1001), ("/tf", 1002)]
 
 
 def test_a_foreign_raw_image_is_an_image_or_a_depth_image_by_its_encoding(tmp_path: Path) -> None:

@@ -47,6 +47,15 @@ def test_a_trigger_at_or_before_the_last_decided_stamp_is_late_and_one_above_is_
     assert aligner.drops == {("a", "late"): 2}
 
 
+def test_a_join_that_was_forced_to_pass_over_an_anchor_has_decided_it() -> None:
+    aligner = Aligner(AlignSpec((A, B)))
+    push(aligner, "a", 50)
+    aligner.force("b", 100)
+    assert aligner.poll() is None
+    push(aligner, "b", 50, 60)
+    assert aligner.drops == {("a", "unmatched"): 1, ("b", "late"): 1}
+
+
 def test_what_has_been_promised_downstream_is_decided() -> None:
     aligner = Aligner(AlignSpec((A,)))
     aligner.force("a", 100)

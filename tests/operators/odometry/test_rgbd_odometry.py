@@ -296,6 +296,15 @@ def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
     assert sigma[0] > 0.05
 
 
+def test_a_start_in_the_dark_costs_no_more_than_the_dark() -> None:
+    frames, poses = sequence(40)
+    results = follow([black(without_depth(f)) if i < 5 else f for i, f in enumerate(frames)])
+    assert results[5].status is Status.RESTARTED
+    assert all(r.status is Status.TRACKED for r in results[7:])
+    moved = invert(results[5].T_world_camera) @ results[39].T_world_camera
+    assert np.abs(se3.log(invert(invert(poses[5]) @ poses[39]) @ moved)).max() < 0.01
+
+
 def test_nothing_ever_seen_stays_put() -> None:
     nothing = (np.zeros((240, 320), np.uint8), np.zeros((240, 320), np.float32))
     results = follow([nothing] * 10)
