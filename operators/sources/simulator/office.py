@@ -1,0 +1,98 @@
+"""The office: a room with desks and shelves along its walls, a table in its middle that the robot drives around."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from operators.sources.simulator import furniture
+from operators.sources.simulator.furnishing import (
+    FLOOR,
+    Style,
+    Wall,
+    decorate,
+    lay_floor,
+    line_wall,
+    put_on_floor,
+    raise_wall,
+    scatter,
+    small_items,
+)
+from operators.sources.simulator.scene import Builder, Light, World
+from operators.sources.simulator.shapes import Array, pose
+from operators.sources.simulator.trajectory import Trajectory
+
+REACH = 2.45
+"""Metres between the walls and the robot's path: furniture, then room for those who walk, roll or drive there."""
+
+
+def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
+    """A world of about nine by eight metres, drawn from the seed."""
+    rng = np.random.default_rng([seed, 1])
+    half_x, half_y, height = rng.uniform(4.3, 5.0), rng.uniform(3.7, 4.2), rng.uniform(2.5, 2.9)
+    builder, style = Builder(), Style.drawn(rng)
+    lay_floor(builder, (-half_x, -half_y), (half_x, half_y), height, style)
+    corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
+    walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
+    accent = int(rng.integers(4))
+    door_wall = int(rng.integers(4))
+    for k, wall in enumerate(walls):
+        raise_wall(builder, wall, style, accent=k == accent)
+        half = wall.length / 2 - 0.75  # the corners stay free: furniture of two walls would meet there
+        free = [(-half, half)]
+        taken: list[tuple[float, float]] = []
+        if k == door_wall:
+            middle, width = rng.uniform(-0.4, 0.4) * half, rng.uniform(0.85, 0.95)
+            shape = furniture.door(rng, width, rng.uniform(2.0, 2.1), rng.uniform(0.0, 0.9))
+            put_on_floor(builder, "door", shape, wall.place(0.0, middle))
+            free = [(-half, middle - 0.75), (middle + 0.75, half)]
+            taken.append((middle - 0.65, middle + 0.65))
+        line_wall(builder, rng, wall, free)
+        decorate(builder, rng, wall, windows=k in (0, 2), taken=taken)
+
+    a, b = half_x - REACH, half_y - REACH
+    path = Trajectory(_loop(rng, a, b), speed=speed, hold=hold)
+    _island(builder, rng, min(a, b) - 0.42)
+    lights = tuple(
+        Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(0.95, 1.25)) for sx in (-1, 1) for sy in (-1, 1)
+    )
+    landmarks = _landmarks(rng, walls)
+    pitch = math.radians(rng.uniform(7, 11))
+    return World(
+        "office",
+        tuple(builder.things),
+        lights,
+        0.5,
+        path,
+        landmarks,
+        (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, pitch, 0.0),
+        tuple(builder.placements),
+        tuple(builder.scripts),
+    )
+
+
+def _loop(rng: np.random.Generator, a: float, b: float) -> Array:
+    """Waypoints of an uneven oval, counter-clockwise."""
+    angle = np.linspace(0, 2 * math.pi, 12, endpoint=False) + rng.uniform(0, 2 * math.pi)
+    wobble = 1 - 0.06 * (1 + np.sin(3 * angle + rng.uniform(0, 6)))
+    return np.stack([a * wobble * np.cos(angle), b * wobble * np.sin(angle)], axis=1)
+
+
+def _island(builder: Builder, rng: np.random.Generator, radius: float) -> None:
+    """A small table in the middle of the room, within a circle, and what lies on it."""
+    length, depth = radius * rng.uniform(1.25, 1.4), radius * rng.uniform(0.8, 1.0)
+    shape, surface = furniture.table(rng, length, depth, rng.uniform(0.45, 0.75))
+    T = pose(0, 0, 0, rng.uniform(-math.pi, math.pi))
+    id = builder.put("table", shape, T, on=FLOOR)
+    scatter(builder, rng, id, T, surface, small_items(rng, 6))
+
+
+def _landmarks(rng: np.random.Generator, walls: list[Wall]) -> Array:
+    """Four points on every wall."""
+    points = [
+        wall.place(0.03, wall.length * (share + rng.uniform(-0.05, 0.05)), rng.uniform(1.0, 2.2))[:3, 3]
+        for wall in walls
+        for share in (-0.36, -0.12, 0.12, 0.36)
+    ]
+    return np.array(points)
