@@ -21,6 +21,7 @@ class Kind(StrEnum):
     COMPANION = "companion"
     FIRINGS = "firings"
     EVENTS = "events"
+    FRAMES = "frames"
 
 
 EVENT_SCHEMA: Final = json.dumps(
@@ -51,6 +52,10 @@ def firings_topic(namespace: str, operator: str) -> str:
 
 def events_topic(namespace: str) -> str:
     return _internal(namespace, "events")
+
+
+def frames_topic(namespace: str) -> str:
+    return _internal(namespace, "frames")
 
 
 def _internal(namespace: str, rest: str) -> str:

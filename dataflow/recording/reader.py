@@ -253,7 +253,7 @@ class Recording:
             kind = channel.metadata.get("kind")
             if kind == Kind.COMPANION:
                 companions[_key(channel, channel.metadata.get("companion_of", ""))] = channel
-            elif kind not in (Kind.FIRINGS, Kind.EVENTS):
+            elif kind not in (Kind.FIRINGS, Kind.EVENTS, Kind.FRAMES):
                 grouped.setdefault(channel.topic, []).append(channel)
         found = {name: self._find_stream(name, channels, companions, sizes) for name, channels in grouped.items()}
         return dict(sorted(found.items()))

@@ -9,11 +9,13 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from dataflow.messages import Transforms
 from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest
 from dataflow.recording.container import CHUNK_BYTES, CHUNK_SECONDS, Buffer, Compression, ContainerWriter
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.frames import FrameTree
 from dataflow.recording.json_codec import TIMESTAMP, encode_object, timestamp_object
 from dataflow.recording.layout import (
     COMPANION_SUFFIX,
@@ -26,6 +28,7 @@ from dataflow.recording.layout import (
     Kind,
     events_topic,
     firings_topic,
+    frames_topic,
 )
 from dataflow.sync.stamps import FOREVER
 
@@ -79,6 +82,9 @@ class RecordingWriter:
         self._firings: dict[str, tuple[int, int]] = {}
         self._events: tuple[int, int] | None = None
         self._newest = 0
+        self._frames = FrameTree()
+        self._frames_channel: int | None = None
+        self._frames_written = 0
         try:
             self._file.add_metadata(RECORDING, {"format": FORMAT, "namespace": namespace})
             for name, mapping in metadata.items():
@@ -148,6 +154,7 @@ class RecordingWriter:
         group: list[tuple[int, int, int, list[Buffer]]] = [(known.channel, stamp, sequence, list(parts))]
         if extra is not None:
             group.append((self._companion(known), stamp, sequence, [extra]))
+        group += self._frame_group(stream, message)
         self._file.add_messages(group)
         known.last_seq, known.last_stamp = seq, stamp
         known.digest.update(message.digest())
@@ -260,6 +267,22 @@ class RecordingWriter:
             topic = stream.name + COMPANION_SUFFIX
             stream.companion = self._file.add_channel(topic, "json", self._schema(schema), metadata)
         return stream.companion
+
+    def _frame_group(self, stream: str, message: Message) -> list[tuple[int, int, int, list[Buffer]]]:
+        """The derived transforms that let other people's viewers put things in place."""
+        group: list[tuple[int, int, int, list[Buffer]]] = []
+        for transforms in self._frames.transforms(stream, message):
+            codec = codec_for(Transforms)
+            if self._frames_channel is None:
+                topic = frames_topic(self._namespace)
+                schema = self._schema(codec.schema())
+                self._frames_channel = self._file.add_channel(
+                    topic, codec.message_encoding, schema, {"kind": Kind.FRAMES}
+                )
+            parts, _ = codec.encode(transforms)
+            group.append((self._frames_channel, message.stamp, self._frames_written % SEQUENCE_SPAN, list(parts)))
+            self._frames_written += 1
+        return group
 
     def _add_firings_channel(self, operator: str) -> int:
         metadata = {"kind": Kind.FIRINGS, "operator": operator}

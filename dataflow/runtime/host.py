@@ -20,10 +20,11 @@ from dataflow.runtime.control import Channel, ChannelClosed
 from dataflow.runtime.feed import Feed, LogFeed, Window
 from dataflow.runtime.firings import FiringRecord, encode_batch
 from dataflow.runtime.keys import firings_key
+from dataflow.runtime.network import network_config
 from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner
 from dataflow.runtime.threads import limit_threads
 from dataflow.sync import NEVER, Entry
-from dataflow.transport import Bus, DecodeError, Envelope, Kind, NetworkConfig, TapServer, decode, encode
+from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode, encode
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.004
@@ -177,17 +178,10 @@ class Host:
 
     def open(self) -> None:
         """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
-        network = self.graph.network
-        self.bus = Bus(
-            NetworkConfig(
-                listen=tuple(self.config.listen),
-                connect=tuple(self.config.connect),
-                shared_memory=network.shared_memory,
-            )
-        )
+        self.bus = Bus(network_config(self.graph.network, self.config.listen, self.config.connect))
         self.taps = TapServer(self.bus, self.graph.namespace)
-        for stream in self.config.publish:
-            self.remote[stream] = self.bus.publisher(stream)
+        for stream, consumers in self.config.publish.items():
+            self.remote[stream] = self.bus.publisher(stream, consumers=consumers)
         for stream in self.config.subscribe:
             self.bus.subscribe(stream, self._receiver(stream))
         self.channel.send("joined")

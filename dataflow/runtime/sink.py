@@ -18,8 +18,9 @@ from dataflow.messages.base import Message, message_type
 from dataflow.runtime.control import Channel, ChannelClosed
 from dataflow.runtime.firings import decode_batch
 from dataflow.runtime.keys import firings_key
+from dataflow.runtime.network import network_config
 from dataflow.sync import FOREVER, NEVER
-from dataflow.transport import Bus, DecodeError, Kind, NetworkConfig, decode
+from dataflow.transport import Bus, DecodeError, Kind, decode
 from dataflow.transport.codec import MAGIC
 
 IDLE_WAIT = 0.1
@@ -88,11 +89,7 @@ class SinkHost:
         self._outcome = "the supervisor is gone"
 
     def open(self) -> None:
-        self.bus = Bus(
-            NetworkConfig(
-                listen=(), connect=tuple(self.config.connect), shared_memory=self.graph.network.shared_memory
-            )
-        )
+        self.bus = Bus(network_config(self.graph.network, [], self.config.connect))
         for key in (*self.frontiers, *self.firings_open):
             self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")

@@ -17,7 +17,7 @@ from typing import Any, Self
 import zenoh
 
 from dataflow.transport.codec import Buffer, DecodeError, Envelope, Kind, encode_head, encode_parts, parts_size
-from dataflow.transport.keys import RUNTIME, alive_key, runtime_key, shared_key, static_key, stream_of
+from dataflow.transport.keys import RUNTIME, alive_key, alive_name, shared_key, static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
 from dataflow.transport.shared import (
     SUPPORTED,
@@ -328,7 +328,7 @@ class Bus:
         """
         wanted = zenoh.KeyExpr.autocanonize(expression)
         replies = self.session.get(
-            runtime_key(namespace, "static", "**"),
+            static_key(f"{namespace}/**"),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout,
@@ -338,7 +338,7 @@ class Bus:
             sample = reply.ok
             if sample is None:
                 continue
-            stream = stream_of(str(sample.key_expr))
+            stream = stream_of_static(str(sample.key_expr))
             if wanted.intersects(zenoh.KeyExpr(stream)):
                 found[stream] = bytes(sample.payload)
         return found
@@ -353,12 +353,12 @@ class Bus:
         """Calls `changed(name, alive)` for those present already, and on every change. Runs on Zenoh's thread."""
 
         def on_sample(sample: zenoh.Sample) -> None:
-            changed(str(sample.key_expr).rpartition("/")[2], sample.kind == zenoh.SampleKind.PUT)
+            changed(alive_name(namespace, str(sample.key_expr)), sample.kind == zenoh.SampleKind.PUT)
 
         return self._keep(
             Token(
                 self.session.liveliness().declare_subscriber(
-                    alive_key(namespace, "*"), zenoh.handlers.Callback(on_sample, indirect=False), history=True
+                    alive_key(namespace, "**"), zenoh.handlers.Callback(on_sample, indirect=False), history=True
                 )
             )
         )

@@ -1,19 +1,12 @@
 """The runtime's own Zenoh keys. They live behind the verbatim chunk `@`, which no wildcard matches.
 
-A stream's key is its name, `<namespace>/<operator>/<port>`; a namespace may have several chunks.
+A stream's key is its name, `<namespace>/<operator>/<port>`; a namespace may have several chunks, and so may the name of
+an operator of a nested graph. What concerns one stream lies below its own key.
 """
 
 from __future__ import annotations
 
 RUNTIME = "@"
-
-
-def split_stream(stream: str) -> tuple[str, str, str]:
-    """(namespace, operator, port) of a stream name; raises `ValueError` when it has fewer than three chunks."""
-    chunks = stream.rsplit("/", 2)
-    if len(chunks) != 3 or not all(chunks):
-        raise ValueError(f"stream {stream!r}: expected <namespace>/<operator>/<port>")
-    return chunks[0], chunks[1], chunks[2]
 
 
 def runtime_key(namespace: str, *chunks: str) -> str:
@@ -22,24 +15,35 @@ def runtime_key(namespace: str, *chunks: str) -> str:
 
 
 def static_key(stream: str) -> str:
-    """Where the static stream `stream` is answered to late joiners."""
-    namespace, operator, port = split_stream(stream)
-    return runtime_key(namespace, "static", operator, port)
+    """Where the static stream `stream` (or those that match an expression) is answered to late joiners."""
+    return f"{stream}/{RUNTIME}/static"
+
+
+def stream_of_static(key: str) -> str:
+    """The stream that a `static_key` is about."""
+    return key.removesuffix(f"/{RUNTIME}/static")
 
 
 def shared_key(stream: str, machine: str, pid: str, descriptor: str, bus: str) -> str:
     """The liveliness token of a consumer of `stream` that can read shared memory."""
-    namespace, operator, port = split_stream(stream)
-    return runtime_key(namespace, "shm", operator, port, machine, pid, descriptor, bus)
+    return "/".join((stream, RUNTIME, "shm", machine, pid, descriptor, bus))
+
+
+def tap_key(namespace: str, tap: str, stream: str) -> str:
+    """Where the copies of `stream` for one tap travel."""
+    return runtime_key(namespace, "tap", tap, stream.removeprefix(f"{namespace}/"))
+
+
+def stream_of_tap(namespace: str, tap: str, key: str) -> str:
+    """The stream that a `tap_key` is about."""
+    return f"{namespace}/{key.removeprefix(runtime_key(namespace, 'tap', tap) + '/')}"
 
 
 def alive_key(namespace: str, operator: str) -> str:
-    """The liveliness token of an operator."""
+    """The liveliness token of an operator; `**` for all of them."""
     return runtime_key(namespace, "alive", operator)
 
 
-def stream_of(key: str) -> str:
-    """The stream that a runtime key `<namespace>/@/<word>/.../<operator>/<port>` is about."""
-    namespace, _, rest = key.partition(f"/{RUNTIME}/")
-    operator, _, port = rest.rpartition("/")
-    return f"{namespace}/{operator.rpartition('/')[2]}/{port}"
+def alive_name(namespace: str, key: str) -> str:
+    """The operator that an `alive_key` is about."""
+    return key.removeprefix(alive_key(namespace, ""))

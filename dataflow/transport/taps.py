@@ -23,7 +23,7 @@ import zenoh
 
 from dataflow.transport.bus import Bus, undeclare
 from dataflow.transport.codec import DEFAULT_LIMITS, Envelope, Head, Limits, decode, decode_head, encode
-from dataflow.transport.keys import runtime_key, stream_of
+from dataflow.transport.keys import runtime_key, stream_of_tap, tap_key
 
 SYNC_EVERY = 0.5
 SPEC_WITHIN = 10.0
@@ -277,9 +277,7 @@ class TapServer:
             found = tap.next()
             if found is not None:
                 stream, copy = found
-                operator, port = stream.rsplit("/", 2)[1:]
-                key = runtime_key(self._namespace, "tap", tap.id, operator, port)
-                due.append((key, copy, tap.attachment(self._host)))
+                due.append((tap_key(self._namespace, tap.id, stream), copy, tap.attachment(self._host)))
                 self._sent += 1
             elif tap.sent_messages > tap.acked_messages and now - tap.quiet_since >= SYNC_EVERY:
                 tap.quiet_since = now
@@ -455,7 +453,7 @@ class TapClient:
                 self.refused += 1
                 return
             origin.received, origin.skipped = (messages, nbytes), skipped
-            stream = stream_of(key) if payload else ""
+            stream = stream_of_tap(self._namespace, self.id, key) if payload else ""
             self._queue.append((stream, payload, host, (messages, nbytes), epoch))
             self._arrived.notify()
 

@@ -131,3 +131,17 @@ def test_large_messages_arrive_whole(mixed: Graph) -> None:
     graph = load_graph(HERE / "mixed.yaml", settings=["count=20", "padding=300000"])
 
     assert run(graph, placement="one_host").digests() == run(graph, placement="host_each").digests()
+
+
+def test_operators_of_nested_graphs_run_in_hosts_of_their_own_and_are_seen_by_tools(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    graph = load_graph(HERE / "outer.yaml")
+
+    together = run(graph, placement="one_host")
+    apart = run(graph, placement="host_each", record=tmp_path / "run.mcap")
+
+    assert together.digests() == apart.digests()
+    assert apart.streams["fleet/robot1/front/counter/constant"][0] == 1
+    assert replay(tmp_path / "run.mcap", placement="host_each").digests() == apart.digests()

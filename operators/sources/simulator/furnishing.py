@@ -221,7 +221,7 @@ def put_shelf(builder: Builder, rng: Rng, wall: Wall, along: float, width: float
     T = wall.place(depth / 2 + 0.02, along)
     id = builder.put("shelf", shape, T, on=FLOOR)
     for board in boards[:-1]:
-        if rng.uniform() < 0.62:
+        if rng.uniform() < 0.55:
             _row_of_books(builder, rng, id, T, board)
         else:
             scatter(builder, rng, id, T, board, small_items(rng, 3), inside=True)
@@ -231,9 +231,9 @@ def put_shelf(builder: Builder, rng: Rng, wall: Wall, along: float, width: float
 
 
 def _row_of_books(builder: Builder, rng: Rng, id: int, T: Array, board: Surface) -> None:
-    y = -board.half_y + rng.uniform(0.0, 0.1)
-    end = board.half_y - rng.uniform(0.0, 0.4 * board.half_y)
-    while True:
+    y = rng.uniform(-1, 0.5) * board.half_y
+    end = board.half_y
+    for _ in range(int(rng.integers(3, 8))):
         shape, (width, thick, height) = objects.book(rng, upright=True)
         if y + thick > end:
             return

@@ -26,9 +26,9 @@ from operators.sources.simulator.textures import LEVELS, SIZE, Atlas, make_atlas
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 
-_CHUNK = 1 << 15  # pixels shaded at once: the work stays in the cache
+_CHUNK = 1 << 14  # pixels shaded at once: the work stays in the cache (and remap takes no more than 32,767)
 _NONE = 0xFFFFFFFF
-_APART = 256.0  # metres between things in the scene of silhouettes
+_APART = 64.0  # metres between things in the scene of silhouettes; no world is wider than half of it
 _SILHOUETTE_RAYS = 1024  # about so many rays judge how much of a thing would be seen
 
 
@@ -253,7 +253,7 @@ class Renderer:
             rays[:, :3] = T_world_camera[:3, 3]
             local = np.stack([(u.ravel() - optics.cx) / optics.fx, (v.ravel() - optics.cy) / optics.fy, np.ones(u.size)])
             rays[:, 3:] = (R @ local.astype(np.float32)).T
-            rays[:, 0] += np.float32(_APART * k)
+            rays[:, :2] += _shift(np.array([k]))[0, :2].astype(np.float32)
             (still if self.world.things[k].still else moving).append((slot, rays, stride))
         if moving and self._apart_movers is None:
             self._apart_movers = (self._apart.movers(self._moved), self._moved)
@@ -263,7 +263,7 @@ class Renderer:
             distance, *_ = self._first_hit(scene, np.concatenate([rays for _, rays, _ in jobs]))
             end = 0
             for slot, rays, stride in jobs:
-                near = distance[end : end + len(rays)] < 0.4 * _APART
+                near = distance[end : end + len(rays)] < 0.5 * _APART
                 counts[slot] = np.count_nonzero(near) * stride * stride
                 end += len(rays)
         return counts
@@ -362,7 +362,7 @@ _SHRINK = np.array([0.5**k for k in range(LEVELS)], np.float32)
 
 def _shift(things: NDArray[np.int32]) -> Array:
     shift = np.zeros((len(things), 3))
-    shift[:, 0] = _APART * things
+    shift[:, 0], shift[:, 1] = _APART * (things % 32), _APART * (things // 32)
     return shift
 
 
