@@ -241,13 +241,18 @@ class Operator:
     def __init_subclass__(
         cls,
         *,
-        merge: bool = False,
-        tolerance: str | int = 0,
+        merge: bool | None = None,
+        tolerance: str | int | None = None,
         every: str | int | None = None,
         abstract: bool = False,
         **kwargs: Any,
     ) -> None:
         super().__init_subclass__(**kwargs)
+        above: OperatorSpec | None = getattr(cls, "spec", None)
+        if above is not None:  # what a subclass does not say itself, it inherits
+            merge = above.merge if merge is None else merge
+            tolerance = above.tolerance if tolerance is None else tolerance
+            every = above.every if every is None else every
         if not abstract:
             cls.spec = _declare(cls, merge, tolerance, every, sys._getframe(1).f_locals)
 
@@ -363,7 +368,11 @@ def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
 
 
 def _declare(
-    cls: type[Operator], merge: bool, tolerance: str | int, every: str | int | None, local: Mapping[str, Any]
+    cls: type[Operator],
+    merge: bool | None,
+    tolerance: str | int | None,
+    every: str | int | None,
+    local: Mapping[str, Any],
 ) -> OperatorSpec:
     def fault(attribute: str, text: str) -> OperatorDefinitionError:
         return OperatorDefinitionError(f"{cls.__module__}.{cls.__qualname__}.{attribute}: {text}")
@@ -420,7 +429,8 @@ def _declare(
 
     triggers = [p for p in inputs.values() if p.kind == "in"]
     period = None if every is None else parse_duration(every)
-    window = parse_duration(tolerance)
+    window = 0 if tolerance is None else parse_duration(tolerance)
+    merge = bool(merge)
     if period is not None and period <= 0:
         raise fault("every", f"must be positive, got {every!r}")
     if merge and window:

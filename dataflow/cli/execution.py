@@ -2,104 +2,176 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dataflow.cli.output import INTERRUPTED, err, fail, friendly_errors, out, print_json
+from dataflow.cli.arguments import (
+    FLAG,
+    End,
+    GraphFile,
+    RecordingFile,
+    Settings,
+    Start,
+    existing,
+    output_file,
+    span,
+    window,
+)
+from dataflow.cli.output import INTERRUPTED, err, fail, friendly_errors, out, print_json, say, size
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.runtime.execute import Watch
     from dataflow.runtime.supervisor import RunReport
 
-Settings = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
+_PLACEMENT, _OUTPUT = "Placement", "Results"
+
+OneHost = Annotated[
+    bool,
+    typer.Option("--one-host", metavar=FLAG, rich_help_panel=_PLACEMENT, help="Run all operators in one process."),
 ]
-OneHost = Annotated[bool, typer.Option("--one-host", help="Run all operators in one process.")]
-HostEach = Annotated[bool, typer.Option("--host-each", help="Run every operator in a process of its own.")]
+HostEach = Annotated[
+    bool,
+    typer.Option(
+        "--host-each", metavar=FLAG, rich_help_panel=_PLACEMENT, help="Run every operator in a process of its own."
+    ),
+]
 Place = Annotated[
     list[str] | None,
-    typer.Option("--place", metavar="OPERATOR=HOST", help="Run OPERATOR in the process HOST. May be repeated."),
+    typer.Option(
+        "--place",
+        metavar="OPERATOR=HOST",
+        rich_help_panel=_PLACEMENT,
+        help="Run OPERATOR in the process HOST. May be repeated.",
+    ),
 ]
 Record = Annotated[
-    Path | None, typer.Option("--record", metavar="FILE.mcap", help="Record the graph's streams and firings.")
+    Path | None,
+    typer.Option(
+        "--record", metavar="FILE.mcap", rich_help_panel=_OUTPUT, help="Record the graph's streams and firings."
+    ),
 ]
 View = Annotated[
     str | None,
     typer.Option(
         "--view",
-        metavar="spawn|serve|FILE.rrd",
-        help="Open the viewer, serve it to a browser, or save everything to a file.",
+        metavar="TARGET",
+        rich_help_panel=_OUTPUT,
+        help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: save everything that is shown.",
     ),
 ]
-Rate = Annotated[
-    float | None, typer.Option("--rate", min=1e-6, help="Pace: 1 is real time. Default: as fast as the graph goes.")
+Open = Annotated[
+    bool,
+    typer.Option(
+        "--open",
+        metavar=FLAG,
+        rich_help_panel=_OUTPUT,
+        help="With --view FILE.rrd: open the saved file in the viewer when there is a display.",
+    ),
 ]
-Paranoid = Annotated[bool, typer.Option("--paranoid", help="Catch operators that write into their inputs.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the recording if it exists.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the report, digests included, as JSON.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress display.")]
+Replace = Annotated[
+    bool,
+    typer.Option("--overwrite", metavar=FLAG, rich_help_panel=_OUTPUT, help="Replace output files that exist."),
+]
+Json = Annotated[
+    bool,
+    typer.Option("--json", metavar=FLAG, rich_help_panel=_OUTPUT, help="Print the report, digests included, as JSON."),
+]
+Rate = Annotated[
+    float | None,
+    typer.Option("--rate", metavar="RATE", help="Pace: 1 is real time. Default: as fast as the graph goes."),
+]
+Paranoid = Annotated[
+    bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
+]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]
+
+
+@dataclass(frozen=True, slots=True)
+class _Outputs:
+    """What a run leaves behind or shows, checked before anything starts."""
+
+    record: Path | None
+    view_file: Path | None
+    live_view: str | None
+    open_file: bool
+    overwrite: bool
 
 
 def run(
-    graph: Annotated[Path, typer.Argument(help="The graph file.")],
+    graph: GraphFile,
     settings: Settings = None,
+    rate: Rate = None,
+    paranoid: Paranoid = False,
+    quiet: Quiet = False,
     one_host: OneHost = False,
     host_each: HostEach = False,
     place: Place = None,
     record: Record = None,
-    overwrite: Overwrite = False,
     view: View = None,
-    rate: Rate = None,
-    paranoid: Paranoid = False,
+    open_view: Open = False,
+    overwrite: Replace = False,
     json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
-    """Run a graph file.
+    """Run a graph.
 
-    \b
-    dataflow run graphs/synthetic_rgbd.yaml
-    dataflow run graphs/rgbd_perception.yaml --set data=PATH --record out/run.mcap --view spawn
-    dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1
+    A table of its operators is shown while it runs, and a summary at the end. Ctrl-C ends it in order: sources stop,
+    everything on its way is finished, files are closed; a second Ctrl-C ends it at once.
+
+    Examples:
+
+      dataflow run graphs/synthetic_rgbd.yaml
+      dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --view spawn
+      dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
+      dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
+      dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1 --json
     """
     from dataflow.graph import load_graph
     from dataflow.runtime.execute import run as run_graph
 
     with friendly_errors():
-        loaded = load_graph(graph, settings=settings or ())
-        options = _options(loaded, one_host, host_each, place, record, overwrite, view, rate, paranoid)
-        _execute(
-            lambda watch: run_graph(loaded, watch=watch, **options), loaded, view, None, json=json, quiet=quiet or json
-        )
+        loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+        outputs = _outputs(record, view, open_view, overwrite)
+        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid)
+        _execute(lambda watch: run_graph(loaded, watch=watch, **options), loaded, outputs, None, json=json, quiet=quiet)
 
 
 def replay(
-    recording: Annotated[Path, typer.Argument(help="The recording (.mcap).")],
+    recording: RecordingFile,
     graph: Annotated[
-        Path | None, typer.Option("--graph", help="Another graph than the one that made the recording.")
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
     settings: Settings = None,
-    start: Annotated[float | None, typer.Option(min=0, help="Seconds from the first message.")] = None,
-    end: Annotated[float | None, typer.Option(min=0, help="Seconds from the first message.")] = None,
+    start: Start = None,
+    end: End = None,
+    rate: Rate = None,
+    paranoid: Paranoid = False,
+    quiet: Quiet = False,
     one_host: OneHost = False,
     host_each: HostEach = False,
     place: Place = None,
     record: Record = None,
-    overwrite: Overwrite = False,
     view: View = None,
-    rate: Rate = None,
-    paranoid: Paranoid = False,
+    open_view: Open = False,
+    overwrite: Replace = False,
     json: Json = False,
-    quiet: Quiet = False,
 ) -> None:
-    """Replay a recording: recorded streams replace the sources, everything else runs again, with identical results.
+    """Replay a recording through the graph that made it, or another one.
 
-    \b
-    dataflow replay recordings/demo.mcap
-    dataflow replay out/run.mcap --graph graphs/other.yaml --record out/again.mcap
-    dataflow replay out/run.mcap --start 5 --end 10 --rate 1 --view spawn
+    Recorded streams replace the sources; everything else runs again, with identical results. Compare two recordings of
+    it with `dataflow diff`.
+
+    Examples:
+
+      dataflow replay run.mcap
+      dataflow replay run.mcap --start 5 --end 10 --rate 1 --view spawn
+      dataflow replay run.mcap --graph other.yaml --set cloud.stride=8
+      dataflow replay run.mcap --record again.mcap --view again.rrd --open
     """
     from dataflow.graph import load_graph
     from dataflow.recording import Recording
@@ -107,79 +179,120 @@ def replay(
     from dataflow.runtime.replay import plan_replay, recorded_graph
 
     with friendly_errors():
-        if record is not None and record.exists() and record.resolve() == recording.resolve():
+        existing(recording, "a recording")
+        if record is not None and record.exists() and record.samefile(recording):
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
         with Recording(recording) as opened:
-            if graph is None and settings:
-                raise fail("--set changes a graph file: name it with --graph")
-            loaded = recorded_graph(opened) if graph is None else load_graph(graph, settings=settings or ())
-            log = plan_replay(opened, loaded, start=start, end=end)
-            infos = [opened.streams[s] for s in log.streams if not opened.streams[s].static]
-        first = max(min((i.first for i in infos if i.first is not None), default=0), log.start or 0)
-        last = max((i.last for i in infos if i.last is not None), default=0)
-        span = (first, last if log.end is None else min(last, log.end))
-        options = _options(loaded, one_host, host_each, place, record, overwrite, view, rate, paranoid)
+            if graph is None:
+                loaded = recorded_graph(opened)
+            else:
+                loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+            whole = span(opened, plan_replay(opened, loaded).streams)
+            begin, finish = window(whole, start, end, recording)
+        outputs = _outputs(record, view, open_view, overwrite)
+        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid)
+        shown = None
+        if whole is not None:
+            shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
         _execute(
             lambda watch: replay_recording(recording, graph=loaded, start=start, end=end, watch=watch, **options),
             loaded,
-            view,
-            span,
+            outputs,
+            shown,
             json=json,
-            quiet=quiet or json,
+            quiet=quiet,
         )
+
+
+def _outputs(record: Path | None, view: str | None, open_view: bool, overwrite: bool) -> _Outputs:
+    saves = view is not None and view.endswith(".rrd")
+    if view is not None and view not in ("spawn", "serve") and not saves:
+        raise fail(f"--view {view!r}: expected spawn, serve, or a file name that ends in .rrd")
+    if open_view and not saves:
+        raise fail("--open opens a saved file: it needs --view FILE.rrd")
+    if view == "spawn":
+        from dataflow.cli.viewing import require_display
+
+        require_display()
+    if record is not None:
+        output_file(record, ".mcap", overwrite=overwrite, option="--record")
+    view_file = Path(view) if view is not None and saves else None
+    if view_file is not None:
+        output_file(view_file, ".rrd", overwrite=overwrite, option="--view")
+    return _Outputs(record, view_file, None if saves else view, open_view, overwrite)
 
 
 def _options(
     graph: Graph,
+    outputs: _Outputs,
     one_host: bool,
     host_each: bool,
     place: list[str] | None,
-    record: Path | None,
-    overwrite: bool,
-    view: str | None,
     rate: float | None,
     paranoid: bool,
 ) -> dict[str, Any]:
-    if one_host + host_each + bool(place) > 1:
-        raise fail("--one-host, --host-each and --place exclude each other")
-    placement: Any = "one_host" if one_host else "host_each" if host_each else "graph"
-    if place:
-        placement = {}
-        for word in place:
-            operator, separator, host = word.partition("=")
-            if not separator or not host or operator not in graph.nodes:
-                known = ", ".join(graph.nodes)
-                raise fail(f"--place {word!r}: expected OPERATOR=HOST with an operator of the graph ({known})")
-            placement[operator] = host
-    if record is not None and record.exists() and not overwrite:
-        raise fail(f"{record} exists; name another file, or replace it with --overwrite")
-    if view is not None and view not in ("spawn", "serve") and not view.endswith(".rrd"):
-        raise fail(f"--view {view!r}: expected spawn, serve, or a file that ends in .rrd")
+    if rate is not None and not 0 < rate < float("inf"):
+        raise fail(f"--rate {rate:g}: expected a number above 0; 1 is real time")
     return {
-        "placement": placement,
-        "record": record,
-        "overwrite": overwrite,
-        "view_file": Path(view) if view is not None and view.endswith(".rrd") else None,
+        "placement": _placement(graph, one_host, host_each, place),
+        "record": outputs.record,
+        "overwrite": outputs.overwrite,
+        "view_file": outputs.view_file,
         "rate": rate,
         "paranoid": paranoid,
     }
 
 
-def _execute(
-    start: Any, graph: Graph, view: str | None, span: tuple[int, int] | None, *, json: bool, quiet: bool
-) -> None:
-    from dataflow.cli.progress import RunDisplay, print_report, report_json, shown
-    from dataflow.runtime.attach import attached_viewer
+def _placement(graph: Graph, one_host: bool, host_each: bool, place: list[str] | None) -> Any:
+    if one_host + host_each + bool(place) > 1:
+        raise fail("--one-host, --host-each and --place exclude each other")
+    if not place:
+        return "one_host" if one_host else "host_each" if host_each else "graph"
+    placement = {}
+    for word in place:
+        operator, separator, host = word.partition("=")
+        if not separator or not host or operator not in graph.nodes:
+            known = ", ".join(graph.nodes)
+            raise fail(f"--place {word!r}: expected OPERATOR=HOST with an operator of the graph ({known})")
+        placement[operator] = host
+    return placement
 
-    display = RunDisplay(err, span=span)
-    target = view if view in ("spawn", "serve") else None
-    with attached_viewer(graph.name, target), shown(err, display, quiet=quiet) as watch:
-        report: RunReport = start(watch)
+
+def _execute(
+    start: Callable[[Watch | None], RunReport],
+    graph: Graph,
+    outputs: _Outputs,
+    shown_span: tuple[int, int] | None,
+    *,
+    json: bool,
+    quiet: bool,
+) -> None:
+    from dataflow.cli.progress import RunDisplay, shown
+    from dataflow.cli.report import print_report, report_json
+    from dataflow.cli.viewing import attached_viewer, open_saved
+    from dataflow.runtime.supervisor import RunFailed
+
+    display = RunDisplay(err, sources=[node.name for node in graph.sources()], span=shown_span)
+    try:
+        with attached_viewer(outputs.live_view), shown(err, display, quiet=quiet) as watch:
+            report = start(watch)
+    except RunFailed:
+        _say_what_is_left(outputs)
+        raise
     if json:
         print_json(report_json(report))
     else:
         print_report(out, report)
+    if outputs.open_file and outputs.view_file is not None:
+        open_saved(outputs.view_file)
     if report.interrupted:
         raise typer.Exit(INTERRUPTED)
 
 
+def _say_what_is_left(outputs: _Outputs) -> None:
+    """After a failure: which files hold what came before it."""
+    for file in (outputs.record, outputs.view_file):
+        if file is not None and file.exists():
+            say(f"[dim]{file} ({size(file.stat().st_size)}) holds what came before the failure[/]")

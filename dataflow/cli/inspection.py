@@ -3,65 +3,87 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.padding import Padding
+from rich.text import Text
 
-from dataflow.cli.execution import Json, Settings
-from dataflow.cli.output import fail, friendly_errors, out, print_json
+from dataflow.cli.arguments import FLAG, GraphFile, Json, Settings, existing
+from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say
+
+if TYPE_CHECKING:
+    from dataflow.graph.catalogue import Catalogue
 
 
 def check(
-    graphs: Annotated[list[Path], typer.Argument(help="Graph files.")], settings: Settings = None, json: Json = False
+    graphs: Annotated[list[Path], typer.Argument(metavar="GRAPH...", help="Graph files (.yaml).")],
+    settings: Settings = None,
+    json: Json = False,
 ) -> None:
-    """Check graph files wholly: names, streams, types, parameters, cycles. Exit code 1 when one has faults.
+    """Check graph files wholly, without running them.
 
-    \b
-    dataflow check graphs/*.yaml
+    Names, streams, types, parameters, cycles, hosts. Exit code 0: all are sound; 1: one has faults; 2: one cannot be
+    read.
+
+    Examples:
+
+      dataflow check graphs/*.yaml
+      dataflow check graphs/rgbd_perception.yaml --set cloud.stride=8
     """
     from dataflow.graph import GraphError, Problem, load_graph
 
     faults: list[Problem] = []
+    faulty = 0
+    for path in graphs:
+        existing(path, "a graph file")
     for path in graphs:
         with friendly_errors():
             try:
                 graph = load_graph(path, settings=settings or ())
             except GraphError as error:
                 faults += error.problems
+                faulty += 1
+                if not json:
+                    out.print(
+                        Text.assemble(("faults", "bold red"), f"  {path}: {plural(len(error.problems), 'fault')}")
+                    )
+                    out.print(Text(str(error)), soft_wrap=True)
                 continue
         if not json:
-            out.print(f"[green]ok[/] {path}: {len(graph.nodes)} operators, {len(graph.streams)} streams")
+            what = f"{plural(len(graph.nodes), 'operator')}, {plural(len(graph.streams), 'stream')}"
+            out.print(Text.assemble(("ok", "green"), f"  {path}: {what}"), soft_wrap=True)
     if json:
-        print_json(
-            {
-                "ok": not faults,
-                "problems": [problem.to_json() for problem in faults],
-            }
-        )
-    else:
-        for problem in faults:
-            out.print(str(problem), markup=False, soft_wrap=True)
+        print_json({"ok": not faults, "problems": [problem.to_json() for problem in faults]})
+    elif len(graphs) > 1 and faulty:
+        say(f"{faulty} of {plural(len(graphs), 'graph')} cannot run")
     if faults:
-        raise typer.Exit(1)
+        raise typer.Exit(DIFFERENT)
 
 
 def show(
-    graph: Annotated[Path, typer.Argument(help="The graph file.")],
+    graph: GraphFile,
     settings: Settings = None,
-    mermaid: Annotated[bool, typer.Option("--mermaid", help="Print a Mermaid diagram instead.")] = False,
-    svg: Annotated[Path | None, typer.Option("--svg", metavar="FILE", help="Write a picture.")] = None,
+    mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
+    svg: Annotated[Path | None, typer.Option("--svg", metavar="FILE.svg", help="Write a picture.")] = None,
     json: Json = False,
 ) -> None:
     """Show a graph: hosts, operators, what each takes and makes.
 
-    \b
-    dataflow show graphs/synthetic_rgbd.yaml
-    dataflow show graphs/synthetic_rgbd.yaml --svg graph.svg
+    Examples:
+
+      dataflow show graphs/synthetic_rgbd.yaml
+      dataflow show graphs/synthetic_rgbd.yaml --svg graph.svg
+      dataflow show graphs/synthetic_rgbd.yaml --mermaid
     """
     from dataflow.graph import draw, load_graph
 
     with friendly_errors():
-        loaded = load_graph(graph, settings=settings or ())
+        if json + mermaid + (svg is not None) > 1:
+            raise fail("--json, --mermaid and --svg exclude each other")
+        if svg is not None and svg.suffix != ".svg":
+            raise fail(f"--svg {svg}: expected a file name that ends in .svg")
+        loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
         if json:
             print_json(loaded.to_json())
         elif mermaid:
@@ -69,35 +91,55 @@ def show(
         elif svg is not None:
             svg.parent.mkdir(parents=True, exist_ok=True)
             svg.write_text(draw.svg(loaded), encoding="utf-8")
-            out.print(f"wrote {svg}")
+            out.print(Text(f"wrote {svg}"), soft_wrap=True)
         else:
             out.print(draw.tree(loaded))
 
 
 def operators(
-    name: Annotated[str | None, typer.Argument(help="One operator: its ports, parameters and documentation.")] = None,
+    name: Annotated[
+        str | None,
+        typer.Argument(metavar="[NAME]", help="One operator: its ports, parameters and documentation."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """List the operators that are installed, or describe one.
 
-    \b
-    dataflow operators
-    dataflow operators CloudBuilder
+    Examples:
+
+      dataflow operators
+      dataflow operators CloudBuilder
+      dataflow operators operators.cloud:CloudBuilder --json
     """
     from dataflow.graph import catalogue
 
-    found = catalogue.discover()
-    if name is None:
+    with friendly_errors():
+        found = catalogue.discover()
+        if name is None:
+            if json:
+                print_json(found.to_json())
+            else:
+                _print_operators(found)
+            return
+        try:
+            described = catalogue.find(found, name)
+        except LookupError as error:
+            raise fail(str(error.args[0])) from None
         if json:
-            print_json(found.to_json())
+            print_json(described.to_json())
         else:
-            out.print(catalogue.table(found))
-        return
-    try:
-        described = catalogue.find(found, name)
-    except LookupError as error:
-        raise fail(str(error.args[0])) from None
-    if json:
-        print_json(described.to_json())
-    else:
-        out.print(catalogue.page(described))
+            out.print(catalogue.page(described))
+
+
+def _print_operators(found: Catalogue) -> None:
+    """One operator after the other: path, what goes in and out, first sentence of its documentation."""
+    for path, operator in found.operators.items():
+        spec = operator.spec
+        takes = ", ".join(dict.fromkeys(p.type_text() for p in spec.inputs.values()))
+        makes = ", ".join(dict.fromkeys(p.type_text() for p in spec.outputs.values()))
+        out.print(Text(path, style="bold cyan"), soft_wrap=True)
+        flow = f"{takes} → {makes}" if takes and makes else f"source of {makes}" if makes else f"sink of {takes}"
+        out.print(Padding(Text(flow, style="dim"), (0, 0, 0, 4)))
+        out.print(Padding(Text(spec.doc.partition("\n\n")[0].replace("\n", " ")), (0, 0, 0, 4)))
+    for failure in found.failures:
+        say(f"[red]failed to import[/] {failure}")

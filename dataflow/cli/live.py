@@ -1,335 +1,321 @@
-"""`dataflow list`, `echo`, `hz`, `view`: following graphs that run, and looking at recordings."""
+"""`dataflow list`, `echo`, `hz`: following graphs that run."""
 
 from __future__ import annotations
 
+import json as json_module
 import time
-from collections import defaultdict, deque
-from pathlib import Path
-from typing import Annotated, Any
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
-from dataflow.cli.execution import Json
-from dataflow.cli.output import err, fail, friendly_errors, out, print_json
+from dataflow.cli.arguments import FLAG, Json, chosen_streams
+from dataflow.cli.output import (
+    INTERRUPTED,
+    count,
+    fail,
+    friendly_errors,
+    jsonable,
+    out,
+    plural,
+    print_json,
+    say,
+    seconds,
+    table,
+)
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from dataflow.messages import Message
+    from dataflow.transport import TapClient, TapMessage
+    from dataflow.transport.registry import RunningGraph
 
 GraphName = Annotated[
-    str | None, typer.Option("--graph", metavar="NAME", help="Which running graph, when several run.")
+    str | None,
+    typer.Option("--graph", metavar="NAME", help="Which running graph, by name or process, when several run."),
 ]
-Wait = Annotated[float, typer.Option("--wait", min=0, help="Seconds to wait for the graph to run.")]
-Keys = Annotated[list[str] | None, typer.Argument(metavar="[STREAM]...", help="Streams: camera/image, camera/*, **.")]
+Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", min=0, help="Wait so long for the graph to run.")]
+Streams = Annotated[
+    list[str] | None, typer.Argument(metavar="[STREAM]...", help="Streams; wildcards work. Default: all.")
+]
+
+SHOWN_ELEMENTS = 16
+"""Arrays and lists up to this length are printed whole."""
+HISTORY = 2000
+"""Messages of a stream over which its rates are taken, at most."""
+
+
+def running_graph(name: str | None, wait: float) -> RunningGraph:
+    """The running graph of that name, or the only one; says so when it has to wait. Raises `NotRunning`."""
+    from dataflow.runtime.attach import NotRunning, find_running
+
+    try:
+        return find_running(name)
+    except NotRunning:
+        if not wait:
+            raise
+    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else name} to run")
+    return find_running(name, wait=wait)
+
+
+@contextmanager
+def tapped(streams: list[str] | None, name: str | None, wait: float) -> Iterator[tuple[RunningGraph, TapClient]]:
+    """The running graph, and a lossy copy of those of its streams that were asked for."""
+    from dataflow.runtime.attach import graph_of, tap
+
+    found = running_graph(name, wait)
+    graph = graph_of(found)
+    chosen = chosen_streams(streams, graph.streams, graph.namespace)
+    with tap(found, [f"/{stream}" for stream in chosen] if streams else ["**"]) as client:
+        yield found, client
 
 
 def list_running(json: Json = False) -> None:
-    """List the graphs that run on this machine, their operators and streams.
+    """List the graphs that run on this machine, with their streams.
 
-    \b
-    dataflow list
+    Examples:
+
+      dataflow list
+      dataflow list --json
     """
-    from rich.table import Table
-
     from dataflow.runtime.attach import graph_of
     from dataflow.transport.registry import running
 
-    graphs = running()
+    with friendly_errors():
+        graphs = running()
     if json:
-        print_json(
-            [
-                {
-                    "name": g.name,
-                    "namespace": g.namespace,
-                    "pid": g.pid,
-                    "started": g.started,
-                    "operators": list(graph_of(g).nodes),
-                    "streams": {s.name: list(s.types) for s in graph_of(g).streams.values()},
-                }
-                for g in graphs
-            ]
-        )
+        print_json([_listed(found) for found in graphs])
         return
     if not graphs:
-        out.print("no graph runs on this machine; start one with: dataflow run GRAPH")
+        say("no graph runs on this machine; start one with: dataflow run GRAPH")
         return
     for found in graphs:
         graph = graph_of(found)
-        table = Table(
-            title=f"{found.name}  process {found.pid}, running for {time.time() - found.started:.0f} s",
-            title_justify="left",
+        out.print(
+            Text.assemble(
+                (found.name, "bold"),
+                f"  namespace {found.namespace}, process {found.pid}, running for {seconds(time.time() - found.started)}",
+            )
         )
-        for column in ("stream", "type", "from", "taken by"):
-            table.add_column(column)
+        streams = table("stream", "type", "taken by")
         for stream in graph.streams.values():
             takers = ", ".join(f"{node.name}.{port}" for node, port in graph.consumers(stream.name))
             kind = " | ".join(stream.types) + (" (static)" if stream.static else "")
-            table.add_row(graph.relative(stream.name), kind, stream.node, takers)
-        out.print(table)
+            streams.add_row(Text(graph.relative(stream.name)), Text(kind), Text(takers or "nobody"))
+        out.print(streams)
+
+
+def _listed(found: RunningGraph) -> dict[str, Any]:
+    from dataflow.runtime.attach import graph_of
+
+    graph = graph_of(found)
+    return {
+        "name": found.name,
+        "namespace": found.namespace,
+        "pid": found.pid,
+        "started": found.started,
+        "operators": list(graph.nodes),
+        "streams": {s.name: list(s.types) for s in graph.streams.values()},
+    }
 
 
 def echo(
-    streams: Keys = None,
+    streams: Streams = None,
+    limit: Annotated[
+        int | None, typer.Option("--count", "-n", metavar="N", min=1, help="Stop after so many messages.")
+    ] = None,
+    full: Annotated[bool, typer.Option("--full", metavar=FLAG, help="Print long arrays and lists whole.")] = False,
     graph: GraphName = None,
-    count: Annotated[int | None, typer.Option("--count", "-n", min=1, help="Stop after so many messages.")] = None,
-    full: Annotated[bool, typer.Option("--full", help="Print array contents, not only their shapes.")] = False,
     wait: Wait = 0.0,
-    json: Json = False,
+    json: Annotated[
+        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line; numbers unrounded.")
+    ] = False,
 ) -> None:
-    """Print the messages of a running graph, as they come. Never slows the graph; may skip messages.
+    """Print the messages of a running graph, as they come.
 
-    \b
-    dataflow echo odometry/odometry
-    dataflow echo "camera/*" -n 10 --json
+    It never slows the graph: what is not printed in time is skipped, and counted at the end. Streams are named without
+    the graph's namespace, or in full with a leading slash.
+
+    Examples:
+
+      dataflow echo odometry/odometry
+      dataflow echo "camera/*" -n 10
+      dataflow echo odometry/odometry --json | jq .position
     """
-    from dataflow.runtime.attach import find_running, still_runs, tap
+    from dataflow.runtime.attach import still_runs
 
-    with friendly_errors():
-        found = _found(find_running, graph, wait)
+    with friendly_errors(), tapped(streams, graph, wait) as (found, client):
         printed = 0
-        with tap(found, streams or ["**"]) as client:
-            while count is None or printed < count:
-                taken = client.take(timeout=0.5)
+        try:
+            while limit is None or printed < limit:
+                taken = client.take(timeout=0.25)
                 if taken is None:
                     if not still_runs(found):
                         break
                     continue
-                envelope = taken.decode()
-                if envelope.message is None:
-                    continue
-                printed += 1
-                _print_message(taken.stream, envelope.message, full=full, json=json)
-            skipped = client.skipped
-        if skipped:
-            err.print(f"[dim]{skipped} messages were skipped: the graph made them faster than they were printed[/]")
+                message = taken.decode().message
+                if message is not None:
+                    printed += 1
+                    _print_message(taken.stream, message, full=full, json=json)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+        finally:
+            if client.skipped:
+                say(f"[dim]{plural(client.skipped, 'message')} skipped: they came faster than they were printed[/]")
+    if limit is not None and printed < limit:
+        raise fail(f"the graph ended after {plural(printed, 'message')}, {limit - printed:,} short of --count", code=1)
 
 
-def _print_message(stream: str, message: Any, *, full: bool, json: bool) -> None:
-    import json as json_module
+def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> None:
+    if json:
+        values = {name: _json_value(value, full) for name, value in message.items() if value is not None}
+        line = {"stream": stream, "type": message.SCHEMA, **values}
+        print(json_module.dumps(line, ensure_ascii=False, allow_nan=False), flush=True)
+        return
+    from dataflow.sync.stamps import format_stamp
 
+    out.print(Text.assemble((stream, "bold"), f"  {format_stamp(message.stamp)}  ", (message.SCHEMA, "dim")))
+    fields = [(name, value) for name, value in message.items() if name != "stamp" and value is not None]
+    width = max((len(name) for name, _ in fields), default=0)
+    for name, value in fields:
+        out.print(Text.assemble(f"  {name:<{width}}  ", _text(value, full)), soft_wrap=True)
+
+
+def _json_value(value: Any, full: bool) -> Any:
     import numpy as np
 
-    values: dict[str, Any] = {}
-    for name, value in message.items():
-        if isinstance(value, np.ndarray):
-            small = full or value.size <= 16
-            values[name] = value.tolist() if small else f"{value.dtype}{list(value.shape)}"
-        elif value is not None:
-            values[name] = value
-    if json:
-        print(json_module.dumps({"stream": stream, "type": message.SCHEMA, **values}, ensure_ascii=False), flush=True)
-    else:
-        out.print(f"[bold]{stream}[/] [dim]{message.SCHEMA}[/]")
-        for name, value in values.items():
-            out.print(f"  {name}: {value}", markup=False, soft_wrap=True)
+    if isinstance(value, np.ndarray) and not full and value.size > SHOWN_ELEMENTS:
+        return f"{value.dtype}{list(value.shape)}"
+    return jsonable(value)
+
+
+def _text(value: Any, full: bool) -> str:
+    """A field for people: six digits, long arrays by their shape and range, long lists by their beginning."""
+    import numpy as np
+
+    if isinstance(value, np.ndarray):
+        if full or value.size <= SHOWN_ELEMENTS:
+            limit = value.size + 1 if full else SHOWN_ELEMENTS
+            text = np.array2string(value, precision=6, suppress_small=True, threshold=limit, separator=", ")
+            return " ".join(text.split())
+        shape = " × ".join(map(str, value.shape))
+        return f"{value.dtype} {shape}{_range(value)}"
+    if isinstance(value, tuple):
+        shown = value if full or len(value) <= SHOWN_ELEMENTS else value[:5]
+        more = f", … {len(value)} in all" if len(shown) < len(value) else ""
+        return ", ".join(map(str, shown)) + more if value else "none"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, str):
+        return value if full or len(value) <= 200 else f"{value[:200]}… {len(value):,} characters in all"
+    return str(value)
+
+
+def _range(value: Any) -> str:
+    """The smallest and the largest finite element, in words."""
+    import numpy as np
+
+    if value.dtype.kind not in "iuf" or not value.size:
+        return ""
+    finite = value[np.isfinite(value)] if value.dtype.kind == "f" else value
+    return f"  from {finite.min():.4g} to {finite.max():.4g}" if finite.size else "  nothing finite"
+
+
+@dataclass(slots=True)
+class _Rate:
+    """What was seen of one stream: arrival (s), stamp (ns), number in the stream and bytes of the latest messages."""
+
+    seen: deque[tuple[float, int, int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY))
+
+    def row(self, stream: str) -> dict[str, Any]:
+        (t0, s0, n0, _), (t1, s1, n1, _) = self.seen[0], self.seen[-1]
+        made, clock, event = n1 - n0, t1 - t0, (s1 - s0) * 1e-9
+        mean = sum(entry[3] for entry in self.seen) / len(self.seen)
+        return {
+            "stream": stream,
+            "messages": n1 + 1,
+            "hz_clock": made / clock if made and clock > 0 else None,
+            "hz_event": made / event if made and event > 0 else None,
+            "bytes": mean,
+            "mb_per_s": mean * made / clock * 1e-6 if made and clock > 0 else None,
+        }
 
 
 def hz(
-    streams: Keys = None,
+    streams: Streams = None,
+    duration: Annotated[
+        float | None, typer.Option("--seconds", metavar="SECONDS", min=0.1, help="Stop after so long.")
+    ] = None,
     graph: GraphName = None,
-    seconds: Annotated[float | None, typer.Option("--seconds", min=0.1, help="Stop after so long.")] = None,
     wait: Wait = 0.0,
     json: Json = False,
 ) -> None:
-    """Show the rates of a running graph's streams: by the clock, by event time, and the bandwidth.
+    """Show the rates of a running graph's streams.
 
-    \b
-    dataflow hz
-    dataflow hz "camera/*" --seconds 5
+    By the clock, by event time (the stamps), and the bandwidth. Messages that are skipped here are counted all the
+    same. Ends with the graph, after --seconds, or at Ctrl-C.
+
+    Examples:
+
+      dataflow hz
+      dataflow hz "camera/*" --seconds 5
+      dataflow hz --seconds 5 --json
     """
     from rich.live import Live
-    from rich.table import Table
 
-    from dataflow.runtime.attach import find_running, still_runs, tap
-    from dataflow.transport import Kind
+    from dataflow.runtime.attach import still_runs
 
-    seen: dict[str, deque[tuple[float, int, int, int]]] = defaultdict(lambda: deque(maxlen=500))
-
-    def rows() -> list[dict[str, Any]]:
-        result = []
-        for stream, times in sorted(seen.items()):
-            clock = times[-1][0] - times[0][0]
-            event = (times[-1][1] - times[0][1]) * 1e-9
-            made = times[-1][2] - times[0][2]
-            nbytes = sum(t[3] for t in list(times)[1:])
-            shown = max(len(times) - 1, 1)
-            result.append(
-                {
-                    "stream": stream,
-                    "messages": times[-1][2] + 1,
-                    "hz_clock": made / clock if clock > 0 else None,
-                    "hz_event": made / event if event > 0 else None,
-                    "mb_per_s": nbytes / shown * made / clock * 1e-6 if clock > 0 else None,
-                }
-            )
-        return result
-
-    def table() -> Table:
-        shown = Table()
-        shown.add_column("stream")
-        for column in ("messages", "Hz", "Hz (event time)", "MB/s"):
-            shown.add_column(column, justify="right")
-        for row in rows():
-            cells = (row["hz_clock"], row["hz_event"], row["mb_per_s"])
-            shown.add_row(row["stream"], str(row["messages"]), *("–" if c is None else f"{c:.2f}" for c in cells))
-        return shown
-
-    with friendly_errors():
-        found = _found(find_running, graph, wait)
-        deadline = None if seconds is None else time.monotonic() + seconds
-        with tap(found, streams or ["**"]) as client:
-            live = None if json or not out.is_terminal else Live(console=out, refresh_per_second=4)
+    rates: dict[str, _Rate] = {}
+    stopped = False
+    with friendly_errors(), tapped(streams, graph, wait) as (found, client):
+        deadline = None if duration is None else time.monotonic() + duration
+        live = None if json or not out.is_terminal else Live(console=out, auto_refresh=False, transient=True)
+        due = 0.0
+        try:
             if live is not None:
                 live.start()
-            try:
-                while deadline is None or time.monotonic() < deadline:
-                    taken = client.take(timeout=0.25)
-                    if taken is None:
-                        if not still_runs(found):
-                            break
-                    else:
-                        head = taken.head()
-                        if head.kind is Kind.MESSAGE:
-                            seen[taken.stream].append((time.monotonic(), head.stamp, head.seq, len(taken.payload)))
-                    if live is not None:
-                        live.update(table())
-            finally:
-                if live is not None:
-                    live.stop()
-        if json:
-            print_json(rows())
-        elif live is None:
-            out.print(table())
-
-
-def view(
-    recording: Annotated[Path | None, typer.Argument(help="A recording. Without one: the running graph.")] = None,
-    to: Annotated[
-        str, typer.Option("--to", metavar="spawn|serve|URL|FILE.rrd", help="Where to show it.")
-    ] = "spawn",
-    streams: Annotated[list[str] | None, typer.Option("--stream", help="Only these streams. May be repeated.")] = None,
-    start: Annotated[float | None, typer.Option(min=0, help="Seconds from the first message.")] = None,
-    end: Annotated[float | None, typer.Option(min=0, help="Seconds from the first message.")] = None,
-    graph: GraphName = None,
-    wait: Wait = 0.0,
-) -> None:
-    """Show a recording, or attach to a running graph. A viewer can never slow the graph.
-
-    \b
-    dataflow view recordings/demo.mcap
-    dataflow view recordings/demo.mcap --to demo.rrd
-    dataflow view --graph rgbd_perception --to serve
-    """
-    from dataflow.view import ViewerError, ViewerSink, parse_target
-
-    with friendly_errors():
-        try:
-            target = parse_target(to)
-            sink = ViewerSink(target)
-            if recording is not None:
-                _view_recording(recording, sink, streams, start, end)
-            else:
-                _view_running(sink, streams, graph, wait)
-        except ViewerError as error:
-            raise fail(str(error)) from None
-
-
-def _announce(sink: Any) -> None:
-    from dataflow.view import Serve
-
-    if isinstance(sink.target, Serve):
-        err.print(f"open {sink.target.url}", soft_wrap=True)
-
-
-def _view_recording(
-    path: Path, sink: Any, streams: list[str] | None, start: float | None, end: float | None
-) -> None:
-    from rich.progress import Progress
-
-    from dataflow.recording import Recording
-    from dataflow.runtime.replay import ReplayError, recorded_graph
-    from dataflow.view import Serve, from_recording
-
-    with Recording(path) as opened:
-        try:
-            graph = recorded_graph(opened)
-        except ReplayError:
-            graph = None
-        known = {name: i.message_type for name, i in opened.streams.items() if i.message_type is not None}
-        chosen = _chosen(list(known), streams)
-        static = [name for name in chosen if opened.streams[name].static]
-        moving = [i for name, i in opened.streams.items() if name in chosen and not i.static]
-        first = min((i.first for i in moving if i.first is not None), default=0)
-        last = max((i.last for i in moving if i.last is not None), default=0)
-        begin = None if start is None else first + round(start * 1e9)
-        finish = None if end is None else first + round(end * 1e9)
-        sink.open({name: known[name] for name in chosen}, graph, static)
-        try:
-            _announce(sink)
-            with Progress(console=err, transient=True) as bar:
-                task = bar.add_task("drawing", total=((finish or last) - (begin or first)) * 1e-9)
-                drawn = from_recording(
-                    opened,
-                    sink,
-                    chosen,
-                    begin,
-                    finish,
-                    progress=lambda stamp: bar.update(task, completed=(stamp - (begin or first)) * 1e-9),
-                )
-            if isinstance(sink.target, Serve):
-                err.print("serving; stop with Ctrl-C")
-                _until_interrupted()
+            while deadline is None or time.monotonic() < deadline:
+                taken = client.take(timeout=0.25)
+                if taken is not None:
+                    _take_rate(rates, taken)
+                elif not still_runs(found):
+                    break
+                if live is not None and time.monotonic() >= due:
+                    due = time.monotonic() + 0.25
+                    live.update(_rate_table(rates, found.namespace), refresh=True)
+        except KeyboardInterrupt:
+            stopped = True
         finally:
-            sink.close()
-    err.print(f"{drawn:,} messages")
+            if live is not None:
+                live.stop()
+    if json:
+        print_json([rate.row(stream) for stream, rate in sorted(rates.items())])
+    else:
+        out.print(_rate_table(rates, found.namespace))
+    if stopped:
+        raise typer.Exit(INTERRUPTED)
 
 
-def _view_running(sink: Any, streams: list[str] | None, graph: str | None, wait: float) -> None:
-    from dataflow.messages import message_type
-    from dataflow.runtime.attach import find_running, graph_of, still_runs, tap
-    from dataflow.view import Serve
+def _take_rate(rates: dict[str, _Rate], taken: TapMessage) -> None:
+    from dataflow.transport import Kind
 
-    found = _found(find_running, graph, wait)
-    running = graph_of(found)
-    chosen = _chosen(list(running.streams), streams)
-    sink.open({name: message_type(running.streams[name].types[0]) for name in chosen}, running)
-    try:
-        _announce(sink)
-        with tap(found, [f"/{name}" for name in chosen]) as client:
-            while True:
-                taken = client.take(timeout=0.5)
-                if taken is None:
-                    if not still_runs(found):
-                        break
-                    continue
-                envelope = taken.decode()
-                if envelope.message is not None:
-                    sink.log(taken.stream, envelope.message)
-        if isinstance(sink.target, Serve):
-            err.print("the graph has ended; still serving; stop with Ctrl-C")
-            _until_interrupted()
-    finally:
-        sink.close()
+    head = taken.head()
+    if head.kind is Kind.MESSAGE:
+        entry = (time.monotonic(), head.stamp, head.seq, len(taken.payload))
+        rates.setdefault(taken.stream, _Rate()).seen.append(entry)
 
 
-def _chosen(known: list[str], wanted: list[str] | None) -> list[str]:
-    if not wanted:
-        return known
-    chosen = [name for name in known if any(name == w or name.endswith(f"/{w}") for w in wanted)]
-    missing = [w for w in wanted if not any(name == w or name.endswith(f"/{w}") for name in known)]
-    if missing:
-        raise fail(f"no stream {missing[0]!r}; there are: {', '.join(known)}")
-    return chosen
-
-
-def _found(find: Any, graph: str | None, wait: float) -> Any:
-    from dataflow.runtime.attach import NotRunning
-
-    try:
-        return find(graph, wait=wait)
-    except NotRunning as error:
-        raise fail(str(error)) from None
-
-
-def _until_interrupted() -> None:
-    try:
-        while True:
-            time.sleep(1.0)
-    except KeyboardInterrupt:
-        return
+def _rate_table(rates: dict[str, _Rate], namespace: str) -> Table:
+    numbers = ("messages", "Hz", "Hz by stamp", "kB each", "MB/s")
+    shown = table("stream", *numbers, right=numbers)
+    for stream, rate in sorted(rates.items()):
+        row = rate.row(stream)
+        cells = (row["hz_clock"], row["hz_event"], row["bytes"] * 1e-3, row["mb_per_s"])
+        texts = ("" if cell is None else f"{cell:,.2f}" for cell in cells)
+        shown.add_row(Text(stream.removeprefix(f"{namespace}/")), count(row["messages"]), *texts)
+    return shown

@@ -1,62 +1,147 @@
-"""How commands talk: tables for people on standard output, JSON for machines, errors with a distinct exit code."""
+"""How commands talk: results on standard output, progress and errors on standard error, one meaning per exit code."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+import math
+import os
+import sys
+import traceback
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import typer
+from rich import box
 from rich.console import Console
 from rich.markup import escape
+from rich.table import Table
 
 DIFFERENT = 1
 """Exit code: it ran, and the answer is no (streams differ, the graph has faults, a run failed)."""
 COULD_NOT_RUN = 2
 """Exit code: it could not run (a file is missing, an option is wrong)."""
 INTERRUPTED = 130
+"""Exit code: ended by Ctrl-C."""
 
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
+TRACEBACK = "DATAFLOW_TRACEBACK"
+"""Environment variable: any value but 0 and none shows the tracebacks of errors."""
+
+PIPE_WIDTH = 120
+"""Columns of tables that go into a file or a pipe, unless COLUMNS says otherwise."""
+
+
+def _console(*, stderr: bool) -> Console:
+    stream = sys.stderr if stderr else sys.stdout
+    piped = not stream.isatty() and "COLUMNS" not in os.environ
+    return Console(stderr=stderr, highlight=False, width=PIPE_WIDTH if piped else None)
+
+
+out = _console(stderr=False)
+err = _console(stderr=True)
 
 
 def print_json(value: Any) -> None:
     """One JSON document on standard output."""
-    print(json.dumps(value, indent=2, ensure_ascii=False, default=str))
+    print(json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False))
+
+
+def jsonable(value: Any) -> Any:
+    """JSON values only: numbers that JSON has no word for become the strings NaN, Infinity and -Infinity."""
+    import numpy as np
+
+    if isinstance(value, dict):
+        return {str(key): jsonable(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return jsonable(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [jsonable(item) for item in value]
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value if value is None or isinstance(value, (str, bool, int, float)) else str(value)
+
+
+def say(text: str) -> None:
+    """A line about what happens, on standard error. `text` is markup."""
+    err.print(text, soft_wrap=not err.is_terminal)
 
 
 def fail(message: str, *, details: str = "", code: int = COULD_NOT_RUN) -> typer.Exit:
     """Prints an error; the caller raises what it returns."""
-    err.print(f"[bold red]error:[/] {escape(message)}")
+    say(f"[bold red]error:[/] {escape(message)}")
     if details.strip():
         err.print(f"[dim]{escape(details.rstrip())}[/]", soft_wrap=True)
     return typer.Exit(code)
 
 
+def wants_traceback() -> bool:
+    """Whether `dataflow --traceback` or the environment asks for our own tracebacks."""
+    return os.environ.get(TRACEBACK, "0") not in ("", "0")
+
+
 @contextmanager
 def friendly_errors() -> Iterator[None]:
-    """Turns the errors that bad input causes into one clear message and exit code 2 (1 for a graph with faults)."""
+    """Turns the errors that bad input causes into one clear message and an exit code; others pass."""
+    try:
+        yield
+    except Exception as error:
+        explained = _explained(error)
+        if explained is None:
+            raise
+        if wants_traceback():
+            err.print(escape(traceback.format_exc().rstrip()), style="dim", soft_wrap=True)
+        message, details, code = explained
+        if message.startswith("\n"):  # faults of a graph: places, lines and carets
+            err.print(escape(message[1:]), soft_wrap=True)
+            raise typer.Exit(code) from None
+        raise fail(message, details=details, code=code) from None
+
+
+def _explained(error: Exception) -> tuple[str, str, int] | None:
+    """(message, details, exit code) of an error that users can do something about; None for a bug."""
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.messages import MessageError
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
+    from dataflow.runtime.attach import NotRunning
     from dataflow.runtime.replay import ReplayError
     from dataflow.runtime.supervisor import RunFailed
+    from dataflow.transport.registry import RegistryError
 
-    try:
-        yield
-    except GraphError as error:
-        err.print(escape(str(error)), soft_wrap=True)
-        raise typer.Exit(DIFFERENT) from None
-    except RunFailed as error:
-        raise fail(str(error), details=error.details, code=DIFFERENT) from None
-    except (RecordingError, ReplayError, ParameterError, MessageError, OperatorImportError) as error:
-        raise fail(str(error)) from None
-    except FileNotFoundError as error:
-        raise fail(f"no such file: {error.filename}" if error.filename else str(error)) from None
-    except (IsADirectoryError, PermissionError) as error:
-        raise fail(f"{error.strerror}: {error.filename}") from None
+    known = (
+        RecordingError,
+        ReplayError,
+        ParameterError,
+        MessageError,
+        OperatorImportError,
+        NotRunning,
+        RegistryError,
+    )
+    viewer = sys.modules.get("dataflow.view.process")  # importing it takes long; an error of it has imported it
+    match error:
+        case GraphError():
+            return f"\n{error}", "", COULD_NOT_RUN
+        case RunFailed():
+            stopped = str(error).startswith(("interrupted", "stopped"))
+            return str(error), error.details, INTERRUPTED if stopped else DIFFERENT
+        case BrokenPipeError():
+            return None
+        case OSError() if error.strerror and error.filename:
+            return f"{error.filename}: {error.strerror}", "", COULD_NOT_RUN
+        case _ if isinstance(error, known) or (viewer is not None and isinstance(error, viewer.ViewerError)):
+            return str(error), "", COULD_NOT_RUN
+    return None
+
+
+def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:
+    """A table in the house style; the columns in `right` hold numbers. Text wraps, numbers never do."""
+    made = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
+    for column in columns:
+        number = column in right
+        made.add_column(column, justify="right" if number else "left", no_wrap=number, overflow="fold")
+    return made
 
 
 def count(number: float) -> str:
@@ -64,15 +149,47 @@ def count(number: float) -> str:
     return f"{number:,.0f}"
 
 
+def plural(number: int, word: str) -> str:
+    """(1, "stream") → "1 stream"; (2, "stream") → "2 streams"."""
+    return f"{number:,} {word}{'' if number == 1 else 's'}"
+
+
 def size(nbytes: float) -> str:
     """Bytes for people: "3.2 MB"."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if abs(nbytes) < 1000 or unit == "GB":
+    for unit in ("B", "kB", "MB"):
+        if abs(nbytes) < 999.95:
             return f"{nbytes:.0f} {unit}" if unit == "B" else f"{nbytes:.1f} {unit}"
         nbytes /= 1000
-    return ""
+    return f"{nbytes:.1f} GB"
 
 
-def figures(values: Mapping[str, Any]) -> str:
-    """`{"ate_rmse_m": 0.0213, "poses": 250}` → "ate_rmse_m 0.0213 · poses 250"."""
-    return " · ".join(f"{name} {f'{v:.4g}' if isinstance(v, float) else v}" for name, v in values.items())
+def seconds(duration: float) -> str:
+    """A duration in seconds for people: "0.63 s", "12.3 s", "4 min 05 s", "2 h 03 min"."""
+    if duration < 59.95:
+        return f"{duration:.2f} s" if duration < 9.995 else f"{duration:.1f} s"
+    minutes, rest = divmod(round(duration), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
+    return f"{minutes // 60} h {minutes % 60:02d} min"
+
+
+_UNITS = {
+    "m": "m",
+    "s": "s",
+    "ms": "ms",
+    "deg": "°",
+    "rad": "rad",
+    "hz": "Hz",
+    "percent": "%",
+}
+
+
+def figure(name: str, value: Any) -> tuple[str, str, str]:
+    """(name, value, unit) for people: ("ate_rmse_m", 0.0213) → ("ate rmse", "0.0213", "m")."""
+    stem, _, unit = name.rpartition("_")
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and stem and unit in _UNITS:
+        name = stem
+    else:
+        unit = ""
+    text = f"{value:.4g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
+    return name.replace("_", " "), text, _UNITS.get(unit, "")

@@ -274,9 +274,9 @@ def page(described: Described) -> RenderableType:
     parts.append(Text(f"fires {fires(cls)}", "dim"))
     ports = _table("port", "kind", "type", "")
     for port in spec.inputs.values():
-        ports.add_row(port.name, f"in  {_KIND[port.kind]}", port.type_text(), _notes(_input_notes(port), port.doc))
+        ports.add_row(port.name, f"in  {_KIND[port.kind]}", port.type_text(), _notes(input_notes(port), port.doc))
     for out in spec.outputs.values():
-        ports.add_row(out.name, "out", out.type_text(), _notes(_output_notes(out), out.doc))
+        ports.add_row(out.name, "out", out.type_text(), _notes(output_notes(out), out.doc))
     parts += [Text(), ports]
     rows = parameters(cls)
     if rows:
@@ -305,7 +305,8 @@ def _notes(notes: Sequence[str], doc: str) -> Text:
     return Text(f"{doc} ({'; '.join(notes)})" if notes and doc else doc or "; ".join(notes))
 
 
-def _input_notes(port: InputPort) -> list[str]:
+def input_notes(port: InputPort) -> list[str]:
+    """What is particular to an input, in a few words each."""
     notes = []
     if port.kind == "sampled" and not port.required:
         notes.append("optional")
@@ -320,6 +321,7 @@ def _input_notes(port: InputPort) -> list[str]:
     return notes
 
 
-def _output_notes(port: OutputPort) -> list[str]:
+def output_notes(port: OutputPort) -> list[str]:
+    """What is particular to an output, in a few words each."""
     notes = ["static"] if port.static else []
     return [*notes, f"up to {format_duration(port.lag)} late"] if port.lag else notes

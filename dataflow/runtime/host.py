@@ -21,6 +21,7 @@ from dataflow.runtime.feed import Feed, LogFeed, Window
 from dataflow.runtime.firings import FiringRecord, encode_batch
 from dataflow.runtime.keys import firings_key
 from dataflow.runtime.network import network_config
+from dataflow.runtime.reexecute import RecordedRunner, recorded_digests, recorded_firings
 from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner
 from dataflow.runtime.threads import limit_threads
 from dataflow.sync import NEVER, Entry
@@ -40,7 +41,7 @@ class HostConfig:
 
     `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
     are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`: whether a recorder
-    takes the firing records.
+    takes the firing records. `verify` names a recording by whose firing records the operators are driven.
     """
 
     label: str
@@ -55,6 +56,7 @@ class HostConfig:
     rate: float | None = None
     paranoid: bool = False
     firings: bool = False
+    verify: str | None = None
 
 
 class HostFailure(RuntimeError):
@@ -148,10 +150,10 @@ class Host:
         self.static = frozenset(name for name, stream in self.graph.streams.items() if stream.static)
         self.received = 0
         self.malformed = 0
-        self.consumers: dict[str, list[OperatorRunner]] = {}
+        self.consumers: dict[str, list[OperatorRunner | RecordedRunner]] = {}
         self.remote: dict[str, Any] = {}
         self.outlet = Outlet(self)
-        self.runners: list[OperatorRunner] = []
+        self.runners: list[OperatorRunner | RecordedRunner] = []
         self.sources: list[SourceRunner] = []
         self.feeds: list[Feed] = []
         self.live: list[SourceRunner] = []
@@ -170,7 +172,7 @@ class Host:
         self._step_done = 0
 
     @property
-    def makers(self) -> list[SourceRunner | OperatorRunner]:
+    def makers(self) -> list[SourceRunner | OperatorRunner | RecordedRunner]:
         """Everything that emits, sources first."""
         return [*self.sources, *self.runners]
 
@@ -217,12 +219,30 @@ class Host:
             else:
                 self.feeds.append(source)
             return
-        runner = OperatorRunner(
-            node, self.outlet, static=self.static, seed=self.graph.seed, paranoid=self.config.paranoid
-        )
+        runner = self._recorded_runner(node) if self.config.verify is not None else self._runner(node)
         self.runners.append(runner)
         for stream in {s for streams in node.inputs.values() for s in streams}:
             self.consumers.setdefault(stream, []).append(runner)
+
+    def _runner(self, node: Node) -> OperatorRunner:
+        return OperatorRunner(
+            node, self.outlet, static=self.static, seed=self.graph.seed, paranoid=self.config.paranoid
+        )
+
+    def _recorded_runner(self, node: Node) -> RecordedRunner:
+        assert self.config.verify is not None
+        inputs = frozenset(s for streams in node.inputs.values() for s in streams)
+        producers = [self.graph.nodes[name] for name in {self.graph.streams[s].node for s in inputs}]
+        with Recording(self.config.verify) as recording:
+            return RecordedRunner(
+                node,
+                self.outlet,
+                static=self.static,
+                records=recorded_firings(recording, node.name),
+                inputs=recorded_digests(recording, producers, inputs),
+                seed=self.graph.seed,
+                paranoid=self.config.paranoid,
+            )
 
     def _make_log(self, replay: Mapping[str, Any]) -> None:
         recording = Recording(replay["path"])
@@ -309,6 +329,8 @@ class Host:
                     runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
 
     def _check_gap(self, stream: str, envelope: Envelope) -> None:
+        if self.config.verify is not None:
+            return  # an operator that makes less than it did is what verification is there to report
         incarnation, expected = self._expected.get(stream, (envelope.incarnation, envelope.seq))
         if (envelope.incarnation, envelope.seq) != (incarnation, expected) and incarnation == envelope.incarnation:
             raise HostFailure(
@@ -436,7 +458,7 @@ class Host:
         for source in self.sources:
             counts[source.node.name] = [source.firings, source.ports.emitted, source.overflow, source.busy_ns, source.last]
         for runner in self.runners:
-            drops = sum(runner.aligner.drops.values())
+            drops = sum(runner.drops.values())
             counts[runner.node.name] = [runner.firings, runner.ports.emitted, drops, runner.busy_ns, runner.done]
         for feed in self.feeds:
             if isinstance(feed, LogFeed):
@@ -463,10 +485,11 @@ class Host:
             "streams": streams,
             "counts": self._counts(),
             "drops": {
-                r.node.name: [[i, why, n] for (i, why), n in sorted(r.aligner.drops.items())] for r in self.runners
+                r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners
             },
             "summaries": {r.node.name: dict(s) for r in self.runners if (s := r.operator.summary())},
             "transport": self.bus.counters(),
+            "verifications": [r.result.to_wire() for r in self.runners if isinstance(r, RecordedRunner)],
         }
 
     # Control
@@ -511,8 +534,7 @@ class Host:
         waiting: dict[str, list[Any]] = {}
         for runner in self.runners:
             if not runner.ended:
-                held = runner.aligner.waiting()
-                waiting[runner.node.name] = [None, {}] if held is None else [held.stamp, dict(held.needs)]
+                waiting[runner.node.name] = list(runner.waiting())
         return waiting
 
     def _probe(self) -> None:

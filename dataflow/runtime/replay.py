@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from dataflow.graph import load_bundle
@@ -33,22 +33,30 @@ def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
 
 
 def plan_replay(
-    recording: Recording, graph: Graph, *, start: float | None = None, end: float | None = None
+    recording: Recording,
+    graph: Graph,
+    *,
+    replaced: Collection[str] | None = None,
+    start: float | None = None,
+    end: float | None = None,
 ) -> LogPlan:
-    """Which recorded streams stand in for which sources. `start`, `end`: seconds from the recording's first message."""
+    """Which recorded streams stand in for which operators: the sources, or those that `replaced` names.
+
+    `start`, `end`: seconds from the recording's first message. Raises `ReplayError`.
+    """
     streams: list[str] = []
-    for node in graph.sources():
+    for node in graph.sources() if replaced is None else [graph.nodes[name] for name in sorted(replaced)]:
         outputs = tuple(node.outputs.values())
         recorded = [s for s in outputs if s in recording.streams]
         if not recorded:
             raise ReplayError(
-                f"{recording.path}: no stream of source {node.name!r} is in the recording "
+                f"{recording.path}: no stream of {node.name!r} is in the recording "
                 f"(looked for {', '.join(outputs)}; it holds {', '.join(recording.streams) or 'none'})"
             )
         missing = [s for s in outputs if s not in recording.streams and graph.consumers(s)]
         if missing:
             raise ReplayError(
-                f"{recording.path}: stream {missing[0]!r} of source {node.name!r} was not recorded, "
+                f"{recording.path}: stream {missing[0]!r} of {node.name!r} was not recorded, "
                 f"but {graph.consumers(missing[0])[0][0].name!r} takes it; record it, or leave that operator out"
             )
         for stream in recorded:
@@ -56,7 +64,7 @@ def plan_replay(
             wanted = graph.streams[stream].types
             if info.message_type is None or info.message_type.SCHEMA not in wanted:
                 raise ReplayError(
-                    f"{recording.path}: stream {stream!r} holds {info.schema}, the graph's source emits "
+                    f"{recording.path}: stream {stream!r} holds {info.schema}, the graph's {node.name!r} emits "
                     f"{' | '.join(wanted)}"
                 )
         streams += recorded

@@ -194,6 +194,16 @@ class OperatorRunner:
     def setup(self) -> None:
         set_up(self.operator, self.ports, self.records, self.node, self.seed)
 
+    @property
+    def drops(self) -> Mapping[tuple[str, str], int]:
+        """Messages dropped so far, by (input, reason)."""
+        return self.aligner.drops
+
+    def waiting(self) -> tuple[int | None, dict[str, int]]:
+        """The stamp that cannot be decided yet, and the frontiers that would decide it, by input."""
+        held = self.aligner.waiting()
+        return (None, {}) if held is None else (held.stamp, dict(held.needs))
+
     def push(self, stream: str, entry: Entry) -> None:
         self.aligner.push(stream, entry)
 
@@ -225,10 +235,9 @@ class OperatorRunner:
         kind: Kind = firing.kind
         try:
             self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, firing.stamp))
-            returned = self._call(firing)
-            messages = outputs_of(self.operator, returned)
-            if self.paranoid:
-                self._check_unchanged(firing)
+            messages = outputs_of(self.operator, call_operator(self.operator, firing))
+            if self.paranoid and (problem := changed_input(self.node, firing)) is not None:
+                raise problem
             emissions = self.ports.emit(messages, firing.stamp)
         except Exception as error:
             failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
@@ -237,17 +246,6 @@ class OperatorRunner:
         self.firings += kind != "finish"
         self._record(kind, firing, started, emissions, None)
         self.busy_ns += time.time_ns() - started
-
-    def _call(self, firing: Firing) -> Outputs:
-        if firing.kind == "finish":
-            return self.operator.finish()
-        arguments: dict[str, Any] = {
-            name: value_of(firing.inputs.get(name, () if port.kind == "batch" else None))
-            for name, port in self.spec.inputs.items()
-        }
-        if "context" in self.spec.process_takes:
-            arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
-        return self.operator.process(**arguments)
 
     def _record(
         self, kind: Kind, firing: Firing, started: int, outputs: tuple[Emission | None, ...], error: str | None
@@ -269,15 +267,31 @@ class OperatorRunner:
             detail={} if error is None else {"error": error},
         )
 
-    def _check_unchanged(self, firing: Firing) -> None:
-        for name, given in firing.inputs.items():
-            for entry in entries_of(given):
-                message: Message = entry.value
-                if message.compute_digest() != message.digest():
-                    raise InputMutated(
-                        f"{self.node.name} changed the memory of its input {name!r} "
-                        f"({message.SCHEMA} at stamp {message.stamp}); messages are immutable: copy before writing"
-                    )
+
+def call_operator(operator: Operator, firing: Firing) -> Outputs:
+    """`process()` with what a firing holds, or `finish()`."""
+    if firing.kind == "finish":
+        return operator.finish()
+    arguments: dict[str, Any] = {
+        name: value_of(firing.inputs.get(name, () if port.kind == "batch" else None))
+        for name, port in operator.spec.inputs.items()
+    }
+    if "context" in operator.spec.process_takes:
+        arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
+    return operator.process(**arguments)
+
+
+def changed_input(node: Node, firing: Firing) -> InputMutated | None:
+    """An error for the first input message whose memory is no longer what its digest says."""
+    for name, given in firing.inputs.items():
+        for entry in entries_of(given):
+            message: Message = entry.value
+            if message.compute_digest() != message.digest():
+                return InputMutated(
+                    f"{node.name} changed the memory of its input {name!r} "
+                    f"({message.SCHEMA} at stamp {message.stamp}); messages are immutable: copy before writing"
+                )
+    return None
 
 
 class SourceRunner:

@@ -72,6 +72,7 @@ class RunReport:
     summaries: Mapping[str, Mapping[str, Any]]
     transport: Mapping[str, Mapping[str, int]]
     files: Mapping[str, Mapping[str, Any]]
+    verifications: tuple[Mapping[str, Any], ...]
     first: int | None
     last: int | None
     wall: float
@@ -195,6 +196,7 @@ class Supervisor:
                     "rate": self.plan.rate,
                     "paranoid": self.plan.paranoid,
                     "firings": self.plan.record is not None,
+                    "verify": self._verified_recording(),
                 }
             self._spawn(label, host.nodes, "sink" if host.sink else "host", config)
             for node in host.nodes or ((label,) if host.sink or host.has_log else ()):
@@ -203,6 +205,10 @@ class Supervisor:
         for label, keys in expected_probes(self.plan, self._plans).items():
             self._processes[label].unseen = keys
         self._endpoints = endpoints
+
+    def _verified_recording(self) -> str | None:
+        log = self.plan.log
+        return str(log.path) if self.plan.verify is not None and log is not None else None
 
     def _log_config(self) -> dict[str, Any]:
         log = self.plan.log
@@ -459,6 +465,7 @@ class Supervisor:
             summaries={node: s for r in reports.values() for node, s in r.get("summaries", {}).items()},
             transport={label: r["transport"] for label, r in reports.items() if "transport" in r},
             files={p.label: p.closed or {} for p in self._processes.values() if p.kind == "sink"},
+            verifications=tuple(v for r in reports.values() for v in r.get("verifications", ())),
             first=self.status.first,
             last=max(reached, default=None),
             wall=wall,

@@ -1,6 +1,7 @@
-"""Sources: datasets, devices and made-up sequences."""
+"""Sources: datasets, devices, made-up sequences and a simulated robot."""
 
 from operators.sources.rgbd_folder import RgbdFolder
+from operators.sources.simulated_robot import SimulatedRobot
 from operators.sources.synthetic_rgbd import SyntheticRgbd
 
-__all__ = ["RgbdFolder", "SyntheticRgbd"]
+__all__ = ["RgbdFolder", "SimulatedRobot", "SyntheticRgbd"]

@@ -179,3 +179,27 @@ class LookAhead(Operator, tolerance="100s"):
 
     def process(self, a: FeatureVector, b: FeatureVector) -> FeatureVector:
         return value(a.stamp, number(b))
+
+
+class SmoothChanged(Smooth):
+    """`Smooth` after somebody changed its arithmetic, in a way that shows late and only here."""
+
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+        made = super().process(x, context)
+        if made is not None and self.calls > 40:
+            made = value(made.stamp, number(made) + 1e-3)
+        return made
+
+
+class Unrepeatable(Operator):
+    """Reads the clock from its thirtieth call on."""
+
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+
+    def setup(self) -> None:
+        self.calls = 0
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        self.calls += 1
+        return value(x.stamp, number(x) + (time.time() % 1 if self.calls >= 30 else 0.0))

@@ -55,6 +55,11 @@ def _directions(optics: Optics) -> F32:
     return rays.astype(np.float32)
 
 
+@lru_cache(maxsize=8)
+def _inverse_lengths(optics: Optics) -> F32:
+    return np.asarray(1 / np.linalg.norm(optics.directions(), axis=-1), np.float32)
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """What a camera sees, without noise.
@@ -198,8 +203,7 @@ class Renderer:
             triangle[rows, columns][nearer] = i[nearer] + self._first_moving
             weights[rows, columns][nearer] = w[nearer]
             normals[rows, columns][nearer] = n[nearer]
-        length = np.linalg.norm(optics.directions(), axis=-1)
-        cosine = np.abs(np.einsum("hwi,hwi->hw", normals, rays[..., 3:], optimize=False)) / length
+        cosine = np.abs(np.einsum("hwi,hwi->hw", normals, rays[..., 3:])) * _inverse_lengths(optics)
         things = self._thing_of_triangle.take(triangle, mode="clip")
         instances = self._id_of_thing.take(things)
         classes = self._class_of_thing.take(things)

@@ -1,0 +1,119 @@
+"""Options and arguments that several commands share, and what they are resolved to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dataflow.cli.output import fail, seconds
+
+if TYPE_CHECKING:
+    from dataflow.recording import Recording
+
+FLAG = " "
+"""The metavar of an option without a value: nothing is shown."""
+
+Json = Annotated[bool, typer.Option("--json", metavar=FLAG, help="Print JSON instead of tables.")]
+Settings = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
+]
+GraphFile = Annotated[Path, typer.Argument(metavar="GRAPH", help="A graph file (.yaml).")]
+RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
+Start = Annotated[
+    float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the recording's first message.")
+]
+End = Annotated[
+    float | None, typer.Option("--end", metavar="SECONDS", help="End so long after the recording's first message.")
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace output files that exist.")]
+
+
+def existing(path: Path, what: str) -> Path:
+    """`path`, or an error that names the files which could be meant. `what`: "a recording", "a graph file"."""
+    from dataflow.graph.problems import nearest
+
+    if path.is_file():
+        return path
+    if path.is_dir():
+        raise fail(f"{path} is a folder; expected {what}")
+    if path.exists():
+        raise fail(f"{path} is no regular file; expected {what}")
+    folder = path.parent
+    if not folder.is_dir():
+        raise fail(f"no file {path}: there is no folder {folder}")
+    near = nearest(path.name, sorted(p.name for p in folder.iterdir() if p.is_file()))
+    raise fail(f"no file {path}" + (f"; did you mean {folder / near}?" if near else f"; expected {what}"))
+
+
+def output_file(path: Path, suffix: str, *, overwrite: bool, option: str) -> Path:
+    """`path`, checked as a file to write: the suffix, its folder, and that nothing is replaced unasked."""
+    if path.suffix != suffix:
+        raise fail(f"{option} {path}: expected a file name that ends in {suffix}")
+    if path.is_dir():
+        raise fail(f"{option} {path}: that is a folder; name a file in it")
+    if path.exists() and not overwrite:
+        raise fail(f"{path} exists; name another file, or replace it with --overwrite")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise fail(f"{option} {path}: cannot make the folder {path.parent}: {error.strerror}") from None
+    return path
+
+
+def chosen_streams(words: Sequence[str] | None, names: Iterable[str], namespace: str = "") -> list[str]:
+    """The streams that `words` mean: full names, names without the namespace, or key expressions with wildcards.
+
+    None or no words: all. A word that matches nothing is an error that names the nearest stream.
+    """
+    from dataflow.graph.keys import canonical, key_fault, matching
+    from dataflow.graph.problems import did_you_mean
+
+    known = list(names)
+    if not words:
+        return known
+    keys = {name.strip("/"): name for name in known}  # foreign recordings name streams "/tf"
+    found: dict[str, None] = {}
+    for word in words:
+        bare = word.removeprefix("/")
+        fault = key_fault(bare)
+        if fault is not None:
+            raise fail(f"stream {word!r}: {fault}")
+        expressions = [bare] if word.startswith("/") or not namespace else [f"{namespace}/{bare}", bare]
+        matches = [keys[key] for expression in expressions for key in matching(canonical(expression), keys)]
+        if not matches:
+            shown = [name.removeprefix(f"{namespace}/") if namespace else name for name in known]
+            raise fail(f"no stream {word!r}: " + did_you_mean(word, shown, "there are"))
+        found |= dict.fromkeys(matches)
+    return [name for name in known if name in found]
+
+
+def span(recording: Recording, streams: Iterable[str]) -> tuple[int, int] | None:
+    """The first and the last stamp (ns) of those streams that are not static; None when they hold no message."""
+    infos = [recording.streams[s] for s in streams if not recording.streams[s].static]
+    firsts = [info.first for info in infos if info.first is not None]
+    lasts = [info.last for info in infos if info.last is not None]
+    return (min(firsts), max(lasts)) if firsts and lasts else None
+
+
+def window(
+    whole: tuple[int, int] | None, start: float | None, end: float | None, path: Path
+) -> tuple[int | None, int | None]:
+    """`--start` and `--end` as stamps (ns), checked against what the recording holds."""
+    for option, value in (("--start", start), ("--end", end)):
+        if value is not None and not 0 <= value < 1e9:
+            raise fail(f"{option} {value:g}: expected seconds from the recording's first message, 0 or more")
+    if start is not None and end is not None and end <= start:
+        raise fail(f"--end {end:g} must be greater than --start {start:g}")
+    if whole is None:
+        return None, None
+    first, last = whole
+    if start is not None and first + round(start * 1e9) > last:
+        raise fail(f"--start {start:g}: {path} ends {seconds((last - first) * 1e-9)} after its first message")
+    return (
+        None if start is None else first + round(start * 1e9),
+        None if end is None else first + round(end * 1e9),
+    )

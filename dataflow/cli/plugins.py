@@ -1,0 +1,107 @@
+"""Commands that other packages supply, through the entry-point group `dataflow.commands`.
+
+The entry point's name is the command; its value is a `typer.Typer` or a function that could be given to
+`Typer.command`. Nothing of a plug-in is imported before its command, or the help of all commands, is asked for; one
+that does not load is listed with its error.
+"""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Mapping
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any
+
+import typer
+from rich.markup import escape
+from typer.core import TyperGroup
+
+from dataflow.cli.output import COULD_NOT_RUN, err, fail, say, wants_traceback
+
+GROUP = "dataflow.commands"
+PANEL = "Commands of other packages"
+BROKEN_PANEL = "Commands that do not load"
+
+
+@cache
+def advertised() -> Mapping[str, EntryPoint]:
+    """The commands that installed packages supply, by name, in alphabetical order."""
+    return {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value))}
+
+
+class CommandGroup(TyperGroup):
+    """The built-in commands, then those of other packages; a built-in command cannot be replaced."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        built_in = super().list_commands(ctx)
+        return [*built_in, *(name for name in advertised() if name not in built_in)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        built_in = super().get_command(ctx, cmd_name)
+        if built_in is None and cmd_name in advertised():
+            self.add_command(load(advertised()[cmd_name]), cmd_name)
+            return super().get_command(ctx, cmd_name)
+        return built_in
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        if args and args[0] not in self.list_commands(ctx):
+            for name in advertised():  # so that they are suggested too
+                self.get_command(ctx, name)
+        return super().resolve_command(ctx, args)
+
+
+def load(entry: EntryPoint) -> Any:
+    """The command of an entry point; for one that does not load, a command that says why."""
+    try:
+        return _command(entry)
+    except Exception as error:  # a plug-in may fail in any way when it is imported
+        return _broken(entry, error)
+
+
+def _command(entry: EntryPoint) -> Any:
+    value = entry.load()
+    if isinstance(value, typer.Typer):
+        app = value
+        app.info.name = entry.name
+    elif callable(value):
+        app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+        app.command(entry.name)(value)
+    else:
+        raise TypeError(f"{entry.value} is {type(value).__name__}; expected a typer.Typer or a function")
+    command = typer.main.get_command(app)
+    command.name = entry.name
+    if getattr(command, "rich_help_panel", None) is None:
+        command.rich_help_panel = PANEL  # type: ignore[attr-defined]
+    return command
+
+
+def _broken(entry: EntryPoint, error: Exception) -> Any:
+    package = f" of package {entry.dist.name}" if entry.dist is not None else ""
+    reason = f"{entry.value}{package}: {type(error).__name__}: {error}"
+    app = typer.Typer(add_completion=False)
+    trace = "".join(traceback.format_exception(error)).rstrip()
+
+    @app.command(
+        entry.name,
+        help=escape(f"Does not load: {reason}"),
+        rich_help_panel=BROKEN_PANEL,
+        context_settings={"allow_extra_args": True, "ignore_unknown_options": True},
+    )
+    def command() -> None:
+        if wants_traceback():
+            err.print(escape(trace), style="dim", soft_wrap=True)
+        raise fail(f"command {entry.name!r} does not load: {reason}", code=COULD_NOT_RUN)
+
+    return typer.main.get_command(app)
+
+
+def shadowed(built_in: list[str]) -> list[EntryPoint]:
+    """Entry points whose name a built-in command has."""
+    return [entry for name, entry in advertised().items() if name in built_in]
+
+
+def say_shadowed(built_in: list[str]) -> None:
+    """Says which commands of other packages cannot be reached."""
+    for entry in shadowed(built_in):
+        say(f"[yellow]{escape(entry.value)} supplies a command {entry.name!r}, which is built in; it is left out[/]")

@@ -1,0 +1,113 @@
+"""The summary of a run: for people, and as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from dataflow.cli.output import count, figure, plural, seconds, size, table
+from dataflow.runtime.supervisor import RunReport
+
+
+def print_report(console: Console, report: RunReport) -> None:
+    """Operators, figures of metrics sinks, drops, notes, files."""
+    title = Text.assemble(
+        (report.graph, "bold"),
+        ("  interrupted", "yellow") if report.interrupted else ("  complete", "green"),
+        f"  {timing(report)}",
+    )
+    console.print(title)
+    console.print(_operators(report))
+    for operator, summary in report.summaries.items():
+        if summary:
+            console.print(Text(operator, style="bold"))
+            console.print(Padding(_figures(summary), (0, 0, 1, 2), expand=False))
+    if any(report.drops.values()):
+        console.print(Text("dropped", style="bold yellow"))
+        console.print(Padding(_drops(report), (0, 0, 1, 2), expand=False))
+    for note in report.notes:
+        console.print(Text(f"note: {note}", style="dim"))
+    for facts in report.files.values():
+        if facts:
+            line = f"wrote {facts['path']} ({plural(facts['messages'], 'message')}, {size(facts['bytes'])})"
+            console.print(Text(line), soft_wrap=True)
+            if facts.get("failed"):
+                console.print(Text(f"  {plural(facts['failed'], 'message')} could not be drawn", style="yellow"))
+
+
+def _operators(report: RunReport) -> Table:
+    numbers = ("firings", "out", "dropped", "work", "per firing")
+    made = table("operator", *numbers, right=numbers)
+    for name, counts in report.operators.items():
+        made.add_row(
+            Text(name),
+            count(counts.firings) if counts.firings else "",
+            count(counts.emitted) if counts.emitted else "",
+            Text(count(counts.dropped), style="yellow") if counts.dropped else "",
+            f"{counts.busy_ns * 1e-9:.2f} s",
+            f"{counts.busy_ns * 1e-6 / counts.firings:.2f} ms" if counts.firings else "",
+        )
+    return made
+
+
+def _figures(summary: Mapping[str, Any]) -> Table:
+    """One line a figure; the decimal values in a column of their own, with their unit."""
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column(no_wrap=True)
+    grid.add_column(overflow="fold")
+    for name, value in summary.items():
+        label, text, unit = figure(name, value)
+        grid.add_row(Text(label, style="dim"), Text(f"{text} {unit}".rstrip()))
+    return grid
+
+
+def _drops(report: RunReport) -> Table:
+    grid = Table.grid(padding=(0, 2))
+    grid.add_column()
+    grid.add_column(justify="right", no_wrap=True)
+    grid.add_column(overflow="fold")
+    for operator, drops in report.drops.items():
+        for input_name, reason, number in drops:
+            grid.add_row(Text(f"{operator}.{input_name}"), count(number), Text(reason))
+    return grid
+
+
+def timing(report: RunReport) -> str:
+    """Such as "8.30 s of event time in 4.10 s, 2.02 × real time"."""
+    if report.first is None or report.last is None or report.last <= report.first:
+        return seconds(report.wall)
+    event = (report.last - report.first) * 1e-9
+    return f"{seconds(event)} of event time in {seconds(report.wall)}, {event / max(report.wall, 1e-9):.2f} × real time"
+
+
+def report_json(report: RunReport) -> dict[str, Any]:
+    """A `RunReport` as JSON values."""
+    return {
+        "graph": report.graph,
+        "complete": not report.interrupted,
+        "wall_s": report.wall,
+        "first_stamp": report.first,
+        "last_stamp": report.last,
+        "operators": {
+            name: {"firings": c.firings, "emitted": c.emitted, "dropped": c.dropped, "busy_ms": c.busy_ns * 1e-6}
+            for name, c in report.operators.items()
+        },
+        "streams": {name: {"messages": n, "digest": digest} for name, (n, digest) in report.streams.items()},
+        "drops": {
+            operator: [{"input": i, "reason": why, "count": n} for i, why, n in drops]
+            for operator, drops in report.drops.items()
+        },
+        "summaries": {operator: dict(summary) for operator, summary in report.summaries.items()},
+        "transport": {label: dict(counts) for label, counts in report.transport.items()},
+        "files": {
+            name: {key: str(value) if isinstance(value, Path) else value for key, value in facts.items()}
+            for name, facts in report.files.items()
+        },
+        "notes": list(report.notes),
+    }

@@ -1,0 +1,303 @@
+"""`dataflow view`, and the viewers that `run` and `replay` start."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from dataflow.cli.arguments import End, Overwrite, Start, chosen_streams, existing, output_file, span, window
+from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.output import DIFFERENT, err, fail, friendly_errors, out, plural, say, size
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
+    from dataflow.view import ViewerSink
+
+READY_WITHIN = 20.0
+"""Seconds that a run waits for its viewer's process to be ready before it starts."""
+DRAW_WITHIN = 15.0
+"""Seconds that a viewer gets to draw the rest when its run has ended."""
+
+
+def view(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="[RECORDING]", help="A recording (.mcap). Without one: the running graph."),
+    ] = None,
+    to: Annotated[
+        str,
+        typer.Option(
+            "--to",
+            metavar="TARGET",
+            help="spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
+            "runs (rerun+http://127.0.0.1:9876/proxy).",
+        ),
+    ] = "spawn",
+    streams: Annotated[
+        list[str] | None,
+        typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    overwrite: Overwrite = False,
+    until_end: Annotated[bool, typer.Option("--until-end", hidden=True)] = False,
+) -> None:
+    """Show a recording, or attach to a running graph.
+
+    A viewer can never slow the graph: it skips what it cannot draw in time. A recording is shown whole.
+
+    Examples:
+
+      dataflow view run.mcap
+      dataflow view run.mcap --to run.rrd --start 5 --end 10
+      dataflow view run.mcap --to serve --stream "camera/*"
+      dataflow view --graph rgbd_perception --to serve
+    """
+    with friendly_errors():
+        if recording is not None:
+            if graph is not None or wait:
+                raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
+            _view_recording(existing(recording, "a recording"), _sink(to, overwrite), streams, start, end)
+        else:
+            if start is not None or end is not None:
+                raise fail("--start and --end are about a recording; name one")
+            _view_running(_sink(to, overwrite), streams, graph, wait, until_end=until_end)
+
+
+def _sink(to: str, overwrite: bool) -> ViewerSink:
+    from dataflow.view import Save, Spawn, ViewerSink, parse_target
+
+    target = parse_target(to)
+    if isinstance(target, Save):
+        output_file(target.path, ".rrd", overwrite=overwrite, option="--to")
+    if isinstance(target, Spawn):
+        require_display()
+    return ViewerSink(target, report=lambda line: say(f"[yellow]{escape(line)}[/]"))
+
+
+def require_display() -> None:
+    """An error, with what to use instead, where no window can be opened."""
+    from dataflow.view.process import display_problem
+
+    if (problem := display_problem()) is not None:
+        raise fail(
+            f"cannot open a viewer window: {problem}; use serve (a page for a browser) or a file name ending in .rrd"
+        )
+
+
+def _view_recording(
+    path: Path, sink: ViewerSink, streams: list[str] | None, start: float | None, end: float | None
+) -> None:
+    from rich.progress import BarColumn, Progress, TextColumn
+
+    from dataflow.recording import Recording
+    from dataflow.runtime.replay import ReplayError, recorded_graph
+    from dataflow.view import Serve, from_recording
+
+    with Recording(path) as opened:
+        readable = [name for name, info in opened.streams.items() if info.message_type is not None]
+        if not readable:
+            raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
+        namespace = opened.metadata.get("recording", {}).get("namespace", "")
+        chosen = chosen_streams(streams, readable, namespace)
+        try:
+            graph = _showing(recorded_graph(opened), streams and chosen)
+        except ReplayError:
+            graph = None  # somebody else's recording: drawn without a graph
+        whole = span(opened, chosen)
+        begin, finish = window(whole, start, end, path)
+        first, last = whole or (0, 0)
+        first, last = begin or first, last if finish is None else min(finish, last)
+        with sink:
+            with Progress(
+                TextColumn("drawing"), BarColumn(bar_width=24), TextColumn("{task.fields[note]}"), console=err,
+                transient=True, disable=not err.is_terminal,
+            ) as bar:  # fmt: skip
+                task = bar.add_task("", total=max(last - first, 1), note="")
+
+                def progress(stamp: int) -> None:
+                    note = f"{(stamp - first) * 1e-9:.1f} of {(last - first) * 1e-9:.1f} s"
+                    bar.update(task, completed=stamp - first, note=note)
+
+                announcer = _Announcer(sink)
+                handed = from_recording(
+                    opened, sink, chosen, begin, finish, graph=graph, progress=announcer.before(progress)
+                )
+            announcer.announce()
+            if isinstance(sink.target, Serve):
+                say(f"all {plural(handed, 'message')} sent; serving until Ctrl-C")
+                _until_interrupted()
+            complete = sink.close(timeout=60.0)
+    _report(sink, complete)
+
+
+def _showing(graph: Graph, wanted: list[str] | None) -> Graph:
+    """The graph, with those of its hidden streams shown that were asked for by name."""
+    if not wanted:
+        return graph
+    return replace(graph, view=replace(graph.view, hide=tuple(s for s in graph.view.hide if s not in wanted)))
+
+
+class _Announcer:
+    """Says once, as soon as the viewer is reached, where to look."""
+
+    def __init__(self, sink: ViewerSink) -> None:
+        self._sink, self._done = sink, False
+
+    def announce(self) -> None:
+        from dataflow.view import Serve
+
+        if not self._done and isinstance(self._sink.target, Serve):
+            say(f"open {self._sink.target.url}")
+        self._done = True
+
+    def before(self, progress: Callable[[int], None]) -> Callable[[int], None]:
+        def announced(stamp: int) -> None:
+            self.announce()
+            progress(stamp)
+
+        return announced
+
+
+def _view_running(
+    sink: ViewerSink, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool
+) -> None:
+    from dataflow.messages import message_type
+    from dataflow.runtime.attach import graph_of, still_runs, tap
+    from dataflow.view import Serve
+
+    found = running_graph(name, wait)
+    running = graph_of(found)
+    chosen = chosen_streams(streams, running.streams, running.namespace)
+    shown = _showing(running, streams and chosen)
+    with sink:
+        sink.open({name: message_type(running.streams[name].types[0]) for name in chosen}, shown)
+        _Announcer(sink).announce()
+        say(f"following {running.name} (process {found.pid})")
+        with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
+            while True:
+                taken = client.take(timeout=0.5)
+                if taken is None:
+                    if not still_runs(found):
+                        break
+                    continue
+                envelope = taken.decode()
+                if envelope.message is not None:
+                    sink.log(taken.stream, envelope.message)
+        if isinstance(sink.target, Serve) and not until_end:
+            say("the graph has ended; still serving until Ctrl-C")
+            _until_interrupted()
+        complete = sink.close(timeout=60.0)
+    _report(sink, complete)
+
+
+def _report(sink: ViewerSink, complete: bool) -> None:
+    from dataflow.view import Save
+
+    drawn = sink.statistics()
+    parts = [plural(drawn.drawn, "message")]
+    if drawn.dropped:
+        parts.append(f"{drawn.dropped:,} skipped because the viewer was too slow")
+    if drawn.failed:
+        parts.append(f"{drawn.failed:,} could not be drawn")
+    if isinstance(sink.target, Save):
+        path = sink.target.path
+        out.print(f"wrote {escape(str(path))} ({', '.join(parts)}, {size(path.stat().st_size)})", soft_wrap=True)
+    else:
+        out.print(f"shown: {', '.join(parts)}")
+    if not complete or drawn.failed:
+        raise typer.Exit(DIFFERENT)
+
+
+def _until_interrupted() -> None:
+    try:
+        while True:
+            time.sleep(1.0)
+    except KeyboardInterrupt:
+        return
+
+
+def open_saved(path: Path) -> None:
+    """Opens a saved viewer file in a window that stays; says so where there is no display."""
+    from dataflow.view import ViewerError
+    from dataflow.view.process import display_problem, start
+
+    if (problem := display_problem()) is not None:
+        say(f"{escape(str(path))} is not opened: {problem}; elsewhere, open it with: rerun {escape(path.name)}")
+        return
+    try:
+        start([str(path.resolve())], [], outlive=True)
+    except (ViewerError, OSError) as error:
+        say(f"[yellow]{escape(str(path))} is not opened: {escape(str(error))}[/]")
+        return
+    say(f"opening {escape(str(path))} in the viewer")
+
+
+@contextmanager
+def attached_viewer(target: str | None) -> Iterator[None]:
+    """While the block runs: a viewer's process that attaches to this process's graph as soon as it runs.
+
+    The block begins when that process is ready to attach, so that a short run is seen too. What the viewer says goes to
+    standard error. Its failure never ends the run.
+    """
+    if target is None:
+        yield
+        return
+    words = ["view", "--graph", str(os.getpid()), "--to", target, "--wait", "3600", "--until-end"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dataflow.cli.main", *words],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        process_group=0,
+    )
+    ready, following = threading.Event(), threading.Event()
+    reader = threading.Thread(target=_relay, args=(process, ready, following), daemon=True)
+    reader.start()
+    ready.wait(READY_WITHIN)
+    try:
+        yield
+    finally:
+        _end(process, following.is_set())
+        reader.join(timeout=2.0)
+
+
+def _relay(process: subprocess.Popen[str], ready: threading.Event, following: threading.Event) -> None:
+    assert process.stderr is not None
+    for line in process.stderr:
+        ready.set()
+        if line.startswith("following "):
+            following.set()
+        elif not line.startswith("waiting "):
+            say(f"[dim]viewer:[/] {escape(line.rstrip())}")
+    ready.set()
+
+
+def _end(process: subprocess.Popen[str], following: bool) -> None:
+    """Lets the viewer draw the rest of a run that has ended; one that never saw it ends at once."""
+    if process.poll() is None and not following:
+        say("[yellow]the run ended before the viewer could follow it; for short runs use --view FILE.rrd[/]")
+        process.terminate()
+    try:
+        process.wait(timeout=DRAW_WITHIN)
+    except subprocess.TimeoutExpired:
+        process.terminate()
+        try:
+            process.wait(timeout=5.0)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait(timeout=5.0)

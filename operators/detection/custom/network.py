@@ -1,0 +1,57 @@
+"""The grid detector: MobileNetV2, a feature pyramid, and per cell and anchor a box, an objectness and class scores."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from operators.training.backbone import MobileNetV2, SeparableConv
+
+STRIDES = (8, 16, 32)
+ANCHORS_PER_CELL = 3
+
+
+class GridDetector(nn.Module):
+    """Images (N, 3, H, W) in [0, 1], H and W multiples of 16 → one map (N, A · (5 + C), ⌈H / s⌉, ⌈W / s⌉) for each stride s.
+
+    What the channels mean is told in `operators.detection.custom.decode`.
+    """
+
+    def __init__(self, classes: int, width: float = 1.0, channels: int = 96) -> None:
+        super().__init__()
+        self.classes = classes
+        self.backbone = MobileNetV2(width)
+        self.lateral = nn.ModuleList(nn.Conv2d(self.backbone.channels[s], channels, 1) for s in STRIDES)
+        self.smooth = nn.ModuleList(SeparableConv(channels, channels) for _ in STRIDES)
+        outputs = ANCHORS_PER_CELL * (5 + classes)
+        self.heads = nn.ModuleList(
+            nn.Sequential(SeparableConv(channels, channels), nn.Conv2d(channels, outputs, 1)) for _ in STRIDES
+        )
+        for head in self.heads:
+            assert isinstance(head, nn.Sequential)
+            _start_rare(head[-1], classes)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        maps = self.backbone(images)
+        merged: list[Tensor] = []
+        for stride, lateral, smooth in reversed(list(zip(STRIDES, self.lateral, self.smooth, strict=True))):
+            level = lateral(maps[stride])
+            if merged:
+                level = level + functional.interpolate(merged[-1], size=level.shape[2:], mode="nearest")
+            merged.append(smooth(level))
+        return tuple(head(level) for head, level in zip(self.heads, reversed(merged), strict=True))
+
+
+def _start_rare(layer: nn.Module, classes: int) -> None:
+    """Biases such that a cell begins by expecting an object with 1 %: else the empty cells drown the first steps."""
+    assert isinstance(layer, nn.Conv2d)
+    assert layer.bias is not None
+    nn.init.normal_(layer.weight, std=0.01)
+    with torch.no_grad():
+        bias = layer.bias.view(ANCHORS_PER_CELL, 5 + classes)
+        bias[:, :4] = 0
+        bias[:, 4] = math.log(0.01 / 0.99)
+        bias[:, 5:] = math.log(0.6 / max(classes - 0.4, 0.6))

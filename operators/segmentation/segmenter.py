@@ -1,0 +1,65 @@
+"""Semantic segmentation with a network trained by `dataflow train segmenter`."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Image, SegmentationMap
+from dataflow.operator import In, Operator, Out, Param
+from operators.detection.fit import Fit
+from operators.weights import NetworkFileError, open_network, shipped
+
+VOID = 255
+
+
+class Segmenter(Operator):
+    """Gives every pixel a class on one CPU thread, so equal images give equal maps.
+
+    The network works on its own input size; its answer is enlarged to the image without inventing classes. Without a
+    file, the network that comes with the project is used; it knows the simulated worlds.
+    """
+
+    image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
+    segmentation: Out[SegmentationMap] = Out(doc="class of every pixel of the image")
+
+    weights: str | None = Param(None, doc="network file of `dataflow train segmenter`; none means the shipped one")
+    confidence_threshold: float = Param(0.0, ge=0, le=1, doc="pixels below become void (255)")
+    with_confidence: bool = Param(False, doc="also give the confidence of every pixel")
+
+    def setup(self) -> None:
+        """Loads the network. Raises FileNotFoundError or NetworkFileError."""
+        file = self.use_file(self.weights if self.weights is not None else shipped("segmenter.onnx"))
+        self._network = open_network(file, "segmenter")
+        names = [output.name for output in self._network.session.get_outputs()]
+        if names != ["classes", "confidence"]:
+            raise NetworkFileError(f"{file} must have the outputs classes and confidence, has {', '.join(names)}")
+        if len(self._network.classes) > VOID:
+            raise NetworkFileError(f"{file} has {len(self._network.classes)} classes; at most {VOID} are possible")
+
+    def process(self, image: Image) -> SegmentationMap:
+        network = self._network
+        pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
+        fit = Fit.plan("letterbox", (image.width, image.height), network.size)
+        classes, confidence = network.run(fit.apply(pixels))
+        labels = _enlarge(classes[0].astype(np.uint8), fit, cv2.INTER_NEAREST)
+        wanted = self.with_confidence or self.confidence_threshold > 0
+        sure = _enlarge(confidence[0], fit, cv2.INTER_LINEAR) if wanted else None
+        if sure is not None and self.confidence_threshold > 0:
+            labels = np.where(sure < self.confidence_threshold, np.uint8(VOID), labels)
+        return SegmentationMap(
+            stamp=image.stamp,
+            frame=image.frame,
+            class_names=network.classes,
+            void=VOID,
+            classes=labels,
+            confidence=np.clip(sure, 0, 1) if sure is not None and self.with_confidence else None,
+        )
+
+
+def _enlarge(values: NDArray[np.generic], fit: Fit, interpolation: int) -> NDArray[np.generic]:
+    """The part of the input that the image takes, at the image's size."""
+    (x, y), (width, height) = fit.offset, fit.inner
+    part = np.ascontiguousarray(values[y : y + height, x : x + width])
+    return part if fit.inner == fit.image else np.asarray(cv2.resize(part, fit.image, interpolation=interpolation))

@@ -1,0 +1,141 @@
+"""Training of the segmenter, as a task for the training loop."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
+from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork
+from operators.segmentation.score import confusion, mean_iou
+from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
+from operators.training.backbone import load_backbone
+from operators.training.export import export_network
+
+KIND = "segmenter"
+STEP = 16
+
+
+class SegmenterTask:
+    """Trains a SegmentationNetwork of input `size` (width, height; multiples of 16) on images with masks."""
+
+    kind = KIND
+
+    def __init__(
+        self,
+        data: SegmentationData,
+        size: tuple[int, int] = (320, 240),
+        *,
+        seed: int = 0,
+        width: float = 1.0,
+        variation: Variation | None = None,
+        backbone: Path | None = None,
+    ) -> None:
+        if any(extent % STEP or extent <= 0 for extent in size):
+            raise ValueError(f"the input's width and height must be multiples of {STEP}, got {size[0]}x{size[1]}")
+        torch.manual_seed(seed)
+        self.data, self.size, self.width = data, size, width
+        self.variation = Variation() if variation is None else variation
+        self.segmenter = SegmentationNetwork(len(data.classes), width)
+        self.class_weights = class_weights(data)
+        if backbone is not None:
+            load_backbone(self.segmenter.backbone, backbone)
+
+    @property
+    def network(self) -> nn.Module:
+        return self.segmenter
+
+    @property
+    def samples(self) -> int:
+        return len(self.data.training)
+
+    def description(self) -> dict[str, Any]:
+        return {
+            "classes": list(self.data.classes),
+            "size": list(self.size),
+            "width": self.width,
+            "images": self.samples,
+        }
+
+    def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> tuple[Tensor, Tensor]:
+        views = [self._view(self.data.training[k], rng) for k, rng in zip(samples, rngs, strict=True)]
+        images = np.stack([tensor_of(pixels) for pixels, _ in views])
+        return torch.from_numpy(images), torch.from_numpy(np.stack([mask for _, mask in views]).astype(np.int64))
+
+    def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
+        images, masks = (t.to(device) for t in batch)
+        scores = self.segmenter(images.contiguous(memory_format=torch.channels_last))
+        # Compared at half the resolution, in which the network answers; every second pixel of the truth.
+        masks = masks[:, ::2, ::2]
+        entropy = functional.cross_entropy(scores, masks, self.class_weights.to(device), ignore_index=VOID)
+        return {"entropy": entropy, "dice": dice_loss(scores, masks)}
+
+    def evaluate(self, network: nn.Module) -> dict[str, float]:
+        device = next(network.parameters()).device
+        classes = len(self.data.classes)
+        table = np.zeros((classes, classes + 1), np.int64)
+        for image in self.data.validation:
+            pixels, mask = self._view(image, None)
+            with torch.inference_mode():
+                scores = network(torch.from_numpy(tensor_of(pixels))[None].to(device))
+                scores = functional.interpolate(scores, size=mask.shape, mode="bilinear", align_corners=False)
+            table += confusion(mask, scores.argmax(dim=1)[0].cpu().numpy().astype(np.uint8), classes)
+        score = mean_iou(table)
+        return {"score": score, "miou": score}
+
+    def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
+        assert isinstance(network, SegmentationNetwork)
+        described = {
+            "kind": KIND,
+            "architecture": f"mobilenetv2-{self.width:g} decoder",
+            "classes": list(self.data.classes),
+            "width": self.size[0],
+            "height": self.size[1],
+            "training_images": self.samples,
+            **facts,
+        }
+        deployed = DeployedSegmenter(network, (self.size[1], self.size[0]))
+        export_network(deployed, self.size, ["classes", "confidence"], described, file)
+
+    def _view(
+        self, image: MaskedImage, rng: np.random.Generator | None
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """A random view of an image and its mask; as it is, fitted into the input, without `rng`."""
+        pixels, mask = image.read(len(self.data.classes))
+        affine = fitted((pixels.shape[1], pixels.shape[0]), self.size)
+        variation = self.variation if rng is not None else NONE
+        rng = rng or np.random.default_rng(0)
+        affine = varied(affine, self.size, variation, rng)
+        seen = warp(mask, affine, self.size, border=VOID, labels=True)
+        return recolored(warp(pixels, affine, self.size), variation, rng), seen
+
+
+def class_weights(data: SegmentationData, most: int = 200) -> Tensor:
+    """Weights (C,) float32 that fall with the square root of a class's share of the pixels, at most 8 times the least."""
+    counts = np.zeros(len(data.classes), np.float64)
+    step = max(1, len(data.training) // most)
+    for image in data.training[::step]:
+        mask = image.read(len(data.classes))[1]
+        counts += np.bincount(mask[mask != VOID], minlength=len(counts))
+    shares = np.maximum(counts / max(counts.sum(), 1), 1e-9)
+    weights = np.minimum(np.sqrt(shares.max() / shares), 8.0)
+    return torch.from_numpy((weights / np.average(weights, weights=shares)).astype(np.float32))
+
+
+def dice_loss(scores: Tensor, masks: Tensor) -> Tensor:
+    """1 - Dice of the classes in the batch (Milletari 2016): it counts a small class as much as a large one."""
+    known = (masks != VOID)[:, None]
+    probability = scores.softmax(dim=1) * known
+    truth = functional.one_hot(masks.where(known[:, 0], 0), scores.shape[1]).permute(0, 3, 1, 2) * known
+    overlap = (probability * truth).sum(dim=(0, 2, 3))
+    total = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
+    present = truth.sum(dim=(0, 2, 3)) > 0
+    dice = (2 * overlap + 1) / (total + 1)
+    return (1 - dice[present]).mean() if bool(present.any()) else scores.sum() * 0

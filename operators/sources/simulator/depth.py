@@ -1,0 +1,58 @@
+"""The depth camera's error model: noise and steps that grow with z², holes at edges and on slanted surfaces.
+
+The camera measures inverse depth v · quantum with an integer v. That integer is what a 16-bit PNG holds, so the
+compressed stream loses nothing.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.sources.simulator.noise import NoisePool
+from operators.sources.simulator.renderer import View
+from operators.sources.simulator.settings import DepthCamera
+
+F32 = NDArray[np.float32]
+U16 = NDArray[np.uint16]
+
+_STEP = 0.04  # a change of depth by this share between neighbours is an edge
+
+
+def measure(view: View, camera: DepthCamera, pool: NoisePool, rng: np.random.Generator) -> U16:
+    """The integers (H, W) that the camera reads; 0 for no return."""
+    truth = view.depth
+    seen = (truth >= camera.min_range) & (truth <= camera.max_range) & (view.cosine >= camera.grazing)
+    inverse = np.where(seen, 1 / np.maximum(truth, 1e-3), 0).astype(np.float32)
+    steps = inverse * np.float32(1 / ((1 + camera.bias) * camera.quantum))
+    if camera.noise > 0:
+        steps = steps + pool.take(rng, truth.shape) * np.float32(camera.noise / camera.quantum)
+    levels = np.clip(np.rint(steps), 1, 65535)
+    if camera.edge_holes > 0:
+        around = np.ones((3, 3), np.uint8)
+        brink = cv2.dilate(inverse, around) - cv2.erode(inverse, around) > _STEP * inverse
+        seen &= ~(brink & (_uniform(pool, rng, truth.shape) < camera.edge_holes))
+    if camera.specks > 0:
+        seen &= _uniform(pool, rng, truth.shape) >= camera.specks
+    return np.where(seen, levels, 0).astype(np.uint16)
+
+
+def metres(levels: U16, quantum: float) -> F32:
+    """The depths (H, W) of integers: scale / v with scale = 1 / quantum, 0 where v is 0."""
+    scale = 1 / quantum
+    return np.where(levels > 0, scale / np.maximum(levels, 1).astype(np.float64), 0).astype(np.float32)
+
+
+def png(levels: U16) -> NDArray[np.uint8]:
+    """The bytes (N,) of a 16-bit grey PNG file."""
+    done, data = cv2.imencode(".png", levels, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    if not done:
+        raise ValueError(f"depth of shape {levels.shape} could not be encoded as PNG")
+    return np.asarray(data.reshape(-1), np.uint8)
+
+
+def _uniform(pool: NoisePool, rng: np.random.Generator, shape: tuple[int, ...]) -> F32:
+    """Numbers in [0, 1), made of the fractions of the pool's numbers."""
+    value = pool.take(rng, shape) * np.float32(997.0)
+    return np.asarray(value - np.floor(value), np.float32)

@@ -1,0 +1,27 @@
+"""Frames of the robot: how mounts become transforms, and what the optical frame of a camera is."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.sources.simulator.settings import Mount
+
+Array = NDArray[np.float64]
+
+BODY_TO_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
+"""`T_housing_optical` (4, 4): the optical frame (z forward, x right, y down) in a housing (x forward, y left, z up)."""
+
+
+def mounted(mount: Mount) -> Array:
+    """`T_base_sensor` (4, 4) of (x, y, z, roll, pitch, yaw): turned about the fixed x, then y, then z axis (REP 103)."""
+    x, y, z, roll, pitch, yaw = mount
+    (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
+            [-sp, cp * sr, cp * cr, z],
+            [0, 0, 0, 1],
+        ]
+    )

@@ -1,0 +1,177 @@
+"""The sensors' parameters: rate, place on the robot, noise and faults of each."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from dataflow.operator import Duration
+
+Mount = tuple[float, float, float, float, float, float]
+"""x, y, z (m), roll, pitch, yaw (rad) on the robot: of a camera's housing with x forward, y left, z up."""
+
+
+class Sensor(BaseModel):
+    """What all sensors have. A sensor with rate 0 is off and costs nothing."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    rate: float = Field(0.0, ge=0, le=1000, description="measurements a second; 0 switches the sensor off")
+    phase: Duration = Field(0, description="time of the first measurement after the start")
+    delay: Duration = Field(0, description="how much older than its stamp a measurement is: a wrong clock")
+    dropout: float = Field(0.0, ge=0, le=1, description="probability that a measurement is missing")
+    outages: tuple[tuple[float, float], ...] = Field(
+        (), description="spans (from, to) in seconds since the start without any measurement"
+    )
+
+
+class ColorCamera(Sensor):
+    """A colour camera with square pixels and no distortion."""
+
+    rate: float = Field(10.0, ge=0, le=200, description="images a second; 0 switches the camera off")
+    width: int = Field(320, ge=16, le=4096, description="columns")
+    height: int = Field(240, ge=16, le=4096, description="rows")
+    focal: float = Field(0.85, gt=0.1, le=10, description="focal length as a share of the width")
+    mount: Mount | None = Field(None, description="place on the robot; the world's own (it looks where it should) if none")
+    output: Literal["raw", "jpeg", "both"] = Field("raw", description="ports that it feeds: image, image_jpeg or both")
+    jpeg_quality: int = Field(88, ge=1, le=100, description="of image_jpeg")
+    exposure: float = Field(1.0, gt=0, description="brightness")
+    exposure_change: float = Field(0.06, ge=0, lt=1, description="how far brightness swings about its mean, slowly")
+    read_noise: float = Field(1.2, ge=0, description="standard deviation in the dark, of 255")
+    shot_noise: float = Field(0.08, ge=0, description="standard deviation at brightness b is this times sqrt(b), of 255")
+    shutter: Duration = Field(0, description="how long the shutter is open: motion blur by the robot's turning; 0 for none")
+    black: float = Field(0.0, ge=0, le=1, description="probability of a black frame")
+
+
+class DepthCamera(Sensor):
+    """A depth camera that measures inverse depth, as stereo and structured light do: errors grow with z²."""
+
+    rate: float = Field(10.0, ge=0, le=200, description="images a second; 0 switches the camera off")
+    width: int | None = Field(None, ge=16, le=4096, description="columns; the colour camera's if none")
+    height: int | None = Field(None, ge=16, le=4096, description="rows; the colour camera's if none")
+    focal: float | None = Field(None, gt=0.1, le=10, description="share of the width; the colour camera's if none")
+    offset: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="of the depth camera in the colour camera's optical frame, metres; 0 is registered"
+    )
+    output: Literal["raw", "png", "both"] = Field("raw", description="ports that it feeds: depth, depth_png or both")
+    min_range: float = Field(0.25, gt=0, description="nearer things have no return, metres")
+    max_range: float = Field(6.0, gt=0, description="farther things have no return, metres")
+    noise: float = Field(0.0012, ge=0, description="standard deviation at 1 m, metres; at z it is this times z²")
+    quantum: float = Field(0.0012, gt=1e-4, description="step of the depths at 1 m, metres; at z it is this times z²")
+    bias: float = Field(0.0, gt=-0.5, lt=0.5, description="depths are too long by this share")
+    grazing: float = Field(0.12, ge=0, lt=1, description="no return where the cosine of ray and normal is less")
+    edge_holes: float = Field(0.5, ge=0, le=1, description="probability of no return on the brink of a depth step")
+    specks: float = Field(0.002, ge=0, le=1, description="probability of no return anywhere")
+    black: float = Field(0.0, ge=0, le=1, description="probability of a frame without any return")
+
+
+class StereoRig(Sensor):
+    """Two parallel cameras; the left one sits where the colour camera does."""
+
+    width: int = Field(320, ge=16, le=4096, description="columns")
+    height: int = Field(240, ge=16, le=4096, description="rows")
+    focal: float = Field(0.85, gt=0.1, le=10, description="focal length as a share of the width")
+    baseline: float = Field(0.12, gt=0, description="distance of the right camera from the left one, metres")
+    color: bool = Field(False, description="RGB instead of grey")
+    exposure: float = Field(1.0, gt=0, description="brightness")
+    read_noise: float = Field(1.5, ge=0, description="standard deviation in the dark, of 255")
+    shot_noise: float = Field(0.08, ge=0, description="standard deviation at brightness b is this times sqrt(b), of 255")
+    black: float = Field(0.0, ge=0, le=1, description="probability of black frames")
+
+
+class Lidar(Sensor):
+    """A rotating laser scanner; its stamp is the end of the sweep."""
+
+    rings: int = Field(16, ge=1, le=256, description="laser channels")
+    columns: int = Field(360, ge=4, le=4096, description="directions around")
+    lower: float = Field(-0.2618, gt=-1.57, lt=1.57, description="elevation of the lowest ring, radians")
+    upper: float = Field(0.2618, gt=-1.57, lt=1.57, description="elevation of the highest ring, radians")
+    mount: Mount = Field((-0.05, 0.0, 0.62, 0.0, 0.0, 0.0), description="place on the robot")
+    min_range: float = Field(0.2, ge=0, description="nearer returns are lost, metres")
+    max_range: float = Field(30.0, gt=0, description="farther returns are lost, metres")
+    noise: float = Field(0.012, ge=0, description="standard deviation of a range, metres")
+    bias: float = Field(0.0, description="ranges are too long by this, metres")
+    resolution: float = Field(
+        0.00390625, ge=0, description="coordinates are rounded to this, metres (1/256 packs well); 0 for not at all"
+    )
+    missing: float = Field(0.01, ge=0, le=1, description="probability that a beam has no return")
+    motion: bool = Field(False, description="the robot moves on during the sweep; the points say when each was measured")
+
+
+class Inertial(Sensor):
+    """An inertial measurement unit."""
+
+    mount: Mount = Field((0.0, 0.0, 0.3, 0.0, 0.0, 0.0), description="place on the robot")
+    gyro_noise: float = Field(1.7e-4, ge=0, description="noise density, rad/s/√Hz")
+    accel_noise: float = Field(2.0e-3, ge=0, description="noise density, m/s²/√Hz")
+    gyro_walk: float = Field(2.0e-5, ge=0, description="random walk of the bias, rad/s²/√Hz")
+    accel_walk: float = Field(3.0e-4, ge=0, description="random walk of the bias, m/s³/√Hz")
+    gyro_bias: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="at the start, rad/s")
+    accel_bias: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="at the start, m/s²")
+    gravity: float = Field(9.80665, gt=0, description="m/s²")
+
+
+class Wheels(Sensor):
+    """Encoders of the two driven wheels, and odometry made of them."""
+
+    radius: float = Field(0.08, gt=0, description="of a wheel, metres")
+    track: float = Field(0.4, gt=0, description="distance between the wheels, metres")
+    ticks_per_turn: int = Field(2048, ge=1, description="encoder counts a turn of the wheel")
+    scale_error: float = Field(0.01, ge=0, lt=0.5, description="standard deviation of each wheel's constant scale error")
+    slip: float = Field(0.006, ge=0, description="standard deviation of a wheel's error after 1 m; grows with √distance")
+
+
+class Radar(Sensor):
+    """A radar with a fan of cells: range, bearing and Doppler velocity of what reflects."""
+
+    mount: Mount = Field((0.2, 0.0, 0.45, 0.0, 0.0, 0.0), description="place on the robot")
+    field: float = Field(2.0, gt=0, le=6.28, description="width of the fan, radians")
+    max_range: float = Field(20.0, gt=0, description="metres")
+    range_noise: float = Field(0.05, ge=0, description="standard deviation, metres")
+    azimuth_noise: float = Field(0.015, ge=0, description="standard deviation, radians")
+    velocity_noise: float = Field(0.05, ge=0, description="standard deviation, m/s")
+    bias: float = Field(0.0, description="ranges are too long by this, metres")
+    detection: float = Field(0.85, ge=0, le=1, description="probability that a reflector is detected")
+    clutter: float = Field(0.5, ge=0, description="mean number of false detections a scan")
+
+
+class Landmarks(Sensor):
+    """Sightings of known landmarks by range and bearing."""
+
+    mount: Mount = Field((0.0, 0.0, 0.62, 0.0, 0.0, 0.0), description="place on the robot")
+    field: float = Field(6.2832, gt=0, le=6.2832, description="width of the field of view, radians")
+    max_range: float = Field(8.0, gt=0, description="metres")
+    range_noise: float = Field(0.03, ge=0, description="standard deviation at 1 m, metres; grows with the range")
+    bearing_noise: float = Field(0.01, ge=0, description="standard deviation, radians")
+    bias: float = Field(0.0, description="ranges are too long by this, metres")
+    unknown: float = Field(0.0, ge=0, le=1, description="probability that the identity of a sighting is not known")
+    missing: float = Field(0.05, ge=0, le=1, description="probability that a landmark in view is not seen")
+
+
+class Gnss(Sensor):
+    """A satellite receiver; the world's origin has the given coordinates, its x axis points east."""
+
+    mount: Mount = Field((0.0, 0.0, 1.2, 0.0, 0.0, 0.0), description="place of the antenna on the robot")
+    latitude: float = Field(48.1374, gt=-89, lt=89, description="of the world's origin, degrees")
+    longitude: float = Field(11.5755, ge=-180, le=180, description="of the world's origin, degrees")
+    altitude: float = Field(520.0, description="of the world's origin above the ellipsoid, metres")
+    noise: float = Field(0.4, ge=0, description="standard deviation, horizontal, metres; vertical is twice as much")
+    drift: float = Field(0.3, ge=0, description="standard deviation of a slowly changing error, metres")
+    drift_time: float = Field(30.0, gt=0, description="time in which that error changes, seconds")
+    bias: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="east, north, up, metres")
+
+
+class Truth(BaseModel):
+    """What is known about the world itself. A rate of 0 switches a stream off."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    poses: float = Field(10.0, ge=0, le=1000, description="true poses of robot and camera, a second")
+    boxes: bool = Field(True, description="Detections2D and Boxes3D with every colour image")
+    masks: bool = Field(False, description="SegmentationMap with every colour image")
+    relations: float = Field(2.0, ge=0, le=100, description="true scene graphs a second")
+    activities: float = Field(5.0, ge=0, le=100, description="true activities a second")
+    min_pixels: int = Field(12, ge=1, description="objects with fewer visible pixels have no box")
+    visible_share: bool = Field(True, description="work out how much of each object is hidden; costs a few ms an image")
+    spatial: bool = Field(True, description="add near, left_of and in_front_of to the relations of placement and contact")

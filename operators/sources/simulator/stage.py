@@ -1,0 +1,37 @@
+"""The world at the times at which it is measured: where the robot is, and what a camera on it sees."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.sources.simulator.renderer import Optics, Renderer, View
+from operators.sources.simulator.scene import World
+
+Array = NDArray[np.float64]
+
+
+class Stage:
+    """Sensors that measure at one time from one place share one cast."""
+
+    def __init__(self, world: World, renderer: Renderer) -> None:
+        self.world, self.renderer = world, renderer
+        self._last: tuple[tuple[float, bytes, Optics], View] | None = None
+
+    def T_world_base(self, t: float) -> Array:
+        """(4, 4)."""
+        return np.asarray(self.world.path.at([t]).T_world_base()[0])
+
+    def at(self, t: float) -> Renderer:
+        """The renderer, set to a time."""
+        self.renderer.at(t)
+        return self.renderer
+
+    def view(self, t: float, T_base_camera: Array, optics: Optics, *, color: bool) -> View:
+        """What a camera on the robot sees at a time."""
+        key = (t, T_base_camera.tobytes(), optics)
+        if self._last is not None and self._last[0] == key and (self._last[1].color is not None or not color):
+            return self._last[1]
+        view = self.at(t).view(self.T_world_base(t) @ T_base_camera, optics, color=color)
+        self._last = (key, view)
+        return view

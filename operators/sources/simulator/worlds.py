@@ -1,0 +1,19 @@
+"""The worlds by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from operators.sources.simulator.office import office
+from operators.sources.simulator.scene import World
+
+_MAKERS: dict[str, Callable[..., World]] = {"office": office}
+NAMES = tuple(_MAKERS)
+
+
+def make_world(name: str, seed: int, *, speed: float, hold: float, movers: bool) -> World:
+    """A world drawn from the seed. Raises ValueError for an unknown name."""
+    maker = _MAKERS.get(name)
+    if maker is None:
+        raise ValueError(f"no world {name!r}; there are {', '.join(NAMES)}")
+    return maker(seed, speed=speed, hold=hold, movers=movers)

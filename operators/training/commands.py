@@ -1,0 +1,302 @@
+"""`dataflow train` and `dataflow evaluate`. What is heavy is imported when a command runs, so `--help` is quick."""
+
+from __future__ import annotations
+
+import contextlib
+import json as jsonlib
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from operators.training.loop import Outcome, Settings, Task
+
+FAILED = 1
+_out, _err = Console(), Console(stderr=True)
+_LONGEST_SIDE, _MULTIPLE = 384, 32
+
+train = typer.Typer(
+    name="train", help="Train the project's networks on your own data.", no_args_is_help=True, rich_markup_mode="rich"
+)
+evaluate = typer.Typer(
+    name="evaluate", help="Score a network file on labelled data.", no_args_is_help=True, rich_markup_mode="rich"
+)
+
+Data = Annotated[Path, typer.Argument(help="The data folder.", show_default=False)]
+Epochs = Annotated[int, typer.Option(min=1, help="Passes through the training images.")]
+Batch = Annotated[int, typer.Option(min=1, help="Images a step.")]
+Rate = Annotated[float, typer.Option("--learning-rate", min=1e-7, help="Largest learning rate.")]
+Seed = Annotated[int, typer.Option(min=0, help="Decides everything random.")]
+Size = Annotated[
+    str | None, typer.Option(metavar="WxH", help="Input size, multiples of 16. Default: by the images, longest side 384.")
+]
+Width = Annotated[float, typer.Option(min=0.1, max=2.0, help="Width of the backbone, as a factor on its channels.")]
+Backbone = Annotated[
+    Path | None,
+    typer.Option("--backbone-weights", help="Start from these: torchvision's MobileNetV2 weights, or a checkpoint (.pt)."),
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]
+Every = Annotated[int, typer.Option(min=1, help="Score after every so many epochs.")]
+Workers = Annotated[int, typer.Option(min=1, help="Threads that prepare images.")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Threads that compute. Default: one a core.")]
+Device = Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1 ... Default: a GPU where there is one.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")]
+Weights = Annotated[Path, typer.Option("--weights", help="The network file (.onnx).", show_default=False)]
+
+
+@train.command("detector")
+def train_detector(
+    data: Data,
+    classes: Annotated[
+        str | None, typer.Option(metavar="A,B,...", help="Only these classes of the data, in this order.")
+    ] = None,
+    epochs: Epochs = 100,
+    out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("detector.onnx"),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    size: Size = None,
+    batch: Batch = 16,
+    learning_rate: Rate = 1e-3,
+    seed: Seed = 0,
+    width: Width = 1.0,
+    backbone_weights: Backbone = None,
+    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    evaluate_every: Every = 1,
+    workers: Workers = 2,
+    threads: Threads = None,
+    device: Device = None,
+    json: Json = False,
+) -> None:
+    """Train a grid detector on a folder in COCO or YOLO format.
+
+    Writes the best epoch's network (.onnx), which the operator `operators.detection:CustomDetector` takes as `weights`,
+    and a checkpoint (.pt) to resume from.
+    """
+    with _friendly():
+        _free(out, resume, overwrite)
+        from operators.detection.custom.dataset import read_detection_data
+        from operators.detection.custom.training import DetectorTask
+        from operators.training.augmentation import Variation
+        from operators.training.loop import Settings
+
+        read = read_detection_data(data, seed)
+        read = read if classes is None else read.only([name.strip() for name in classes.split(",") if name.strip()])
+        task = DetectorTask(
+            read,
+            _size(size, [image.file for image in read.training[:20]]),
+            seed=seed,
+            width=width,
+            variation=Variation() if flip else replace(Variation(), flip=0.0),
+            backbone=backbone_weights,
+        )
+        _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
+            device=device,
+        )  # fmt: skip
+        outcome = _run(task, settings, out, resume, json)
+    _finish(outcome, "operators.detection:CustomDetector", json)
+
+
+@train.command("segmenter")
+def train_segmenter(
+    data: Data,
+    epochs: Epochs = 60,
+    out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("segmenter.onnx"),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    size: Size = None,
+    batch: Batch = 16,
+    learning_rate: Rate = 1e-3,
+    seed: Seed = 0,
+    width: Width = 1.0,
+    backbone_weights: Backbone = None,
+    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    evaluate_every: Every = 1,
+    workers: Workers = 2,
+    threads: Threads = None,
+    device: Device = None,
+    json: Json = False,
+) -> None:
+    """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt."""
+    with _friendly():
+        _free(out, resume, overwrite)
+        from operators.segmentation.dataset import read_segmentation_data
+        from operators.segmentation.training import SegmenterTask
+        from operators.training.augmentation import Variation
+        from operators.training.loop import Settings
+
+        read = read_segmentation_data(data, seed)
+        task = SegmenterTask(
+            read,
+            _size(size, [image.image for image in read.training[:20]]),
+            seed=seed,
+            width=width,
+            variation=Variation() if flip else replace(Variation(), flip=0.0),
+            backbone=backbone_weights,
+        )
+        _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
+            device=device,
+        )  # fmt: skip
+        outcome = _run(task, settings, out, resume, json)
+    _finish(outcome, "operators.segmentation:Segmenter", json)
+
+
+@evaluate.command("detector")
+def evaluate_detector(
+    data: Data,
+    weights: Weights,
+    everything: Annotated[bool, typer.Option("--all", help="Score on all images, not only those for validation.")] = False,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format."""
+    with _friendly():
+        from operators.detection.custom.assessment import assess
+        from operators.detection.custom.dataset import read_detection_data
+
+        read = read_detection_data(data, seed)
+        images = (*read.training, *read.validation) if everything else read.validation
+        assessed = assess(weights, read.classes, images)
+    if json:
+        typer.echo(jsonlib.dumps(assessed))
+        return
+    table = Table("class", "AP50", title=f"{weights.name}: {assessed['images']} images, {assessed['objects']} objects")
+    for name, value in assessed["per_class"].items():
+        table.add_row(name, f"{value:.3f}")
+    table.add_section()
+    table.add_row("mean", f"{assessed['ap50']:.3f}")
+    _out.print(table)
+    _out.print(f"AP at 0.5 to 0.95: {assessed['ap']:.3f}; {assessed['ms']:.1f} ms an image")
+
+
+@evaluate.command("segmenter")
+def evaluate_segmenter(
+    data: Data,
+    weights: Weights,
+    everything: Annotated[bool, typer.Option("--all", help="Score on all images, not only those for validation.")] = False,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Score a segmenter by its mean IoU on the validation images of a folder with images/, masks/ and classes.txt."""
+    with _friendly():
+        from operators.segmentation.assessment import assess
+        from operators.segmentation.dataset import read_segmentation_data
+
+        read = read_segmentation_data(data, seed)
+        images = (*read.training, *read.validation) if everything else read.validation
+        assessed = assess(weights, read.classes, images)
+    if json:
+        typer.echo(jsonlib.dumps(assessed))
+        return
+    table = Table("class", "IoU", title=f"{weights.name}: {assessed['images']} images")
+    for name, value in assessed["per_class"].items():
+        table.add_row(name, f"{value:.3f}")
+    table.add_section()
+    table.add_row("mean", f"{assessed['miou']:.3f}")
+    _out.print(table)
+    _out.print(f"{assessed['ms']:.1f} ms an image")
+
+
+def _run(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -> Outcome:
+    from operators.training.loop import train as run
+    from operators.training.progress import TrainingBar
+
+    if quiet:
+        return run(task, settings, out, resume=resume)
+    with TrainingBar(_err) as bar:
+        return run(task, settings, out, resume=resume, progress=bar)
+
+
+def _tell(
+    notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
+) -> None:
+    if quiet:
+        return
+    for note in notes:
+        _err.print(f"[yellow]note:[/yellow] {note}", highlight=False)
+    named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
+    _err.print(
+        f"{training} images to train on, {validation} to score on; {len(classes)} classes: {named}; input {size[0]}x{size[1]}",
+        highlight=False,
+    )
+
+
+def _finish(outcome: Outcome, operator: str, json: bool) -> None:
+    if json:
+        typer.echo(
+            jsonlib.dumps(
+                {
+                    "weights": str(outcome.file),
+                    "checkpoint": str(outcome.checkpoint),
+                    "scores": outcome.best,
+                    "epoch": outcome.best_epoch,
+                    "epochs": len(outcome.history),
+                    "seconds": round(outcome.seconds, 1),
+                    "history": outcome.history,
+                }
+            )
+        )
+        return
+    scores = ", ".join(f"{name} {value:.3f}" for name, value in outcome.best.items() if name != "score")
+    _out.print(f"[green]{outcome.file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False)
+    _out.print(f"use it: `use: {operator}` with `params: {{weights: {outcome.file}}}`", highlight=False)
+
+
+def _size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
+    """The input size: as given, or the images' median proportions with the longest side 384."""
+    if text is not None:
+        match = re.fullmatch(r"(\d+)x(\d+)", text)
+        if match is None:
+            raise ValueError(f"--size {text!r} should be WIDTHxHEIGHT in pixels, such as 320x240")
+        return int(match[1]), int(match[2])
+    import cv2
+    import numpy as np
+
+    shapes = [found.shape for found in (cv2.imread(str(file)) for file in files) if found is not None]
+    ratio = float(np.median([width / height for height, width, _ in shapes])) if shapes else 1.0
+    extents = (min(1.0, ratio) * _LONGEST_SIDE, min(1.0, 1 / ratio) * _LONGEST_SIDE)
+    width, height = (max(_MULTIPLE, round(extent / _MULTIPLE) * _MULTIPLE) for extent in extents)
+    return width, height
+
+
+def _free(out: Path, resume: bool, overwrite: bool) -> None:
+    """Keeps an earlier training from being lost."""
+    if out.suffix != ".onnx":
+        raise ValueError(f"--out {str(out)!r} should end in .onnx")
+    checkpoint = out.with_suffix(".pt")
+    there = [str(file) for file in (out, checkpoint) if file.exists()]
+    if there and not (resume or overwrite):
+        raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")
+
+
+@contextlib.contextmanager
+def _friendly() -> Iterator[None]:
+    """Errors that the user can mend become one line and exit code 1."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if error.name not in _EXTRA:
+            raise
+        _fail(f"training needs the package {error.name!r}: pip install 'robot-dataflow[train]'")
+    except (ValueError, FileNotFoundError, FileExistsError, FloatingPointError) as error:
+        _fail(str(error))
+    except KeyboardInterrupt:
+        _fail("interrupted; go on with --resume", 130)
+
+
+_EXTRA: dict[str | None, Any] = dict.fromkeys(("torch", "onnx", "pycocotools"))
+
+
+def _fail(message: str, code: int = FAILED) -> None:
+    _err.print(f"[bold red]error:[/bold red] {message}", highlight=False, soft_wrap=True)
+    raise typer.Exit(code)

@@ -1,0 +1,104 @@
+"""Network files: ONNX models that carry, as metadata, all that is needed to use them (classes, input size, anchors).
+
+The metadata entry `dataflow.network` holds a JSON object with at least `kind`, `classes`, `width` and `height`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+KEY = "dataflow.network"
+_FOLDER = Path(__file__).parent
+
+
+class NetworkFileError(ValueError):
+    """A network file that does not fit its use: names the file, what it has and what would be right."""
+
+
+def shipped(name: str) -> Path:
+    """Where the project's own network `name` lies."""
+    return _FOLDER / name
+
+
+@dataclass(frozen=True, eq=False)
+class Network:
+    """An opened network. `size` is the (width, height) of its input, `facts` its whole metadata."""
+
+    file: Path
+    size: tuple[int, int]
+    classes: tuple[str, ...]
+    facts: dict[str, Any]
+    session: onnxruntime.InferenceSession
+
+    def run(self, pixels: NDArray[np.uint8]) -> Sequence[NDArray[Any]]:
+        """The outputs for an image (H, W, 3), RGB, of the input's size."""
+        tensor = np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], np.float32)
+        tensor /= np.float32(255)
+        found: Sequence[NDArray[Any]] = self.session.run(None, {self.session.get_inputs()[0].name: tensor})
+        return found
+
+
+def open_network(file: Path, kind: str) -> Network:
+    """Opens a network for one CPU thread, so that equal images give equal outputs on any load and core count.
+
+    Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`).
+    """
+    session = _session(file)
+    facts = _facts(file, session)
+    if facts.get("kind") != kind:
+        raise NetworkFileError(f"{file} is a {facts.get('kind')}; a {kind} is needed: `dataflow train {kind} DATA`")
+    inputs = session.get_inputs()
+    size = (int(facts["width"]), int(facts["height"]))
+    if len(inputs) != 1 or inputs[0].type != "tensor(float)" or list(inputs[0].shape) != [1, 3, size[1], size[0]]:
+        described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
+        raise NetworkFileError(f"{file} must have one input tensor(float) [1, 3, {size[1]}, {size[0]}], has {described}")
+    return Network(file, size, tuple(map(str, facts["classes"])), facts, session)
+
+
+def read_facts(file: Path) -> dict[str, Any]:
+    """The metadata of a network file. Raises NetworkFileError."""
+    return _facts(file, _session(file))
+
+
+def _facts(file: Path, session: onnxruntime.InferenceSession) -> dict[str, Any]:
+    text = session.get_modelmeta().custom_metadata_map.get(KEY)
+    if text is None:
+        raise NetworkFileError(
+            f"{file} has no metadata {KEY!r}; it was not written by `dataflow train` (for another family's ONNX file use "
+            f"operators.detection:OnnxDetector)"
+        )
+    try:
+        facts = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise NetworkFileError(f"{file}: metadata {KEY!r} is not JSON: {error}") from None
+    missing = [k for k in ("kind", "classes", "width", "height") if not isinstance(facts, dict) or k not in facts]
+    if missing:
+        raise NetworkFileError(f"{file}: metadata {KEY!r} lacks {', '.join(missing)}")
+    return dict(facts)
+
+
+def _session(file: Path) -> onnxruntime.InferenceSession:
+    import onnxruntime  # heavy, and needed only where a network runs
+
+    if not file.is_file():
+        raise FileNotFoundError(f"no network file {str(file)!r} (looked for {file.absolute()})")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.use_deterministic_compute = True
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime's exception classes share no public base
+        raise NetworkFileError(f"{file} cannot be loaded as an ONNX model: {error}") from error

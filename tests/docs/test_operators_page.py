@@ -1,0 +1,62 @@
+"""The reference page of the operators."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph.catalogue import BUILT_IN, Catalogue, discover
+from dataflow.graph.catalogue_page import markdown, section
+from dataflow.messages import PointCloud
+from dataflow.operator import In, Operator, Out, Param
+
+REMEDY = "run: python -m dataflow.graph.catalogue_page > docs/operators.md"
+
+
+@pytest.fixture(scope="module")
+def found() -> Catalogue:
+    return discover(BUILT_IN)
+
+
+@pytest.fixture
+def page(repository: Path) -> str:
+    return (repository / "docs" / "operators.md").read_text(encoding="utf-8")
+
+
+def test_the_page_is_what_the_operators_declare(found: Catalogue, page: str) -> None:
+    if not found.failures:
+        assert page == markdown(found), REMEDY
+    for use, cls in found.operators.items():  # where an optional package is missing, what can be imported
+        assert section(use, cls) in page, REMEDY
+
+
+def test_every_port_and_parameter_has_a_row_with_a_meaning(found: Catalogue, page: str) -> None:
+    for cls in found.operators.values():
+        rows = page.split(f"\n### {cls.spec.name}\n")[1].split("\n#")[0].splitlines()
+        for name in (*cls.spec.inputs, *cls.spec.outputs, *cls.spec.parameters.model_fields):
+            (row,) = [row for row in rows if row.startswith(f"| `{name}` |")]
+            assert not row.endswith("|  |"), f"{cls.spec.name}.{name} has no documentation"
+
+
+class Thinner(Operator):
+    """Keeps a | share."""
+
+    cloud: In[PointCloud] = In(doc="all | points")
+    thin: Out[PointCloud] = Out(lag="1s", doc="fewer")
+    share: float | None = Param(None, gt=0, doc="kept", unit="m")
+    offset: tuple[float, float] = Param((0.0, 0.0), doc="x, y", unit="m")
+
+    def process(self, cloud: PointCloud) -> PointCloud:
+        return cloud
+
+
+def test_declarations_cannot_break_the_tables() -> None:
+    lines = section("my:Thinner", Thinner).splitlines()
+
+    assert r"| `cloud` | In | [PointCloud](messages.md#pointcloud) | all \| points |" in lines
+    assert "| `thin` | Out | [PointCloud](messages.md#pointcloud) | fewer (up to 1s late) |" in lines
+    assert [line for line in lines if line.startswith("| `share`")] == [
+        r"| `share` | `float \| None` | `null` m | kept |"
+    ]
+    assert "Fires on every message of cloud." in lines

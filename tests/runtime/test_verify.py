@@ -1,0 +1,100 @@
+"""Verification repeats recorded firings, says 'identical' only when all is, and names who is to blame when not."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+from tests_runtime_graphs import chain
+
+from dataflow.graph import load_graph
+from dataflow.recording import Recording
+from dataflow.runtime.execute import run
+from dataflow.runtime.replay import ReplayError
+from dataflow.runtime.verify import VerifyReport, verify
+
+HERE = Path(__file__).resolve().parent
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("verify") / "run.mcap"
+    run(load_graph(HERE / "mixed.yaml"), placement="host_each", record=path)
+    return path
+
+
+def verdicts(report: VerifyReport) -> dict[str, str]:
+    return {v.operator: v.verdict for v in report.operators}
+
+
+@pytest.mark.parametrize("placement", ["one_host", "host_each", {"mix": "x", "sum": "x", "left": "y", "right": "y"}])
+def test_a_recorded_run_is_identical_in_any_placement(recorded: Path, placement: object) -> None:
+    report = verify(recorded, placement=placement)
+
+    assert report.identical
+    assert report.messages == 403
+    assert {v.operator: v.verified for v in report.operators} == {"mix": 101, "smooth": 121, "merge": 200, "sum": 200}
+    assert all(v.verified == v.firings and v.complete for v in report.operators)
+
+
+def test_one_operator_is_verified_alone_with_its_inputs_taken_from_the_recording(recorded: Path) -> None:
+    report = verify(recorded, only="smooth")
+
+    assert verdicts(report) == {"smooth": "identical"}
+    assert report.stood_in == ("mix",)
+
+
+def test_an_operator_and_what_follows_from_it(recorded: Path) -> None:
+    assert set(verdicts(verify(recorded, first="merge"))) == {"merge", "sum"}
+
+
+def test_a_change_in_one_operator_names_it_and_the_firing_and_the_others_as_downstream(recorded: Path) -> None:
+    graph = load_graph(HERE / "changed.yaml")
+
+    report = verify(recorded, graph=graph)
+
+    assert report.culprits == ("smooth",)
+    assert verdicts(report) == {"mix": "downstream", "smooth": "culprit", "merge": "identical", "sum": "identical"}
+    first = next(v.first for v in report.operators if v.operator == "smooth")
+    assert first is not None
+    assert (first.kind, first.port) == ("fire", "mean")
+    with Recording(recorded) as recording:
+        expected = next(m.message for m in recording.messages(["test/smooth/mean"]) if m.stamp == first.stamp)
+    assert first.expected == expected.digest().hex() != first.got
+
+
+def test_an_operator_that_reads_the_clock_or_draws_unseeded_numbers_is_the_culprit(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    graph = chain(
+        "smooth: {use: runtime_operators:Smooth, inputs: {x: left/fast}}",
+        "dice: {use: runtime_operators:Unrepeatable, inputs: {x: smooth/mean}}",
+        "sum: {use: runtime_operators:Merge, inputs: {all: dice/y}}",
+    )
+    run(graph, record=path)
+
+    report = verify(path)
+
+    assert report.culprits == ("dice",)
+    assert verdicts(report)["smooth"] == "identical"
+    assert verdicts(report)["sum"] == "downstream"
+
+
+def test_a_torn_recording_is_never_called_wholly_identical(recorded: Path, tmp_path: Path) -> None:
+    data = recorded.read_bytes()
+    for cut in random.Random(3).sample(range(len(data) // 3, len(data) * 9 // 10), 3):
+        torn = tmp_path / f"{cut}.mcap"
+        torn.write_bytes(data[:cut])
+        try:
+            report = verify(torn, placement="one_host")
+        except ReplayError:
+            continue
+        assert not any(v.first for v in report.operators)
+        assert all(v.complete for v in report.operators) or not report.identical
+
+
+def test_a_recording_without_what_is_needed_is_refused(recorded: Path) -> None:
+    with pytest.raises(ReplayError, match="'left' cannot be verified: it is a source"):
+        verify(recorded, only="left")
+    with pytest.raises(ReplayError, match="no operator of the graph; those that can: merge, mix, smooth, sum"):
+        verify(recorded, only="nobody")
