@@ -1,1 +1,1 @@
-"""The command line: results on standard output, progress and errors on standard error, exit codes that mean something."""
+"""The command line: results on standard output, progress and errors on standard error, exit codes that say which."""

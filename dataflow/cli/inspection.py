@@ -99,7 +99,7 @@ def show(
 def operators(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="[NAME]", help="One operator: its ports, parameters and documentation."),
+        typer.Argument(metavar="NAME", help="One operator: its ports, parameters and documentation."),
     ] = None,
     json: Json = False,
 ) -> None:

@@ -39,9 +39,9 @@ GraphName = Annotated[
     str | None,
     typer.Option("--graph", metavar="NAME", help="Which running graph, by name or process, when several run."),
 ]
-Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", min=0, help="Wait so long for the graph to run.")]
+Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", help="Wait so long for the graph to run.")]
 Streams = Annotated[
-    list[str] | None, typer.Argument(metavar="[STREAM]...", help="Streams; wildcards work. Default: all.")
+    list[str] | None, typer.Argument(metavar="STREAM...", help="Streams; wildcards work. Default: all.")
 ]
 
 SHOWN_ELEMENTS = 16
@@ -54,6 +54,8 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
     """The running graph of that name, or the only one; says so when it has to wait. Raises `NotRunning`."""
     from dataflow.runtime.attach import NotRunning, find_running
 
+    if not 0 <= wait < 1e9:
+        raise fail(f"--wait {wait:g}: expected seconds, 0 or more")
     try:
         return find_running(name)
     except NotRunning:
@@ -99,7 +101,8 @@ def list_running(json: Json = False) -> None:
         out.print(
             Text.assemble(
                 (found.name, "bold"),
-                f"  namespace {found.namespace}, process {found.pid}, running for {seconds(time.time() - found.started)}",
+                f"  namespace {found.namespace}, process {found.pid}",
+                f", running for {seconds(time.time() - found.started)}",
             )
         )
         streams = table("stream", "type", "taken by")
@@ -127,7 +130,7 @@ def _listed(found: RunningGraph) -> dict[str, Any]:
 def echo(
     streams: Streams = None,
     limit: Annotated[
-        int | None, typer.Option("--count", "-n", metavar="N", min=1, help="Stop after so many messages.")
+        int | None, typer.Option("--count", "-n", metavar="N", help="Stop after so many messages.")
     ] = None,
     full: Annotated[bool, typer.Option("--full", metavar=FLAG, help="Print long arrays and lists whole.")] = False,
     graph: GraphName = None,
@@ -149,6 +152,8 @@ def echo(
     """
     from dataflow.runtime.attach import still_runs
 
+    if limit is not None and limit < 1:
+        raise fail(f"--count {limit}: expected 1 or more")
     with friendly_errors(), tapped(streams, graph, wait) as (found, client):
         printed = 0
         try:
@@ -248,9 +253,7 @@ class _Rate:
 
 def hz(
     streams: Streams = None,
-    duration: Annotated[
-        float | None, typer.Option("--seconds", metavar="SECONDS", min=0.1, help="Stop after so long.")
-    ] = None,
+    duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Json = False,
@@ -270,6 +273,8 @@ def hz(
 
     from dataflow.runtime.attach import still_runs
 
+    if duration is not None and not 0 < duration < 1e9:
+        raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
     rates: dict[str, _Rate] = {}
     stopped = False
     with friendly_errors(), tapped(streams, graph, wait) as (found, client):

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import sys
 import traceback
+from collections.abc import Callable
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 
-from dataflow.cli import execution, inspection, live, recordings, viewing
+from dataflow.cli import execution, inspection, live, recordings, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup
@@ -56,8 +58,8 @@ def dataflow(
     Exit codes:
 
       0    it worked, and where a question was asked the answer is yes
-      1    it ran, and failed or answers no: a failed run, different recordings, a faulty graph
-      2    it could not run: a wrong option, a missing file, a graph with faults
+      1    it ran, and failed or the answer is no (different, faulty)
+      2    it could not run: a wrong option, a missing file, a faulty graph
       130  interrupted with Ctrl-C
 
     Examples:
@@ -65,6 +67,7 @@ def dataflow(
       dataflow run graphs/synthetic_rgbd.yaml --record run.mcap
       dataflow replay run.mcap --record again.mcap
       dataflow diff run.mcap again.mcap
+      dataflow verify run.mcap
       dataflow view run.mcap
       dataflow run --help
     """
@@ -72,19 +75,31 @@ def dataflow(
         os.environ[TRACEBACK] = "1"
 
 
-_MAKE, _LOOK, _FOLLOW = "Run and replay", "Look at graphs, operators and recordings", "Follow a running graph"
+_MAKE, _LOOK, _FOLLOW = "Run, replay, verify", "Look at graphs, operators and recordings", "Follow a running graph"
 
-app.command(rich_help_panel=_MAKE)(execution.run)
-app.command(rich_help_panel=_MAKE)(execution.replay)
-app.command(rich_help_panel=_LOOK)(inspection.check)
-app.command(rich_help_panel=_LOOK)(inspection.show)
-app.command(rich_help_panel=_LOOK)(inspection.operators)
-app.command(rich_help_panel=_LOOK)(recordings.info)
-app.command(rich_help_panel=_LOOK)(recordings.diff)
-app.command(rich_help_panel=_LOOK)(viewing.view)
-app.command("list", rich_help_panel=_FOLLOW)(live.list_running)
-app.command(rich_help_panel=_FOLLOW)(live.echo)
-app.command(rich_help_panel=_FOLLOW)(live.hz)
+
+def _paragraphs(text: str) -> str:
+    """A docstring with the lines of each paragraph joined, so that it wraps where the terminal ends; lists stay."""
+    blocks = inspect.cleandoc(text).split("\n\n")
+    return "\n\n".join(block if block.startswith(" ") else " ".join(block.split("\n")) for block in blocks)
+
+
+def _add(function: Callable[..., None], panel: str, name: str | None = None) -> None:
+    app.command(name, rich_help_panel=panel, help=_paragraphs(function.__doc__ or ""))(function)
+
+
+_add(execution.run, _MAKE)
+_add(execution.replay, _MAKE)
+_add(verification.verify, _MAKE)
+_add(inspection.check, _LOOK)
+_add(inspection.show, _LOOK)
+_add(inspection.operators, _LOOK)
+_add(recordings.info, _LOOK)
+_add(recordings.diff, _LOOK)
+_add(viewing.view, _LOOK)
+_add(live.list_running, _FOLLOW, "list")
+_add(live.echo, _FOLLOW)
+_add(live.hz, _FOLLOW)
 
 
 def main() -> None:

@@ -33,16 +33,28 @@ def advertised() -> Mapping[str, EntryPoint]:
 class CommandGroup(TyperGroup):
     """The built-in commands, then those of other packages; a built-in command cannot be replaced."""
 
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self._added: set[str] = set()
+
     def list_commands(self, ctx: Any) -> list[str]:
-        built_in = super().list_commands(ctx)
-        return [*built_in, *(name for name in advertised() if name not in built_in)]
+        present = super().list_commands(ctx)
+        return [*present, *(name for name in advertised() if name not in present)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        built_in = super().get_command(ctx, cmd_name)
-        if built_in is None and cmd_name in advertised():
+        present = super().get_command(ctx, cmd_name)
+        if present is None and cmd_name in advertised():
+            self._added.add(cmd_name)
             self.add_command(load(advertised()[cmd_name]), cmd_name)
             return super().get_command(ctx, cmd_name)
-        return built_in
+        return present
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        super().format_help(ctx, formatter)
+        for name in advertised():
+            if name in self.commands and name not in self._added:
+                value = escape(advertised()[name].value)
+                say(f"[yellow]{value} supplies a command {name!r}, which is built in; it is left out[/]")
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if args and args[0] not in self.list_commands(ctx):
@@ -94,14 +106,3 @@ def _broken(entry: EntryPoint, error: Exception) -> Any:
         raise fail(f"command {entry.name!r} does not load: {reason}", code=COULD_NOT_RUN)
 
     return typer.main.get_command(app)
-
-
-def shadowed(built_in: list[str]) -> list[EntryPoint]:
-    """Entry points whose name a built-in command has."""
-    return [entry for name, entry in advertised().items() if name in built_in]
-
-
-def say_shadowed(built_in: list[str]) -> None:
-    """Says which commands of other packages cannot be reached."""
-    for entry in shadowed(built_in):
-        say(f"[yellow]{escape(entry.value)} supplies a command {entry.name!r}, which is built in; it is left out[/]")

@@ -113,8 +113,8 @@ def _made_by(run: Mapping[str, str]) -> str:
     from dataflow.sync.stamps import format_stamp
 
     started = run.get("started", "")
-    when = f", {format_stamp(int(started)).partition('.')[0]} UTC" if started.isdigit() else ""
-    return f"{run.get('mode', '')}{when}".replace("T", " ")
+    when = format_stamp(int(started)).partition(".")[0].replace("T", " ") if started.isdigit() else ""
+    return f"{run.get('mode', '')}, {when} UTC" if when else run.get("mode", "")
 
 
 def _streams(described: Description, namespace: str) -> Table:

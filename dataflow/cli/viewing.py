@@ -33,7 +33,7 @@ DRAW_WITHIN = 15.0
 def view(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="[RECORDING]", help="A recording (.mcap). Without one: the running graph."),
+        typer.Argument(metavar="RECORDING", help="A recording (.mcap). Without one: the running graph."),
     ] = None,
     to: Annotated[
         str,
@@ -113,6 +113,8 @@ def _view_recording(
             raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
         namespace = opened.metadata.get("recording", {}).get("namespace", "")
         chosen = chosen_streams(streams, readable, namespace)
+        if not any(opened.streams[name].count for name in chosen):
+            raise fail(f"{path} holds no message of {', '.join(chosen)}")
         try:
             graph = _showing(recorded_graph(opened), streams and chosen)
         except ReplayError:
@@ -161,7 +163,7 @@ class _Announcer:
         from dataflow.view import Serve
 
         if not self._done and isinstance(self._sink.target, Serve):
-            say(f"open {self._sink.target.url}")
+            err.print(f"open {self._sink.target.url}", soft_wrap=True)  # whole, so that it can be clicked
         self._done = True
 
     def before(self, progress: Callable[[int], None]) -> Callable[[int], None]:
@@ -256,12 +258,13 @@ def attached_viewer(target: str | None) -> Iterator[None]:
     if target is None:
         yield
         return
+    say(f"[dim]starting the viewer ({target})[/]")
     words = ["view", "--graph", str(os.getpid()), "--to", target, "--wait", "3600", "--until-end"]
     process = subprocess.Popen(
         [sys.executable, "-m", "dataflow.cli.main", *words],
         stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
         text=True,
         process_group=0,
     )
@@ -271,26 +274,27 @@ def attached_viewer(target: str | None) -> Iterator[None]:
     ready.wait(READY_WITHIN)
     try:
         yield
+        if process.poll() is None and not following.is_set():
+            say("[yellow]the run ended before the viewer could follow it; for short runs use --view FILE.rrd[/]")
     finally:
         _end(process, following.is_set())
         reader.join(timeout=2.0)
 
 
 def _relay(process: subprocess.Popen[str], ready: threading.Event, following: threading.Event) -> None:
-    assert process.stderr is not None
-    for line in process.stderr:
+    assert process.stdout is not None
+    for line in process.stdout:
         ready.set()
         if line.startswith("following "):
             following.set()
         elif not line.startswith("waiting "):
-            say(f"[dim]viewer:[/] {escape(line.rstrip())}")
+            err.print(f"[dim]viewer:[/] {escape(line.rstrip())}", soft_wrap=True)
     ready.set()
 
 
 def _end(process: subprocess.Popen[str], following: bool) -> None:
     """Lets the viewer draw the rest of a run that has ended; one that never saw it ends at once."""
-    if process.poll() is None and not following:
-        say("[yellow]the run ended before the viewer could follow it; for short runs use --view FILE.rrd[/]")
+    if not following:
         process.terminate()
     try:
         process.wait(timeout=DRAW_WITHIN)

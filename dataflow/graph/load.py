@@ -15,13 +15,15 @@ from dataflow.graph.resolve import Resolver
 BUNDLE_FORMAT = "dataflow-graph/1"
 
 
-def load_graph(path: str | Path, *, settings: Sequence[str] = ()) -> Graph:
+def load_graph(path: str | Path, *, settings: Sequence[str] = (), live: bool = False) -> Graph:
     """The graph of a YAML file, checked wholly. `settings` are `--set` words, such as `"detector.threshold=0.3"`.
+
+    `live`: every source counts as a device, which does not wait, when the operators' live policies are worked out.
 
     Imports the operators it names. Raises `GraphError` with everything that is wrong.
     """
     file = Path(path)
-    return _load(file.name, _reader(file.parent), os.environ.get, settings, lambda key: _shown(file.parent, key))
+    return _load(file.name, _reader(file.parent), os.environ.get, settings, lambda key: _shown(file.parent, key), live)
 
 
 def load_text(
@@ -58,6 +60,7 @@ def _load(
     variable: Callable[[str], str | None],
     settings: Sequence[str],
     shown: Callable[[str], str],
+    live: bool = False,
 ) -> Graph:
     problems = Problems()
     texts: dict[str, str] = {}
@@ -75,7 +78,7 @@ def _load(
     if expansion is None:
         problems.check()
         raise AssertionError("a graph without a shape has a problem")
-    graph = Resolver(expansion, problems).resolve(Bundle(file, texts, tuple(settings), environment))
+    graph = Resolver(expansion, problems, live).resolve(Bundle(file, texts, tuple(settings), environment))
     problems.check()
     return graph
 

@@ -46,8 +46,8 @@ class _Wired:
 class Resolver:
     """Wires and checks; faults go to `problems`, and the graph that comes out is only right when there are none."""
 
-    def __init__(self, expansion: Expansion, problems: Problems) -> None:
-        self.expansion, self.problems = expansion, problems
+    def __init__(self, expansion: Expansion, problems: Problems, live: bool = False) -> None:
+        self.expansion, self.problems, self.live = expansion, problems, live
         self.fields = Fields(problems)
         self.streams: dict[str, Stream] = {}
         self.types: dict[str, tuple[type[Message], ...]] = {}
@@ -359,11 +359,11 @@ class Resolver:
                 )
 
     def fed_by_devices(self, wired: Iterable[_Wired]) -> set[str]:
-        """Names of the operators that have a source that cannot wait (`Source.live`) somewhere upstream."""
+        """Names of the operators that have a source that cannot wait (`Source.live`, or all in a live run) somewhere upstream."""
         downstream: dict[str, list[str]] = {}
         reached: list[str] = []
         for w in wired:
-            if issubclass(w.draft.cls, Source) and w.draft.cls.live:
+            if issubclass(w.draft.cls, Source) and (w.draft.cls.live or self.live):
                 reached.append(w.draft.name)
             for streams in w.inputs.values():
                 for stream in streams:

@@ -16,13 +16,14 @@ from typing import Any
 from dataflow.graph.model import Graph, Node
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
+from dataflow.runtime.admission import LiveRunner
 from dataflow.runtime.control import Channel, ChannelClosed
 from dataflow.runtime.feed import Feed, LogFeed, Window
 from dataflow.runtime.firings import FiringRecord, encode_batch
 from dataflow.runtime.keys import firings_key
 from dataflow.runtime.network import network_config
 from dataflow.runtime.reexecute import RecordedRunner, recorded_digests, recorded_firings
-from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner
+from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner, step_stamp
 from dataflow.runtime.threads import limit_threads
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode, encode
@@ -42,6 +43,7 @@ class HostConfig:
     `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
     are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`: whether a recorder
     takes the firing records. `verify` names a recording by whose firing records the operators are driven.
+    `live`: sources do not wait for the graph, and operators not for their inputs.
     """
 
     label: str
@@ -57,6 +59,7 @@ class HostConfig:
     paranoid: bool = False
     firings: bool = False
     verify: str | None = None
+    live: bool = False
 
 
 class HostFailure(RuntimeError):
@@ -198,7 +201,8 @@ class Host:
         for feed in self.feeds:
             if isinstance(feed, LogFeed):
                 feed.setup()
-        first = [stamp for feed in self.feeds if (stamp := feed.look_ahead()) is not None]
+        ahead = [*self.feeds, *(source for source in self.live if not source.source.live)]
+        first = [stamp for feed in ahead if (stamp := feed.look_ahead()) is not None]
         lengths = [n for source in self.sources if (n := source.source.length()) is not None]
         self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
 
@@ -214,7 +218,7 @@ class Host:
         if node.source:
             source = SourceRunner(node, self.outlet, seed=self.graph.seed)
             self.sources.append(source)
-            if source.source.live:
+            if self.config.live:
                 self.live.append(source)
             else:
                 self.feeds.append(source)
@@ -225,7 +229,8 @@ class Host:
             self.consumers.setdefault(stream, []).append(runner)
 
     def _runner(self, node: Node) -> OperatorRunner:
-        return OperatorRunner(
+        runner = LiveRunner if self.config.live else OperatorRunner
+        return runner(
             node, self.outlet, static=self.static, seed=self.graph.seed, paranoid=self.config.paranoid
         )
 
@@ -272,8 +277,8 @@ class Host:
     def _wait_time(self) -> float:
         if self._probing:
             return PROBE_EVERY
-        due = self._next_due()
-        return IDLE_WAIT if due is None else max(0.0, min(IDLE_WAIT, due))
+        due = [IDLE_WAIT, self._next_due(), *(r.next_due() for r in self.runners if isinstance(r, LiveRunner))]
+        return max(0.0, min(seconds for seconds in due if seconds is not None))
 
     def _take(self, timeout: float) -> None:
         """Handles everything in the inbox; waits up to `timeout` for the first."""
@@ -402,6 +407,10 @@ class Host:
         assert self.config.rate is not None
         return at + (stamp - first) * 1e-9 / self.config.rate - time.time()
 
+    def _waits_for_clock(self) -> bool:
+        patient = (r.next_due() for r in self.runners if isinstance(r, LiveRunner))
+        return self._next_due() is not None or any(due is not None for due in patient)
+
     def _next_due(self) -> float | None:
         """Seconds until the next paced step; None when nothing waits for the clock."""
         if self._start is None or not self._released or self.window.full:
@@ -415,7 +424,9 @@ class Host:
         def read() -> None:
             try:
                 while not self._stopping.is_set():
-                    step = runner.pull()
+                    step = runner.take()
+                    if step is not None and not runner.source.live:
+                        self._pace(step_stamp(step))
                     self.inbox.put(("source", runner, step))
                     if step is None:
                         return
@@ -423,6 +434,11 @@ class Host:
                 self.inbox.put(("source_failed", failure))
 
         threading.Thread(target=read, name=f"source {runner.node.name}", daemon=True).start()
+
+    def _pace(self, stamp: int) -> None:
+        """Holds a source that could wait to the clock, as a device would be. Ends early when the host stops."""
+        if self._start is not None:
+            self._stopping.wait(max(0.0, self._due_in(stamp)))
 
     def _from_live(self, runner: SourceRunner, step: dict[str, Message] | None) -> None:
         if runner.ended:
@@ -512,7 +528,7 @@ class Host:
                 self.window.grow()
             case "poll":
                 self.outlet.flush_all()
-                idle = self.inbox.empty() and self._next_due() is None and all(s.ended for s in self.live)
+                idle = self.inbox.empty() and not self._waits_for_clock() and all(s.ended for s in self.live)
                 full = self.window.full and any(not f.ended for f in self.feeds)
                 self.channel.send(
                     "state", round=fields["round"], idle=idle, sent=self.outlet.sent, received=self.received, full=full,

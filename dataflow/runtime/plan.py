@@ -34,6 +34,8 @@ class RunPlan:
     - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
     - `verify`: the operators that are driven by the firing records of `log`; the others do not run.
     - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes into the recording.
+    - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
+      `live:` policies apply.
     - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
     - `window`: messages and bytes that feeds may be ahead of the graph.
     - `paranoid`: re-digest inputs after each firing to catch operators that write into them.
@@ -47,6 +49,7 @@ class RunPlan:
     view_file: Path | None = None
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     verify: frozenset[str] | None = None
+    live: bool = False
     rate: float | None = None
     window: tuple[int, int] = (256, 64 << 20)
     paranoid: bool = False

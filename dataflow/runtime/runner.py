@@ -199,6 +199,13 @@ class OperatorRunner:
         """Messages dropped so far, by (input, reason)."""
         return self.aligner.drops
 
+    def take_drops(self) -> list[DropRecord]:
+        """What was dropped since the last record."""
+        return [
+            DropRecord(d.input, d.stream, d.incarnation, d.seq, d.stamp, d.reason, d.because)
+            for d in self.aligner.take_drops()
+        ]
+
     def waiting(self) -> tuple[int | None, dict[str, int]]:
         """The stamp that cannot be decided yet, and the frontiers that would decide it, by input."""
         held = self.aligner.waiting()
@@ -260,10 +267,7 @@ class OperatorRunner:
             late=firing.late,
             outputs=outputs,
             outcome="ok" if error is None else "error",
-            drops=tuple(
-                DropRecord(d.input, d.stream, d.incarnation, d.seq, d.stamp, d.reason, d.because)
-                for d in self.aligner.take_drops()
-            ),
+            drops=tuple(self.take_drops()),
             detail={} if error is None else {"error": error},
         )
 
@@ -308,6 +312,7 @@ class SourceRunner:
         self.ended = False
         self.busy_ns = 0
         self.overflow = 0
+        self._told = 0
         self.last = NEVER
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
@@ -326,6 +331,11 @@ class SourceRunner:
             self._next = self.pull()
             self.busy_ns += time.time_ns() - started
         return None if self._next is None else step_stamp(self._next)
+
+    def take(self) -> dict[str, Message] | None:
+        """The next step without emitting it, None at the end: for the thread that reads a source in a live run."""
+        step, self._next = self._next, None
+        return self.pull() if step is None else step
 
     def pull(self) -> dict[str, Message] | None:
         """Reads the source's next non-empty step; for live sources called on the reader's own thread."""
@@ -365,7 +375,8 @@ class SourceRunner:
         except OutputError as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
         self.firings += 1
-        self.records.add("fire", stamp, started, outputs=emissions)
+        lost, self._told = self.overflow - self._told, self.overflow
+        self.records.add("fire", stamp, started, outputs=emissions, detail={"overflow": lost} if lost else {})
         return len(step), sum(m.nbytes() for m in step.values())
 
     def finish(self, reason: str = "end of source") -> None:

@@ -104,9 +104,7 @@ class SegmenterTask:
         deployed = DeployedSegmenter(network, (self.size[1], self.size[0]))
         export_network(deployed, self.size, ["classes", "confidence"], described, file)
 
-    def _view(
-        self, image: MaskedImage, rng: np.random.Generator | None
-    ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    def _view(self, image: MaskedImage, rng: np.random.Generator | None) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """A random view of an image and its mask; as it is, fitted into the input, without `rng`."""
         pixels, mask = image.read(len(self.data.classes))
         affine = fitted((pixels.shape[1], pixels.shape[0]), self.size)

@@ -55,7 +55,9 @@ def varied(affine: Affine, target: tuple[int, int], variation: Variation, rng: n
     return np.column_stack([change[:, :2] @ affine[:, :2], change[:, :2] @ affine[:, 2] + change[:, 2]])
 
 
-def warp(pixels: Pixels, affine: Affine, target: tuple[int, int], border: int = GREY, *, labels: bool = False) -> Pixels:
+def warp(
+    pixels: Pixels, affine: Affine, target: tuple[int, int], border: int = GREY, *, labels: bool = False
+) -> Pixels:
     """The input (H', W'[, 3]) of an image under the map; class maps (`labels`) keep their values."""
     # OpenCV counts from pixel centres, the map from pixel edges.
     half = np.array([0.5, 0.5])

@@ -34,12 +34,15 @@ Batch = Annotated[int, typer.Option(min=1, help="Images a step.")]
 Rate = Annotated[float, typer.Option("--learning-rate", min=1e-7, help="Largest learning rate.")]
 Seed = Annotated[int, typer.Option(min=0, help="Decides everything random.")]
 Size = Annotated[
-    str | None, typer.Option(metavar="WxH", help="Input size, multiples of 16. Default: by the images, longest side 384.")
+    str | None,
+    typer.Option(metavar="WxH", help="Input size, multiples of 16. Default: by the images, longest side 384."),
 ]
 Width = Annotated[float, typer.Option(min=0.1, max=2.0, help="Width of the backbone, as a factor on its channels.")]
 Backbone = Annotated[
     Path | None,
-    typer.Option("--backbone-weights", help="Start from these: torchvision's MobileNetV2 weights, or a checkpoint (.pt)."),
+    typer.Option(
+        "--backbone-weights", help="Start from these: torchvision's MobileNetV2 weights, or a checkpoint (.pt)."
+    ),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]
@@ -155,7 +158,9 @@ def train_segmenter(
 def evaluate_detector(
     data: Data,
     weights: Weights,
-    everything: Annotated[bool, typer.Option("--all", help="Score on all images, not only those for validation.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Score on all images, not only those for validation.")
+    ] = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -183,7 +188,9 @@ def evaluate_detector(
 def evaluate_segmenter(
     data: Data,
     weights: Weights,
-    everything: Annotated[bool, typer.Option("--all", help="Score on all images, not only those for validation.")] = False,
+    everything: Annotated[
+        bool, typer.Option("--all", help="Score on all images, not only those for validation.")
+    ] = False,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:

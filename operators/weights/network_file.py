@@ -61,7 +61,9 @@ def open_network(file: Path, kind: str) -> Network:
     size = (int(facts["width"]), int(facts["height"]))
     if len(inputs) != 1 or inputs[0].type != "tensor(float)" or list(inputs[0].shape) != [1, 3, size[1], size[0]]:
         described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
-        raise NetworkFileError(f"{file} must have one input tensor(float) [1, 3, {size[1]}, {size[0]}], has {described}")
+        raise NetworkFileError(
+            f"{file} must have one input tensor(float) [1, 3, {size[1]}, {size[0]}], has {described}"
+        )
     return Network(file, size, tuple(map(str, facts["classes"])), facts, session)
 
 

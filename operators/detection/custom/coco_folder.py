@@ -84,9 +84,7 @@ def _merged_names(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[str, ...]
     return tuple(name for name in names if name in used) or tuple(names)
 
 
-def _images(
-    folder: Path, file: Path, content: Mapping[str, Any], names: Sequence[str]
-) -> list[LabelledImage]:
+def _images(folder: Path, file: Path, content: Mapping[str, Any], names: Sequence[str]) -> list[LabelledImage]:
     number = {c["id"]: names.index(str(c["name"])) for c in content["categories"] if str(c["name"]) in names}
     sizes: dict[Any, tuple[int, int]] = {}
     for k, image in enumerate(content["images"]):

@@ -80,7 +80,9 @@ def _in_map(wanted: Tensor, image: Tensor, center: Tensor, similar: Tensor, size
     return Assignment(image[target], anchor, cells[:, 1], cells[:, 0], wanted[target])
 
 
-def decode_maps(maps: Sequence[Tensor], anchors: Tensor, strides: Sequence[int], classes: int) -> list[tuple[Tensor, Tensor]]:
+def decode_maps(
+    maps: Sequence[Tensor], anchors: Tensor, strides: Sequence[int], classes: int
+) -> list[tuple[Tensor, Tensor]]:
     """Per map the boxes (N, A, H, W, 4) as corners in input pixels, and the raw objectness and classes (N, A, H, W, 1 + C)."""
     decoded = []
     for level, (output, stride) in enumerate(zip(maps, strides, strict=True)):

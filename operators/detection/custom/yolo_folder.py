@@ -79,7 +79,9 @@ def _box(values: Sequence[float], where: str) -> list[float]:
         centred = box[2] > box[0] and box[3] > box[1]
         centred = centred and min(box) >= -_TOLERANCE and max(box) <= 1 + _TOLERANCE
     else:
-        raise DataError(f"{where} has {len(values) + 1} numbers; a row is `class cx cy w h` or `class x1 y1 x2 y2 x3 y3 ...`")
+        raise DataError(
+            f"{where} has {len(values) + 1} numbers; a row is `class cx cy w h` or `class x1 y1 x2 y2 x3 y3 ...`"
+        )
     if not centred:
         raise DataError(f"{where}: coordinates are shares of the image's width and height, so they lie in [0, 1]")
     return box

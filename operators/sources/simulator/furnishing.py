@@ -37,12 +37,11 @@ class Style:
 
     @classmethod
     def drawn(cls, rng: Rng) -> Style:
-        kind = ("parquet", "carpet", "tiles", "wood")[int(rng.integers(4))]
+        kind = ("parquet", "carpet", "tiles")[int(rng.integers(3))]
         floor = {
             "parquet": tone(rng, (0.06, 0.1), (0.3, 0.55), (0.55, 0.85)),
             "carpet": tone(rng, (0, 1), (0.05, 0.4), (0.35, 0.7)),
             "tiles": tone(rng, (0, 1), (0.0, 0.15), (0.6, 0.95)),
-            "wood": tone(rng, (0.06, 0.1), (0.25, 0.5), (0.45, 0.8)),
         }[kind]
         return cls(
             Material("plaster", tone(rng, (0, 1), (0.02, 0.16), (0.72, 0.95)), tile=1.6),
@@ -221,7 +220,7 @@ def put_shelf(builder: Builder, rng: Rng, wall: Wall, along: float, width: float
     T = wall.place(depth / 2 + 0.02, along)
     id = builder.put("shelf", shape, T, on=FLOOR)
     for board in boards[:-1]:
-        if rng.uniform() < 0.55:
+        if rng.uniform() < 0.45:
             _row_of_books(builder, rng, id, T, board)
         else:
             scatter(builder, rng, id, T, board, small_items(rng, 3), inside=True)
@@ -233,7 +232,7 @@ def put_shelf(builder: Builder, rng: Rng, wall: Wall, along: float, width: float
 def _row_of_books(builder: Builder, rng: Rng, id: int, T: Array, board: Surface) -> None:
     y = rng.uniform(-1, 0.5) * board.half_y
     end = board.half_y
-    for _ in range(int(rng.integers(3, 8))):
+    for _ in range(int(rng.integers(3, 7))):
         shape, (width, thick, height) = objects.book(rng, upright=True)
         if y + thick > end:
             return
@@ -256,39 +255,39 @@ def put_on_floor(builder: Builder, label: str, shape: Shape, T: Array) -> int:
     return builder.put(label, shape, T, on=FLOOR)
 
 
-def line_wall(builder: Builder, rng: Rng, wall: Wall, free: Sequence[tuple[float, float]], *, density: float = 1.0) -> None:
-    """Stands furniture along the free spans (from, to) of a wall: desks, shelves, plants, boxes, bins, lamps, chairs."""
+def line_wall(
+    builder: Builder, rng: Rng, wall: Wall, free: Sequence[tuple[float, float]], *, depth: float = 1.55
+) -> None:
+    """Stands furniture along the free spans (from, to) of a wall, none farther from it than `depth` metres."""
     for start, end in free:
         cursor = start + rng.uniform(0.05, 0.3)
         while end - cursor > 0.5:
             room = end - cursor
             names = ["plant", "bin", "boxes", "lamp", "chair", "ball"]
             names += ["shelf"] * 3 if room > 1.0 else []
-            names += ["desk"] * 4 if room > 1.6 else []
+            names += ["desk"] * 4 if room > 1.6 and depth >= 1.55 else []
             name = names[int(rng.integers(len(names)))]
             width = {"shelf": min(room, rng.uniform(0.7, 1.4)), "desk": min(room, rng.uniform(1.2, 1.7))}.get(name, 0.55)
-            middle = cursor + width / 2
-            if rng.uniform() < density:
-                _stand(builder, rng, wall, name, middle, width)
+            _stand(builder, rng, wall, name, cursor + width / 2, width, depth)
             cursor += width + rng.uniform(0.08, 0.45)
 
 
-def _stand(builder: Builder, rng: Rng, wall: Wall, name: str, along: float, width: float) -> None:
-    out = rng.uniform(0.32, 0.4)
-    T = wall.place(out, along, 0, rng.uniform(-0.4, 0.4))
+def _stand(builder: Builder, rng: Rng, wall: Wall, name: str, along: float, width: float, depth: float) -> None:
     if name == "shelf":
         put_shelf(builder, rng, wall, along, width)
     elif name == "desk":
         put_desk(builder, rng, wall.place(0.42, along), width, items=int(rng.integers(3, 7)))
     elif name == "boxes":
-        put_boxes(builder, rng, T)
-    elif name == "plant":
-        put_on_floor(builder, "plant", furniture.plant(rng, rng.uniform(0.6, 1.3)), T)
-    elif name == "bin":
-        put_on_floor(builder, "bin", furniture.bin(rng), T)
-    elif name == "lamp":
-        put_on_floor(builder, "lamp", furniture.floor_lamp(rng), T)
-    elif name == "ball":
-        put_on_floor(builder, "ball", at_rest(objects.ball(rng, rng.uniform(0.09, 0.16))), T)
+        put_boxes(builder, rng, wall.place(0.34, along, 0, rng.uniform(-0.3, 0.3)))
     else:
-        put_on_floor(builder, "chair", furniture.chair(rng)[0], T)
+        shape = {
+            "plant": lambda: furniture.plant(rng, rng.uniform(0.6, 1.3)),
+            "bin": lambda: furniture.bin(rng),
+            "lamp": lambda: furniture.floor_lamp(rng),
+            "ball": lambda: at_rest(objects.ball(rng, rng.uniform(0.09, 0.16))),
+            "chair": lambda: furniture.chair(rng)[0],
+        }[name]()
+        yaw = rng.uniform(-0.4, 0.4)
+        low, high = bounds(at(shape, yaw=yaw))
+        if high[0] - low[0] + 0.04 <= depth and high[1] - low[1] <= width + 0.3:
+            put_on_floor(builder, name, shape, wall.place(0.04 - float(low[0]), along, 0, yaw))

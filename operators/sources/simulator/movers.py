@@ -19,7 +19,6 @@ from operators.sources.simulator.shapes import Array, pose
 from operators.sources.simulator.trajectory import Trajectory
 
 _STRIDE = 1.25  # metres a full step, left and right
-_SEATED = ("sitting", "reaching", "drinking")
 
 
 @dataclass(frozen=True)
@@ -45,13 +44,13 @@ class Timeline:
     """Acts one after the other, again and again, from a phase on."""
 
     def __init__(self, acts: Sequence[Act], phase: float = 0.0) -> None:
-        self.acts, self._phase = tuple(acts), phase
+        self.acts, self.phase = tuple(acts), phase
         self._starts = np.concatenate([[0], np.cumsum([act.seconds for act in acts])]).tolist()
         self.period: float = self._starts[-1]
 
     def at(self, t: float) -> tuple[Act, float, float]:
         """The act at a time, how far it is (0 to 1, smoothly: C2), and when it began."""
-        u = (t + self._phase) % self.period
+        u = (t + self.phase) % self.period
         k = min(bisect_right(self._starts, u) - 1, len(self.acts) - 1)
         x = (u - self._starts[k]) / self.acts[k].seconds
         return self.acts[k], x * x * x * (10 + x * (6 * x - 15)), t - (u - self._starts[k])
@@ -59,7 +58,7 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """Where a person sits: the place of the pelvis."""
+    """Where a person sits: the place (3,) of the pelvis."""
 
     pelvis: Array
 
@@ -129,7 +128,7 @@ class Person:
             pelvis[2] += sit * (self._seat.pelvis[2] - pelvis[2])
             middle = middle + 0.06 * sit * forward
         speed = abs(act.along[1] - act.along[0]) / act.seconds * 30 * _bell(self._share(t, act, began))
-        feet, swing, drop = self._gait(middle, along, yaw if forwards else yaw, min(1.0, speed / 0.5), forwards)
+        feet, swing, drop = self._gait(middle, along, yaw, min(1.0, speed / 0.5), forwards)
         pelvis[2] -= drop
         changing = act.sit[0] != act.sit[1]
         reach = _mix(act.reach, x)

@@ -19,6 +19,7 @@ from operators.sources.simulator.furnishing import (
     scatter,
     small_items,
 )
+from operators.sources.simulator.inhabitants import add_ball, add_desk_worker, add_rover, add_walker
 from operators.sources.simulator.scene import Builder, Light, World
 from operators.sources.simulator.shapes import Array, pose
 from operators.sources.simulator.trajectory import Trajectory
@@ -37,17 +38,27 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
     accent = int(rng.integers(4))
     door_wall = int(rng.integers(4))
+    roles = [str(role) for role in rng.permutation(["worker", "walker", "ball", "rover"])] if movers else [""] * 4
     for k, wall in enumerate(walls):
         raise_wall(builder, wall, style, accent=k == accent)
         half = wall.length / 2 - 0.75  # the corners stay free: furniture of two walls would meet there
         free = [(-half, half)]
         taken: list[tuple[float, float]] = []
+        if roles[k] == "worker" and k == door_wall:
+            door_wall = (k + 1) % 4 if k < 3 else -1
         if k == door_wall:
             middle, width = rng.uniform(-0.4, 0.4) * half, rng.uniform(0.85, 0.95)
             shape = furniture.door(rng, width, rng.uniform(2.0, 2.1), rng.uniform(0.0, 0.9))
             put_on_floor(builder, "door", shape, wall.place(0.0, middle))
             free = [(-half, middle - 0.75), (middle + 0.75, half)]
             taken.append((middle - 0.65, middle + 0.65))
+        if roles[k] == "worker":
+            sense = int(rng.choice([-1, 1]))
+            along = sense * -0.35 * half
+            add_desk_worker(builder, rng, wall, along, sense, sense * (half - 0.5), 1.75)
+            free = [(-half, along - 1.2), (along + 1.2, half)]
+        elif roles[k]:
+            _inhabit(builder, rng, wall, roles[k], half)
         line_wall(builder, rng, wall, free)
         decorate(builder, rng, wall, windows=k in (0, 2), taken=taken)
 
@@ -55,7 +66,7 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     path = Trajectory(_loop(rng, a, b), speed=speed, hold=hold)
     _island(builder, rng, min(a, b) - 0.42)
     lights = tuple(
-        Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(0.95, 1.25)) for sx in (-1, 1) for sy in (-1, 1)
+        Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(1.7, 2.2)) for sx in (-1, 1) for sy in (-1, 1)
     )
     landmarks = _landmarks(rng, walls)
     pitch = math.radians(rng.uniform(7, 11))
@@ -63,7 +74,7 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         "office",
         tuple(builder.things),
         lights,
-        0.5,
+        0.62,
         path,
         landmarks,
         (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, pitch, 0.0),
@@ -77,6 +88,26 @@ def _loop(rng: np.random.Generator, a: float, b: float) -> Array:
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False) + rng.uniform(0, 2 * math.pi)
     wobble = 1 - 0.06 * (1 + np.sin(3 * angle + rng.uniform(0, 6)))
     return np.stack([a * wobble * np.cos(angle), b * wobble * np.sin(angle)], axis=1)
+
+
+def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, half: float) -> None:
+    """Someone or something that moves along a wall, between its furniture and the robot's path."""
+    out = 1.78
+
+    def places(*points: tuple[float, float]) -> Array:
+        return np.array([wall.place(d, s)[:2, 3] for d, s in points])
+
+    reach = min(half - 0.6, 2.4)
+    if role == "walker":
+        add_walker(builder, rng, places((out, -reach), (out + 0.05, -0.3 * reach), (out, 0.4 * reach), (out, reach)))
+    elif role == "ball":
+        radius = rng.uniform(0.09, 0.15)
+        a, b = places((out, -reach * 0.8), (out, reach * 0.8))
+        add_ball(builder, rng, a, b, radius=radius, seconds=rng.uniform(4, 6))
+    else:
+        angle = np.linspace(0, 2 * math.pi, 8, endpoint=False)
+        points = [(out + 0.16 * math.sin(a), 0.7 * reach * math.cos(a)) for a in angle]
+        add_rover(builder, rng, places(*points))
 
 
 def _island(builder: Builder, rng: np.random.Generator, radius: float) -> None:

@@ -162,8 +162,9 @@ class Renderer:
         self._tint = np.concatenate([m.tint for m in both])
         self._density = np.concatenate([m.density for m in both])
         self._lights = [np.zeros(len(uv), np.float32) for _ in range(3)]  # l0, dl1, dl2
-        self._set_light(0, self._mesh.triangles, light)
+        self._set_light(slice(0, len(self._mesh.triangles)), self._mesh.triangles, light)
         self._first_moving = len(self._mesh.triangles)
+        self._floor = _Floor(self._mesh, light, [k for k, thing in enumerate(things) if thing.label == "floor"])
         self._time: float | None = None
         self._apart: _Apart | None = None
         self.at(0.0)
@@ -185,7 +186,9 @@ class Renderer:
         self._moving_scene = self._build(vertices, self._moving.triangles)
         light = _lamps(self.world.lights, vertices, normals) + self.world.ambient * (0.72 + 0.13 * normals[:, 2])
         light = np.where(self._moving.glow > 0, self._moving.glow, light).astype(np.float32)
-        self._set_light(self._first_moving, self._moving.triangles, light)
+        self._set_light(slice(self._first_moving, None), self._moving.triangles, light)
+        shaded = self._floor.shaded([vertices[own] for own in self._mover_vertices])
+        self._set_light(self._floor.triangles, self._mesh.triangles[self._floor.triangles], shaded)
 
     def view(self, T_world_camera: Array, optics: Optics, *, color: bool = True) -> View:
         """What a camera at `T_world_camera` (optical frame) sees now."""
@@ -296,12 +299,12 @@ class Renderer:
         answer = self._scene.test_occlusions(tensor, 1e-4, far, nthreads=self._threads)  # type: ignore[attr-defined]
         return np.asarray(answer.numpy())
 
-    def _set_light(self, first: int, triangles: NDArray[np.int64], light: F32) -> None:
+    def _set_light(self, rows: slice | NDArray[np.int64], triangles: NDArray[np.int64], light: F32) -> None:
+        """Enters the light on vertices (V,) for triangles that have these rows of the tables."""
         corner = light[triangles]
-        window = slice(first, first + len(triangles))
-        self._lights[0][window] = corner[:, 0]
-        self._lights[1][window] = corner[:, 1] - corner[:, 0]
-        self._lights[2][window] = corner[:, 2] - corner[:, 0]
+        self._lights[0][rows] = corner[:, 0]
+        self._lights[1][rows] = corner[:, 1] - corner[:, 0]
+        self._lights[2][rows] = corner[:, 2] - corner[:, 0]
 
     def _rectangles(self, T_world_camera: Array, optics: Optics) -> Iterator[tuple[slice, slice]]:
         """Rows and columns of the image that each mover may cover."""
@@ -339,6 +342,29 @@ class Renderer:
             out[part] = cv2.multiply(albedo, cv2.merge([light, light, light]).reshape(-1, 3), dtype=cv2.CV_32F)
         out[~np.isfinite(z)] = 0
         return out.reshape(*shape, 3)
+
+
+class _Floor:
+    """The floor's light, dimmed below movers: a soft shadow without which they would seem to float."""
+
+    def __init__(self, mesh: _Mesh, light: F32, floors: list[int]) -> None:
+        self.triangles = np.flatnonzero(np.isin(mesh.thing_of_triangle, floors))
+        self._vertices = np.unique(mesh.triangles[self.triangles])
+        self._places = mesh.vertices[self._vertices, :2]
+        self._light = light
+
+    def shaded(self, movers: list[Array]) -> F32:
+        """Light (V,) on all still vertices, given the movers' vertices (N, 3)."""
+        factor = np.ones(len(self._vertices))
+        for vertices in movers:
+            low = vertices[vertices[:, 2] < 0.35, :2]
+            if len(low):
+                middle, spread = low.mean(axis=0), 0.1 + low.std(axis=0).mean()
+                square = ((self._places - middle) ** 2).sum(axis=1)
+                factor *= 1 - 0.45 * np.exp(-square / (2 * spread**2))
+        light = self._light.copy()
+        light[self._vertices] *= factor.astype(np.float32)
+        return light
 
 
 class _Apart:

@@ -40,20 +40,6 @@ class Still:
 
 
 @dataclass(frozen=True, eq=False)
-class Rigid:
-    """Moves as one piece; `at` gives `T_world_thing` at a time, `turned` that of its shape where it rolls or tips."""
-
-    at: Callable[[float], Array]
-    turned: Callable[[float], Array] | None = None
-
-    def frame(self, t: float) -> Array:
-        return self.at(t)
-
-    def parts(self, t: float) -> Array:
-        return (self.turned or self.at)(t)[None]
-
-
-@dataclass(frozen=True, eq=False)
 class Thing:
     """An object or a piece of the building. `id` is unique and ≥ 1 for objects, 0 for surfaces."""
 
@@ -76,7 +62,7 @@ class Thing:
     def box(self, t: float) -> tuple[Array, Array]:
         """`T_world_box` (4, 4), centred, and the full size (3,) of the tightest box along the thing's own axes."""
         T = self.mover.frame(t)
-        if self.still or (len(self.parts) == 1 and getattr(self.mover, "turned", None) is None):
+        if self.still:
             low, high = bounds(self.parts[0])
         else:
             own = transform_points(np.linalg.inv(T), self.vertices(t))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from operators.sources.simulator.corridor import corridor
 from operators.sources.simulator.office import office
 from operators.sources.simulator.scene import World
+from operators.sources.simulator.table_top import table_top
 
-_MAKERS: dict[str, Callable[..., World]] = {"office": office}
+_MAKERS: dict[str, Callable[..., World]] = {"office": office, "corridor": corridor, "table_top": table_top}
 NAMES = tuple(_MAKERS)
 
 

@@ -1,0 +1,40 @@
+"""A live run drops, times out and is late; it says so, and its recording repeats it exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph import load_graph
+from dataflow.recording import Recording
+from dataflow.runtime.execute import run
+from dataflow.runtime.reexecute import recorded_firings
+from dataflow.runtime.verify import verify
+
+HERE = Path(__file__).resolve().parent
+
+
+@pytest.mark.parametrize("placement", ["one_host", "host_each"])
+def test_a_live_run_with_drops_and_timeouts_is_verified_in_another_placement(placement: str, tmp_path: Path) -> None:
+    path = tmp_path / "live.mcap"
+    graph = load_graph(HERE / "live.yaml", live=True)
+
+    report = run(graph, live=True, placement=placement, record=path)
+
+    reasons = {(op, reason) for op, drops in report.drops.items() for _, reason, _ in drops}
+    assert ("slow", "overflow") in reasons
+    with Recording(path) as recording:
+        overflowed = [d for r in recorded_firings(recording, "slow") for d in r.drops if d.reason == "overflow"]
+        assert len(overflowed) == sum(n for _, why, n in report.drops["slow"] if why == "overflow")
+    verified = verify(path, placement="one_host" if placement == "host_each" else "host_each")
+    assert verified.identical, verified.as_json()
+    assert {v.operator for v in verified.operators} == {"mix", "slow", "smooth", "merge", "sum"}
+
+
+def test_live_runs_do_differ_from_each_other_so_verification_says_something(tmp_path: Path) -> None:
+    graph = load_graph(HERE / "live.yaml", settings=["count=60"], live=True)
+
+    digests = {run(graph, live=True, placement="one_host").streams["test/slow/mean"] for _ in range(3)}
+
+    assert len(digests) > 1
