@@ -83,6 +83,8 @@ def main(descriptor: int) -> int:
         code = SUPERVISOR_GONE
     except BaseException as error:
         code = FAILED
+        if host is not None:
+            host.fail()
         _report(channel, error)
         _await_leave(inbox)
     facts: Any = {}

@@ -14,8 +14,8 @@ from operators.weights import NetworkFileError, open_network, shipped
 class CustomDetector(Operator):
     """Finds objects with a grid detector on one CPU thread, so equal images give equal boxes.
 
-    The file tells classes, input size and anchors. Without one, the network that comes with the project is used; it knows
-    the objects of the simulated worlds. To find your own objects: `dataflow train detector DATA`.
+    The file tells classes, input size and anchors. Without one, the network that comes with the project is used; it
+    knows the objects of the simulated worlds. To find your own objects: `dataflow train detector DATA`.
     """
 
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")

@@ -17,8 +17,8 @@ _LEVELS = ((16, 64), (8, 48), (4, 32), (2, 24))
 class SegmentationNetwork(nn.Module):
     """Images (N, 3, H, W) in [0, 1] → class scores (N, C, ⌈H / 2⌉, ⌈W / 2⌉) before the softmax.
 
-    The deepest map is weighed by the scene as a whole, as in LR-ASPP (Howard et al. 2019), then enlarged and merged with
-    finer maps step by step, since a mug is a few pixels wide.
+    The deepest map is weighed by the scene as a whole, as in LR-ASPP (Howard et al. 2019), then enlarged and merged
+    with finer maps step by step, since a mug is a few pixels wide.
     """
 
     def __init__(self, classes: int, width: float = 1.0) -> None:

@@ -16,7 +16,7 @@ from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork
 from operators.segmentation.score import confusion, mean_iou
 from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
-from operators.training.backbone import load_backbone
+from operators.training.backbone import MobileNetV2, load_backbone
 from operators.training.export import export_network
 
 KIND = "segmenter"
@@ -51,6 +51,10 @@ class SegmenterTask:
     @property
     def network(self) -> nn.Module:
         return self.segmenter
+
+    @property
+    def backbone(self) -> MobileNetV2:
+        return self.segmenter.backbone
 
     @property
     def samples(self) -> int:
@@ -116,7 +120,7 @@ class SegmenterTask:
 
 
 def class_weights(data: SegmentationData, most: int = 200) -> Tensor:
-    """Weights (C,) float32 that fall with the square root of a class's share of the pixels, at most 8 times the least."""
+    """Weights (C,) float32 that fall with the root of a class's share of the pixels, at most 8 times the least."""
     counts = np.zeros(len(data.classes), np.float64)
     step = max(1, len(data.training) // most)
     for image in data.training[::step]:

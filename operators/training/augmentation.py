@@ -21,9 +21,10 @@ GREY = 114
 class Variation:
     """How much a training image may be changed; zero turns a change off.
 
-    `flip` is the probability of a mirror image, `scale` the largest factor of size (1.5: between 1/1.5 and 1.5), `shift` the
-    share of the input by which the image moves, `color` the strength of brightness, contrast, saturation and hue
-    changes, `noise` the largest standard deviation in grey levels, `blur` the probability of a blur.
+    `flip` is the probability of a mirror image, `scale` the largest factor of size (1.5: between 1/1.5 and 1.5),
+    `shift` the share of the input by which the image moves at most, `color` the strength of changes of brightness,
+    white balance, gamma and saturation, `noise` the largest standard deviation in grey levels, `blur` the probability
+    of a blur.
     """
 
     flip: float = 0.5

@@ -15,6 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 if TYPE_CHECKING:
+    from torch import nn
+
+    from operators.training.backbone import MobileNetV2
     from operators.training.loop import Outcome, Settings, Task
 
 FAILED = 1
@@ -44,6 +47,15 @@ Backbone = Annotated[
         "--backbone-weights", help="Start from these: torchvision's MobileNetV2 weights, or a checkpoint (.pt)."
     ),
 ]
+Frozen = Annotated[
+    int | None,
+    typer.Option(
+        help="Keep the backbone down to this stride as it is. Default: 4 with given weights, else 0 for none."
+    ),
+]
+Initial = Annotated[
+    Path | None, typer.Option("--from", help="Start from all weights of this checkpoint (.pt) that fit: fine-tuning.")
+]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]
 Every = Annotated[int, typer.Option(min=1, help="Score after every so many epochs.")]
@@ -70,6 +82,8 @@ def train_detector(
     seed: Seed = 0,
     width: Width = 1.0,
     backbone_weights: Backbone = None,
+    frozen_stride: Frozen = None,
+    initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
     evaluate_every: Every = 1,
     workers: Workers = 2,
@@ -99,6 +113,7 @@ def train_detector(
             variation=Variation() if flip else replace(Variation(), flip=0.0),
             backbone=backbone_weights,
         )
+        _prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
         _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
@@ -121,6 +136,8 @@ def train_segmenter(
     seed: Seed = 0,
     width: Width = 1.0,
     backbone_weights: Backbone = None,
+    frozen_stride: Frozen = None,
+    initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
     evaluate_every: Every = 1,
     workers: Workers = 2,
@@ -145,6 +162,7 @@ def train_segmenter(
             variation=Variation() if flip else replace(Variation(), flip=0.0),
             backbone=backbone_weights,
         )
+        _prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
         _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
@@ -224,6 +242,17 @@ def _run(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -
         return run(task, settings, out, resume=resume, progress=bar)
 
 
+def _prepare(
+    network: nn.Module, backbone: MobileNetV2, weights: Path | None, frozen_stride: int | None, initial: Path | None
+) -> None:
+    from operators.training.backbone import start_from
+
+    if initial is not None:
+        start_from(network, initial)
+    given = weights is not None or initial is not None
+    backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
+
+
 def _tell(
     notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
 ) -> None:
@@ -232,10 +261,8 @@ def _tell(
     for note in notes:
         _err.print(f"[yellow]note:[/yellow] {note}", highlight=False)
     named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
-    _err.print(
-        f"{training} images to train on, {validation} to score on; {len(classes)} classes: {named}; input {size[0]}x{size[1]}",
-        highlight=False,
-    )
+    counts = f"{training} images to train on, {validation} to score on"
+    _err.print(f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}", highlight=False)
 
 
 def _finish(outcome: Outcome, operator: str, json: bool) -> None:

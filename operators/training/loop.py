@@ -1,7 +1,7 @@
 """The training loop of all networks: AdamW with a cosine schedule, averaged weights, checkpoints that resume exactly.
 
-Everything random follows from (seed, epoch, sample), so on a CPU a run that was interrupted and resumed ends with the same
-weights, bit for bit, as one that was not.
+Everything random follows from (seed, epoch, sample), so on a CPU a run that was interrupted and resumed ends with the
+same weights, bit for bit, as one that was not.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ class Silent:
 
 @dataclass
 class Outcome:
-    """What training gave: the best epoch's scores, each epoch's record, and the seconds spent, resumed parts included."""
+    """What training gave: the best epoch's scores, each epoch's record, the seconds spent (resumed parts included)."""
 
     file: Path
     checkpoint: Path
@@ -238,7 +238,7 @@ class _Run:
 
 
 def schedule(step: int, steps: int, warmup: float) -> float:
-    """The learning rate's factor: a linear rise over the share `warmup` of the steps, then half a cosine down to 2 %."""
+    """The learning rate's factor: a linear rise over the share `warmup` of the steps, then half a cosine to 2 %."""
     rise = max(1, int(steps * warmup))
     if step < rise:
         return (step + 1) / rise

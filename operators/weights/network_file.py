@@ -76,8 +76,8 @@ def _facts(file: Path, session: onnxruntime.InferenceSession) -> dict[str, Any]:
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:
         raise NetworkFileError(
-            f"{file} has no metadata {KEY!r}; it was not written by `dataflow train` (for another family's ONNX file use "
-            f"operators.detection:OnnxDetector)"
+            f"{file} has no metadata {KEY!r}; it was not written by `dataflow train` (for another family's ONNX file "
+            f"use operators.detection:OnnxDetector)"
         )
     try:
         facts = json.loads(text)

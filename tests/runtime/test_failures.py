@@ -17,6 +17,7 @@ from tests_runtime_graphs import chain
 from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.runtime.plan import RunPlan
+from dataflow.runtime.reexecute import recorded_firings
 from dataflow.runtime.supervisor import RunFailed, Supervisor
 
 HERE = Path(__file__).resolve().parent
@@ -74,12 +75,15 @@ def test_an_operator_that_hangs_ends_the_run_within_the_stall_timeout() -> None:
 def test_a_failure_leaves_a_recording_that_says_so(tmp_path: Path) -> None:
     path = tmp_path / "failed.mcap"
 
-    fails(broken("raise"), record=path)
+    fails(broken("raise"), record=path, placement="host_each")
 
     with Recording(path) as recording:
         assert recording.metadata["dataflow:outcome"]["outcome"].startswith("failed: operator 'bad'")
         assert recording.streams["test/left/fast"].count > 0
         assert not recording.torn
+        last = list(recorded_firings(recording, "bad"))[-1]
+        assert (last.outcome, last.stamp) == ("error", 1_200_000_000)
+        assert last.detail["error"] == "RuntimeError: the gripper is on fire"
 
 
 def test_what_operators_print_reaches_the_user() -> None:

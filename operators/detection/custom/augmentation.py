@@ -16,7 +16,7 @@ _LEAST_SHARE = 0.35
 
 @dataclass(frozen=True, eq=False)
 class DetectionSample:
-    """`pixels` (H, W, 3) RGB of the network's input; `boxes` (N, 4) corners in its pixels, `classes`, `ignored` (N,)."""
+    """`pixels` (H, W, 3) RGB of the input; `boxes` (N, 4) corners in its pixels, `classes` and `ignored` (N,)."""
 
     pixels: Pixels
     boxes: NDArray[np.float32]

@@ -1,4 +1,4 @@
-"""Reads a folder in COCO format: JSON files of images, categories and annotations with `bbox` [x, y, w, h] in pixels."""
+"""Reads a folder in COCO format: JSON of images, categories and annotations with `bbox` [x, y, w, h] in pixels."""
 
 from __future__ import annotations
 

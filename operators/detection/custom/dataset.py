@@ -102,9 +102,10 @@ def read_detection_data(folder: Path, seed: int = 0) -> DetectionData:
     elif find_names(folder) is not None:
         data = read_yolo(folder)
     else:
+        held = ", ".join(sorted(p.name for p in folder.iterdir())[:8]) or "nothing"
         raise DataError(
             f"{folder} is neither COCO (annotations.json or instances_*.json) nor YOLO (data.yaml with `names`, or "
-            f"classes.txt, with images/ and labels/); it holds {', '.join(sorted(p.name for p in folder.iterdir())[:8])}"
+            f"classes.txt, with images/ and labels/); it holds {held}"
         )
     if not any(len(image.boxes) for image in data.training):
         raise DataError(f"{folder}: none of the {len(data.training)} training images has a label")

@@ -1,7 +1,8 @@
 """The grid network's raw output as scored boxes.
 
-The box of an anchor (w, h) in the cell (column, row) of a map of stride s follows YOLOv5: centre
-s · (2σ(tx) − 0.5 + column), s · (2σ(ty) − 0.5 + row), size (w · (2σ(tw))², h · (2σ(th))²); score σ(objectness) · σ(class).
+The box of an anchor (w, h) in the cell (column, row) of a map of stride s follows YOLOv5: its centre is
+s · (2σ(tx) − 0.5 + column), s · (2σ(ty) − 0.5 + row), its size w · (2σ(tw))², h · (2σ(th))², and its score
+σ(objectness) · σ(class).
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ def find_boxes(
     nms_iou: float,
     most: int,
 ) -> Candidates:
-    """The boxes in the network's output, in input pixels, after class-wise suppression: the best `most`, by falling score."""
+    """The boxes in the output, in input pixels, after class-wise suppression: the best `most`, by falling score."""
     found = decode_grid(maps, anchors, strides, classes, threshold)
     if len(found.scores) > _CROWD * most:  # a network that is still untrained answers everywhere
         found = found.select(np.argsort(-found.scores, kind="stable")[: _CROWD * most])

@@ -1,7 +1,7 @@
 """The grid detector's loss: CIoU for boxes, binary cross-entropy for objectness (with ignore regions) and classes.
 
-An object is given to every anchor of similar size (Wang et al., YOLOv5's rule: neither side differs by a factor of four)
-in its centre's cell and in the nearer neighbours to each side; one that fits no anchor is given to the nearest in shape.
+An object is given to every anchor of similar size (YOLOv5's rule: neither side differs by a factor of four) in its
+centre's cell and in the nearer neighbours to each side; one that fits no anchor is given to the nearest in shape.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def _in_map(wanted: Tensor, image: Tensor, center: Tensor, similar: Tensor, size
 def decode_maps(
     maps: Sequence[Tensor], anchors: Tensor, strides: Sequence[int], classes: int
 ) -> list[tuple[Tensor, Tensor]]:
-    """Per map the boxes (N, A, H, W, 4) as corners in input pixels, and the raw objectness and classes (N, A, H, W, 1 + C)."""
+    """Per map the boxes (N, A, H, W, 4), corners in input pixels, and raw objectness and classes (N, A, H, W, 1 + C)."""
     decoded = []
     for level, (output, stride) in enumerate(zip(maps, strides, strict=True)):
         batch, _, height, width = output.shape
@@ -124,7 +124,7 @@ def detection_loss(
 
 
 def complete_iou(a: Tensor, b: Tensor) -> Tensor:
-    """CIoU (N,) of boxes (N, 4) given by corners: IoU less centre distance and difference of proportions (Zheng 2020)."""
+    """CIoU (N,) of boxes (N, 4), corners: IoU less centre distance and difference of proportions (Zheng 2020)."""
     size_a, size_b = (a[:, 2:] - a[:, :2]).clamp(min=1e-6), (b[:, 2:] - b[:, :2]).clamp(min=1e-6)
     overlap = (torch.minimum(a[:, 2:], b[:, 2:]) - torch.maximum(a[:, :2], b[:, :2])).clamp(min=0).prod(dim=1)
     iou = overlap / (size_a.prod(dim=1) + size_b.prod(dim=1) - overlap + 1e-9)

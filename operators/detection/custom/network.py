@@ -15,9 +15,9 @@ ANCHORS_PER_CELL = 3
 
 
 class GridDetector(nn.Module):
-    """Images (N, 3, H, W) in [0, 1], H and W multiples of 16 → one map (N, A · (5 + C), ⌈H / s⌉, ⌈W / s⌉) for each stride s.
+    """Images (N, 3, H, W) in [0, 1] → one map (N, A · (5 + C), ⌈H / s⌉, ⌈W / s⌉) for each stride s.
 
-    What the channels mean is told in `operators.detection.custom.decode`.
+    H and W must be multiples of 16. What the channels mean is told in `operators.detection.custom.decode`.
     """
 
     def __init__(self, classes: int, width: float = 1.0, channels: int = 96) -> None:

@@ -19,7 +19,7 @@ from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.loss import Truth, detection_loss
 from operators.detection.custom.network import ANCHORS_PER_CELL, STRIDES, GridDetector
 from operators.training.augmentation import Variation, fitted, tensor_of, warp
-from operators.training.backbone import load_backbone
+from operators.training.backbone import MobileNetV2, load_backbone
 from operators.training.export import export_network
 
 KIND = "detector"
@@ -59,6 +59,10 @@ class DetectorTask:
     @property
     def network(self) -> nn.Module:
         return self.detector
+
+    @property
+    def backbone(self) -> MobileNetV2:
+        return self.detector.backbone
 
     @property
     def samples(self) -> int:

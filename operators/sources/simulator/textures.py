@@ -46,11 +46,11 @@ def make_atlas(names: Sequence[str], seed: int) -> Atlas:
     Raises ValueError for a name that is not a pattern.
     """
     rows = -(-len(names) // _PER_ROW)
-    base = np.zeros((rows * _CELL, _PER_ROW * _CELL, 3), np.float32)
+    base = np.zeros((rows * _CELL, _PER_ROW * _CELL, 3), np.uint8)
     origins = np.zeros((len(names), 2), np.float32)
     for k, name in enumerate(names):
         x, y = (k % _PER_ROW) * _CELL, (k // _PER_ROW) * _CELL
-        padded = np.pad(draw(name, seed), ((BORDER, BORDER), (BORDER, BORDER), (0, 0)), mode="wrap")
+        padded = np.pad(np.rint(draw(name, seed)).astype(np.uint8), ((BORDER, BORDER), (BORDER, BORDER), (0, 0)), mode="wrap")
         base[y : y + _CELL, x : x + _CELL] = padded
         origins[k] = x + BORDER, y + BORDER
     height, width = base.shape[:2]
@@ -61,7 +61,7 @@ def make_atlas(names: Sequence[str], seed: int) -> Atlas:
         level = base if k == 0 else cv2.resize(base, (width >> k, height >> k), interpolation=cv2.INTER_AREA)
         x = 0 if k == 0 else width
         y = row if k else 0
-        image[y : y + level.shape[0], x : x + level.shape[1]] = np.clip(np.rint(level), 0, 255)
+        image[y : y + level.shape[0], x : x + level.shape[1]] = level
         left[k], top[k] = x, y
         row += level.shape[0] if k else 0
     return Atlas(image, tuple(names), origins, left, top)

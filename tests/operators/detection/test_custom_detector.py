@@ -1,4 +1,4 @@
-"""The grid detector from a folder of labelled images to boxes, and each part against a second way to the same answer."""
+"""The grid detector from a folder of labelled images to boxes, and each part against a second way to its answer."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def write_coco(folder: Path, count: int, seed: int = 0) -> Path:
 
 def dataflow_command(*words: str) -> subprocess.CompletedProcess[str]:
     """The command line of training and evaluation, in a process of its own."""
-    script = "from operators.training.commands import train, evaluate; import sys; (train if sys.argv.pop(1) == 'train' else evaluate)()"
+    script = "import sys; from operators.training import commands; getattr(commands, sys.argv.pop(1))()"
     return subprocess.run([sys.executable, "-c", script, *words], capture_output=True, text=True, timeout=100)
 
 

@@ -1,0 +1,79 @@
+"""Decoders of compressed images and depth images, as recordings and network cameras carry them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.operator import In, Operator, Out, Param
+
+
+class ImageDecoder(Operator):
+    """Decodes JPEG, PNG or WebP files to images: grey files to grey images, all others to RGB."""
+
+    compressed: In[CompressedImage] = In(doc="the encoded file")
+    image: Out[Image] = Out(doc="its pixels, of the same stamp and frame")
+
+    max_pixels: int = Param(64_000_000, ge=1, doc="a file that decodes to more pixels is refused")
+
+    def process(self, compressed: CompressedImage) -> Image:
+        """Raises ValueError where the bytes are not a whole image."""
+        pixels = _decoded(compressed, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION, self.max_pixels)
+        if pixels.ndim == 3:
+            pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+        return Image(stamp=compressed.stamp, frame=compressed.frame, data=pixels)
+
+
+class DepthDecoder(Operator):
+    """Decodes 16-bit PNG files to depth images in metres.
+
+    The pixel value 0 is no return. Where the depths were multiples of the quantiser's step, as from a camera that
+    measures in such steps, the result is bit by bit the depth image that was compressed.
+    """
+
+    compressed: In[CompressedDepth] = In(doc="the encoded file and what its numbers mean")
+    depth: Out[DepthImage] = Out(doc="metres, 0 for no return, of the same stamp and frame")
+
+    max_pixels: int = Param(64_000_000, ge=1, doc="a file that decodes to more pixels is refused")
+
+    def process(self, compressed: CompressedDepth) -> DepthImage:
+        """Raises ValueError where the bytes are not a 16-bit PNG with one channel."""
+        levels = _decoded(compressed, cv2.IMREAD_UNCHANGED, self.max_pixels)
+        if levels.dtype != np.uint16 or levels.ndim != 2:
+            raise ValueError(
+                f"CompressedDepth at stamp {compressed.stamp} must hold one 16-bit channel, "
+                f"got {levels.dtype} of shape {levels.shape}"
+            )
+        metres = depth_in_metres(levels, compressed.quantizer, compressed.scale, compressed.offset)
+        return DepthImage(stamp=compressed.stamp, frame=compressed.frame, data=metres)
+
+
+def depth_in_metres(
+    levels: NDArray[np.uint16], quantizer: str, scale: float, offset: float
+) -> NDArray[np.float32]:
+    """Metres of pixel values v: scale · v + offset (linear) or scale / (v − offset) (inverse); 0 where v is 0.
+
+    An inverse value at or below the offset has no depth either: it is 0.
+    """
+    v = levels.astype(np.float64)
+    if quantizer == "linear":
+        return np.where(levels > 0, scale * v + offset, 0).astype(np.float32)
+    usable = (levels > 0) & (v > offset)
+    return np.where(usable, scale / np.where(usable, v - offset, 1), 0).astype(np.float32)
+
+
+def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels: int) -> NDArray[np.generic]:
+    pixels = cv2.imdecode(message.data, flags) if len(message.data) else None
+    if pixels is None:
+        raise ValueError(
+            f"{message.SCHEMA} at stamp {message.stamp} ({len(message.data)} bytes) cannot be decoded: "
+            f"the file is damaged or cut short"
+        )
+    if pixels.shape[0] * pixels.shape[1] > max_pixels:
+        raise ValueError(
+            f"{message.SCHEMA} at stamp {message.stamp} has {pixels.shape[1]}x{pixels.shape[0]} pixels, "
+            f"more than max_pixels={max_pixels}"
+        )
+    return np.asarray(pixels)

@@ -1,0 +1,58 @@
+"""Help, version and wrong words: what a user meets first."""
+
+from __future__ import annotations
+
+import pytest
+
+from dataflow.cli.main import app
+
+COMMANDS = sorted(
+    command.name or command.callback.__name__ for command in app.registered_commands if command.callback is not None
+)
+
+
+def test_the_help_documents_the_exit_codes_and_lists_every_command(dataflow) -> None:
+    told = dataflow("--help").stdout
+
+    for code in ("0 ", "1 ", "2 ", "130 "):
+        assert f"\n   {code}" in told
+    assert all(f"│ {command} " in told for command in COMMANDS)
+    assert {
+        "run",
+        "replay",
+        "verify",
+        "check",
+        "show",
+        "operators",
+        "info",
+        "diff",
+        "view",
+        "list",
+        "echo",
+        "hz",
+    } <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_has_examples_that_stay_on_lines_of_their_own(dataflow, monkeypatch, command: str) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    lines = [line.strip() for line in dataflow(command, "--help").stdout.splitlines()]
+
+    examples = [line for line in lines[lines.index("Examples:") :] if line.startswith("dataflow ")]
+    assert examples
+    assert all(line.startswith(f"dataflow {command}") for line in examples)
+    documented = next(c for c in app.registered_commands if (c.name or c.callback.__name__) == command)
+    assert [line.strip() for line in documented.help.splitlines() if "dataflow " in line and line.startswith("  ")] == (
+        examples
+    )
+
+
+def test_the_version_is_that_of_the_package(dataflow) -> None:
+    from importlib.metadata import version
+
+    assert dataflow("--version").stdout == f"dataflow {version('robot-dataflow')}\n"
+
+
+def test_a_wrong_command_or_option_is_answered_with_the_nearest_and_code_2(dataflow) -> None:
+    assert "Did you mean 'replay'" in dataflow("reply", code=2).stderr
+    assert "--bogus" in dataflow("list", "--bogus", code=2).stderr

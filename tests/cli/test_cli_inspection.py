@@ -1,0 +1,74 @@
+"""`check`, `show` and `operators`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+FAULTY = """\
+graph: faulty
+namespace: test
+operators:
+  left: {use: "runtime_operators:Conter"}
+"""
+
+
+def test_check_says_ok_or_places_every_fault(dataflow, small: Path, tmp_path: Path) -> None:
+    faulty = tmp_path / "faulty.yaml"
+    faulty.write_text(FAULTY)
+
+    assert "ok" in dataflow("check", small).stdout
+    told = dataflow("check", faulty, small, code=1)
+    assert f"{faulty}:4:" in told.stdout
+    assert "did you mean 'Counter'?" in told.stdout
+    assert "1 of 2 graphs cannot run" in told.stderr
+
+
+def test_check_prints_faults_as_json(dataflow, small: Path, tmp_path: Path) -> None:
+    faulty = tmp_path / "faulty.yaml"
+    faulty.write_text(FAULTY)
+
+    assert json.loads(dataflow("check", small, "--json").stdout) == {"ok": True, "problems": []}
+    (problem,) = json.loads(dataflow("check", faulty, "--json", code=1).stdout)["problems"]
+    assert (problem["file"], problem["line"]) == (str(faulty), 4)
+
+
+def test_check_of_a_missing_file_could_not_run(dataflow, small: Path) -> None:
+    wrong = small.with_name("smal.yaml")
+
+    assert f"did you mean {small}?" in dataflow("check", wrong, code=2).stderr
+
+
+def test_check_takes_settings(dataflow, small: Path) -> None:
+    dataflow("check", small, "--set", "smooth.sleep=0.5")
+    assert "no parameter 'nope'" in dataflow("check", small, "--set", "nope=1", code=1).stdout
+
+
+def test_show_draws_the_graph_as_tree_mermaid_svg_and_json(dataflow, small: Path, tmp_path: Path) -> None:
+    assert "in  x     In[FeatureVector] <- left/fast" in dataflow("show", small).stdout
+    assert dataflow("show", small, "--mermaid").stdout.startswith("flowchart LR")
+    assert json.loads(dataflow("show", small, "--json").stdout)["nodes"][0]["name"] == "left"
+    picture = tmp_path / "pictures" / "small.svg"
+    dataflow("show", small, "--svg", picture)
+    assert picture.read_text().lstrip().startswith("<")
+
+
+def test_show_never_writes_a_picture_over_another_kind_of_file(dataflow, small: Path) -> None:
+    before = small.read_text()
+
+    assert "ends in .svg" in dataflow("show", small, "--svg", small, code=2).stderr
+    assert "exclude each other" in dataflow("show", small, "--json", "--mermaid", code=2).stderr
+    assert small.read_text() == before
+
+
+def test_operators_are_listed_and_described(dataflow) -> None:
+    assert "operators.cloud:CloudBuilder" in dataflow("operators").stdout.splitlines()
+    assert "stride" in dataflow("operators", "CloudBuilder").stdout
+    described = json.loads(dataflow("operators", "CloudBuilder", "--json").stdout)
+    assert described["use"] == "operators.cloud:CloudBuilder"
+    listed = json.loads(dataflow("operators", "--json").stdout)
+    assert described in listed["operators"]
+
+
+def test_an_unknown_operator_is_answered_with_the_nearest(dataflow) -> None:
+    assert "did you mean 'CloudBuilder'?" in dataflow("operators", "CloudBilder", code=2).stderr

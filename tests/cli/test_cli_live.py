@@ -1,0 +1,120 @@
+"""`list`, `echo`, `hz` and `view` on a graph that runs."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph import Graph, load_graph
+from dataflow.runtime.attach import find_running
+from dataflow.runtime.execute import run
+
+
+class Background:
+    """A run on a thread of its own, that commands can attach to."""
+
+    def __init__(self, graph: Graph, **options: object) -> None:
+        self.thread = threading.Thread(target=run, args=(graph,), kwargs=options)
+        self.thread.start()
+
+    def end(self) -> None:
+        self.thread.join(60)
+        assert not self.thread.is_alive()
+
+
+@pytest.fixture(scope="module")
+def running(small: Path) -> Iterator[Background]:
+    """A graph that runs as long as the tests of this file need, and is then stopped by its source's end."""
+    graph = load_graph(small, settings=["count=1100", "sleep=0.02"])
+    background = Background(graph, placement="one_host", window=(8, 1 << 20))
+    find_running("small", wait=30)
+    yield background
+    background.end()
+
+
+@pytest.mark.usefixtures("running")
+def test_list_shows_the_running_graph_and_who_takes_its_streams(dataflow) -> None:
+    told = dataflow("list").stdout
+    assert f"namespace test, process {os.getpid()}" in told
+    assert "smooth.x, gripper.x" in told
+    (listed,) = json.loads(dataflow("list", "--json").stdout)
+    assert listed["operators"] == ["left", "smooth", "gripper", "sum"]
+
+
+@pytest.mark.usefixtures("running")
+def test_echo_prints_whole_messages_as_lines_of_json(dataflow) -> None:
+    lines = dataflow("echo", "left/fast", "-n", 3, "--json").stdout.splitlines()
+
+    messages = [json.loads(line) for line in lines]
+    assert [m["stream"] for m in messages] == ["test/left/fast"] * 3
+    assert messages[0]["stamp"] < messages[1]["stamp"] < messages[2]["stamp"]
+    assert messages[0]["vectors"][0][0] == (messages[0]["stamp"] - 10**9) / 10**7  # the counter's number
+
+
+@pytest.mark.usefixtures("running")
+def test_echo_prints_fields_for_people(dataflow) -> None:
+    told = dataflow("echo", "left/*", "-n", 4).stdout
+
+    assert "test/left/constant  0.000000000s  FeatureVector" in told
+    assert "  vectors  [[42.]]" in told
+
+
+@pytest.mark.usefixtures("running")
+def test_echo_into_a_closed_pipe_is_quiet() -> None:
+    echo = subprocess.Popen(
+        [sys.executable, "-m", "dataflow.cli.main", "echo", "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
+    assert echo.stdout is not None
+    assert echo.stderr is not None
+    assert echo.stdout.readline().startswith(b"{")
+    echo.stdout.close()
+    told = echo.stderr.read()
+    echo.wait(20)
+
+    assert b"Traceback" not in told
+    assert b"error" not in told
+
+
+@pytest.mark.usefixtures("running")
+def test_a_stream_that_the_graph_does_not_have_is_refused_at_once(dataflow) -> None:
+    for command in (["echo"], ["hz"], ["view", "--to", "x.rrd", "--stream"]):
+        assert "did you mean 'left/fast'?" in dataflow(*command, "left/fats", code=2).stderr
+
+
+@pytest.mark.usefixtures("running")
+def test_hz_knows_the_rate_by_stamp(dataflow) -> None:
+    rows = json.loads(dataflow("hz", "left/fast", "--seconds", 0.5, "--json").stdout)
+    (row,) = rows
+    assert row["stream"] == "test/left/fast"
+    assert row["hz_event"] == pytest.approx(100.0)
+    assert row["hz_clock"] > 0
+    told = dataflow("hz", "left/*", "--seconds", 0.3).stdout
+    assert "Hz by stamp" in told
+    assert "left/fast" in told
+
+
+def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: Background) -> None:
+    told = dataflow("echo", "--graph", "kitchen", code=2).stderr
+    assert "no graph 'kitchen' runs here (running: small)" in told
+    assert "0 or more" in dataflow("hz", "--wait", "-1", code=2).stderr
+    assert running.thread.is_alive()
+
+
+def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:
+    """The last test of the file: it waits for the end of the graph."""
+    saved = tmp_path / "live.rrd"
+
+    told = dataflow("view", "--graph", "small", "--to", saved, "--stream", "left/*")
+
+    assert f"following small (process {os.getpid()})" in told.stderr
+    assert f"wrote {saved} (" in told.stdout
+    running.end()
+    assert "no graph runs" in dataflow("list").stderr
+    assert json.loads(dataflow("list", "--json").stdout) == []

@@ -1,0 +1,163 @@
+"""Numbers, units, stream names and files, as the command line writes and reads them."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from dataflow.cli.arguments import chosen_streams, existing, output_file, window
+from dataflow.cli.output import figure, jsonable, plural, seconds, size
+from dataflow.cli.report import print_report
+from dataflow.runtime.supervisor import OperatorCounts, RunReport
+
+
+@pytest.mark.parametrize(
+    ("nbytes", "text"), [(0, "0 B"), (999, "999 B"), (1000, "1.0 kB"), (999_960, "1.0 MB"), (3.21e9, "3.2 GB")]
+)
+def test_sizes_change_unit_at_a_thousand(nbytes: float, text: str) -> None:
+    assert size(nbytes) == text
+
+
+@pytest.mark.parametrize(
+    ("duration", "text"),
+    [(0.634, "0.63 s"), (9.999, "10.0 s"), (59.97, "1 min 00 s"), (245, "4 min 05 s"), (7380, "2 h 03 min")],
+)
+def test_durations_are_written_for_people(duration: float, text: str) -> None:
+    assert seconds(duration) == text
+
+
+def test_figures_carry_the_unit_of_their_name() -> None:
+    assert figure("ate_rmse_m", 0.0212999) == ("ate rmse", "0.0213", "m")
+    assert figure("rpe_1s_rmse_deg", 0.5) == ("rpe 1s rmse", "0.5", "°")
+    assert figure("unmatched_poses", 12345) == ("unmatched poses", "12,345", "")
+    assert figure("alignment_m", "se3") == ("alignment m", "se3", "")
+
+
+def test_one_stream_is_not_plural() -> None:
+    assert (plural(1, "stream"), plural(1200, "stream")) == ("1 stream", "1,200 streams")
+
+
+values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=100, deadline=None)
+@given(values)
+def test_everything_becomes_json_that_others_can_parse(value: object) -> None:
+    def refuse(word: str) -> None:
+        raise AssertionError(word)
+
+    json.loads(json.dumps(jsonable(value), allow_nan=False), parse_constant=refuse)
+
+
+def test_arrays_and_numpy_numbers_become_json_values() -> None:
+    assert jsonable({"a": np.array([1.5, np.nan]), "n": np.int64(3), "p": Path("x")}) == {
+        "a": [1.5, "NaN"],
+        "n": 3,
+        "p": "x",
+    }
+
+
+STREAMS = ["robot1/camera/image", "robot1/camera/depth", "robot1/odometry/odometry", "/tf"]
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        (["camera/image"], STREAMS[:1]),  # relative to the namespace
+        (["robot1/camera/image"], STREAMS[:1]),  # in full
+        (["/robot1/camera/image"], STREAMS[:1]),  # absolute
+        (["camera/*"], STREAMS[:2]),
+        (["odometry/*", "camera/depth"], STREAMS[1:3]),  # in the order of the recording
+        (["/tf"], STREAMS[3:]),  # as foreign recordings name them
+        (["tf"], STREAMS[3:]),
+        (None, STREAMS),
+    ],
+)
+def test_streams_are_named_in_short_in_full_or_with_wildcards(words, found) -> None:
+    assert chosen_streams(words, STREAMS, "robot1") == found
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [("camera/imag", "did you mean 'camera/image'"), ("nothing/*", "no stream 'nothing/*'"), ("a//b", "empty part")],
+)
+def test_a_stream_that_does_not_exist_is_answered_with_the_nearest(capsys, word: str, message: str) -> None:
+    with pytest.raises(typer.Exit) as ended:
+        chosen_streams([word], STREAMS, "robot1")
+
+    assert ended.value.exit_code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_a_missing_file_is_answered_with_the_nearest(tmp_path: Path, capsys) -> None:
+    (tmp_path / "kitchen.mcap").touch()
+    for path, message in (
+        (tmp_path / "kichen.mcap", "did you mean"),
+        (tmp_path, "is a folder"),
+        (tmp_path / "no" / "run.mcap", "there is no folder"),
+    ):
+        with pytest.raises(typer.Exit):
+            existing(path, "a recording")
+        assert message in capsys.readouterr().err
+
+
+def test_an_output_file_never_replaces_anything_unasked(tmp_path: Path, capsys) -> None:
+    file = tmp_path / "new" / "run.mcap"
+    assert output_file(file, ".mcap", overwrite=False, option="--record") == file
+    assert file.parent.is_dir()
+    file.touch()
+    with pytest.raises(typer.Exit):
+        output_file(file, ".mcap", overwrite=False, option="--record")
+    assert "--overwrite" in capsys.readouterr().err
+    output_file(file, ".mcap", overwrite=True, option="--record")
+    with pytest.raises(typer.Exit):  # whatever is asked: a graph file is no recording
+        output_file(tmp_path / "graph.yaml", ".mcap", overwrite=True, option="--record")
+
+
+def test_start_and_end_are_seconds_from_the_first_message(capsys) -> None:
+    whole, path = (10**9, 3 * 10**9), Path("run.mcap")
+
+    assert window(whole, 0.5, 1.5, path) == (1_500_000_000, 2_500_000_000)
+    assert window(whole, None, None, path) == (None, None)
+    for start, end in ((-1.0, None), (2.1, None), (1.0, 1.0), (float("nan"), None)):
+        with pytest.raises(typer.Exit):
+            window(whole, start, end, path)
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
+    report = RunReport(
+        graph="rgbd_perception",
+        streams={},
+        operators={"trajectory_metrics": OperatorCounts(1_234_567, 7_654_321, 1_000, 10**12)},
+        drops={"trajectory_metrics": (("ground_truth", "unmatched", 1_000),)},
+        summaries={"trajectory_metrics": {"ate_rmse_m": 0.0123, "ate": "not computed: " + "too few poses " * 12}},
+        transport={},
+        files={"@recorder": {"path": "out/run.mcap", "messages": 1, "bytes": 5_000_000}},
+        first=0,
+        last=10**10,
+        wall=5.0,
+        interrupted=False,
+        notes=(),
+    )
+    file = io.StringIO()
+
+    print_report(Console(file=file, width=width), report)
+
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    assert any(line.split() == ["ate", "rmse", "0.0123", "m"] for line in lines)
+    assert "10.0 s of event time in 5.00 s, 2.00 × real time" in lines[0]
+    assert "wrote out/run.mcap (1 message, 5.0 MB)" in lines

@@ -1,0 +1,183 @@
+"""`run`, `replay` and `verify`: results, files, refusals, failures, Ctrl-C."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+def test_a_run_reports_operators_and_figures_on_stdout_and_progress_on_stderr(dataflow, small: Path) -> None:
+    told = dataflow("run", small, "--one-host", "--set", "count=10")
+
+    assert "small  complete" in told.stdout
+    assert any(line.split()[:3] == ["left", "10", "13"] for line in told.stdout.splitlines())  # firings, out
+    assert "running" in told.stderr
+    assert "running" not in told.stdout
+
+
+def test_the_json_report_stands_alone_on_stdout(recorded) -> None:
+    path, report = recorded
+
+    assert report["complete"] is True
+    assert report["operators"]["left"]["firings"] == 30
+    assert report["summaries"]["sum"]["count"] > 0
+    assert set(report["streams"]["test/left/fast"]) == {"messages", "digest"}
+    assert report["files"]["@recorder"]["path"] == str(path)
+
+
+def test_a_replay_makes_the_same_digests_and_diff_agrees(dataflow, recorded, tmp_path: Path) -> None:
+    path, report = recorded
+    again = tmp_path / "again.mcap"
+
+    replayed = json.loads(dataflow("replay", path, "--record", again, "--one-host", "--json", "-q").stdout)
+
+    assert replayed["streams"] == report["streams"]
+    assert "the same: 5 streams, bit for bit" in dataflow("diff", path, again).stdout
+
+
+def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
+    path, _ = recorded
+
+    replayed = json.loads(dataflow("replay", path, "--start", 0.1, "--end", 0.195, "--one-host", "--json", "-q").stdout)
+
+    assert replayed["streams"]["test/left/fast"]["messages"] == 10  # stamps 0.10, 0.11 ... 0.19 s
+
+
+def test_verification_of_a_recording_says_identical(dataflow, recorded) -> None:
+    path, _ = recorded
+
+    told = dataflow("verify", path, "--one-host", "--json", "-q")
+
+    assert json.loads(told.stdout)["identical"] is True
+    assert "exclude each other" in dataflow("verify", path, "--from", "smooth", "--only", "sum", code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--record", "{recording}"], "replace it with --overwrite"),
+        (["--record", "{graph}", "--overwrite"], "ends in .mcap"),
+        (["--record", "{folder}.mcap"], "is a folder"),
+        (["--view", "window"], "expected spawn, serve, or a file name that ends in .rrd"),
+        (["--view", "spawn"], "there is no display"),
+        (["--open"], "needs --view FILE.rrd"),
+        (["--open", "--view", "serve"], "needs --view FILE.rrd"),
+        (["--rate", "0"], "above 0"),
+        (["--one-host", "--host-each"], "exclude each other"),
+        (["--place", "nobody=a"], "left, smooth, gripper, sum"),
+        (["--set", "cuont=3"], "did you mean 'count'?"),
+        (["--set", "smooth.sleep=soon"], "sleep"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_runs(
+    dataflow, small: Path, recorded, tmp_path: Path, words: list[str], message: str
+) -> None:
+    (tmp_path / "folder.mcap").mkdir()
+    places = {"{recording}": recorded[0], "{graph}": small, "{folder}.mcap": tmp_path / "folder.mcap"}
+
+    told = dataflow("run", small, *(places.get(word, word) for word in words), code=2)
+
+    assert message in told.stderr
+    assert told.stdout == ""
+
+
+def test_a_replay_onto_itself_is_refused_under_any_name(dataflow, recorded, tmp_path: Path) -> None:
+    path, _ = recorded
+    link = tmp_path / "link.mcap"
+    link.symlink_to(path)
+    before = path.read_bytes()
+
+    for name in (path, link):
+        told = dataflow("replay", path, "--record", name, "--overwrite", code=2)
+        assert "is the recording that is being replayed" in told.stderr
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--start", "9"], "ends 0.29 s after its first message"),
+        (["--start", "-1"], "0 or more"),
+        (["--start", "0.2", "--end", "0.1"], "must be greater"),
+        (["--set", "count=3"], "name it with --graph"),
+    ],
+)
+def test_a_replay_of_nothing_is_refused(dataflow, recorded, words: list[str], message: str) -> None:
+    assert message in dataflow("replay", recorded[0], *words, code=2).stderr
+
+
+def test_files_that_are_no_recordings_are_refused_with_the_reason(dataflow, small: Path, data_dir: Path) -> None:
+    for command in ("replay", "verify", "info"):
+        assert "not an MCAP file" in dataflow(command, small, code=2).stderr
+        assert "expected a recording" in dataflow(command, small.parent / "x.mcap", code=2).stderr
+    foreign = data_dir / "bags" / "nav2_turtlebot.mcap"
+    assert "does not hold the graph" in dataflow("replay", foreign, code=2).stderr
+
+
+def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_is_left(
+    dataflow, small: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / "failed.mcap"
+
+    told = dataflow("run", small, "--set", "at=20", "--one-host", "--record", path, code=1)
+
+    assert "operator 'gripper' failed" in told.stderr
+    assert "the gripper is on fire" in told.stderr
+    assert "runtime_operators.py" in told.stderr  # the operator's own traceback
+    assert f"{path} (" in told.stderr
+    assert "failed" in dataflow("info", path).stdout
+
+
+def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -> None:
+    path = tmp_path / "interrupted.mcap"
+    command = ["run", str(small), "--set", "count=100000", "--set", "sleep=0.02", "--record", str(path), "--one-host"]
+    running = subprocess.Popen(
+        [sys.executable, "-m", "dataflow.cli.main", *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert running.stderr is not None
+        assert any(line.startswith("running") for line in running.stderr)
+        running.send_signal(signal.SIGINT)
+        stdout, _ = running.communicate(timeout=30)
+    finally:
+        running.kill()
+
+    assert running.returncode == 130
+    assert "small  interrupted" in stdout
+    assert f"wrote {path}" in stdout
+
+
+def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
+    dataflow, small: Path, tmp_path: Path, monkeypatch
+) -> None:
+    saved, noted = tmp_path / "run.rrd", tmp_path / "opened"
+    viewer = tmp_path / "rerun"
+    viewer.write_text(f'#!/bin/sh\nfor last; do :; done\necho "$last" > {noted}.new && mv {noted}.new {noted}\n')
+    viewer.chmod(viewer.stat().st_mode | stat.S_IXUSR)
+    monkeypatch.setenv("RERUN_CLI_PATH", str(viewer))
+    words = ["run", small, "--set", "count=5", "--one-host", "--view", saved, "--open"]
+
+    assert "is not opened: there is no display" in dataflow(*words).stderr
+    assert not noted.exists()
+    assert "replace it with --overwrite" in dataflow(*words, code=2).stderr
+    monkeypatch.setenv("DISPLAY", ":7")
+    told = dataflow(*words, "--overwrite")
+
+    assert "opening" in told.stderr
+    assert f"wrote {saved}" in told.stdout
+    for _ in range(100):
+        if noted.exists():
+            break
+        os.sched_yield()
+        signal.sigtimedwait([], 0.05)
+    assert noted.read_text().strip() == str(saved)
