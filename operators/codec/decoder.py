@@ -39,14 +39,9 @@ class DepthDecoder(Operator):
     max_pixels: int = Param(64_000_000, ge=1, doc="a file that decodes to more pixels is refused")
 
     def process(self, compressed: CompressedDepth) -> DepthImage:
-        """Raises ValueError where the bytes are not a 16-bit PNG with one channel."""
+        """Raises ValueError where the bytes are not a whole image."""
         levels = _decoded(compressed, cv2.IMREAD_UNCHANGED, self.max_pixels)
-        if levels.dtype != np.uint16 or levels.ndim != 2:
-            raise ValueError(
-                f"CompressedDepth at stamp {compressed.stamp} must hold one 16-bit channel, "
-                f"got {levels.dtype} of shape {levels.shape}"
-            )
-        metres = depth_in_metres(levels, compressed.quantizer, compressed.scale, compressed.offset)
+        metres = depth_in_metres(levels.astype(np.uint16, copy=False), compressed.quantizer, compressed.scale, compressed.offset)
         return DepthImage(stamp=compressed.stamp, frame=compressed.frame, data=metres)
 
 
@@ -65,7 +60,8 @@ def depth_in_metres(
 
 
 def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels: int) -> NDArray[np.generic]:
-    pixels = cv2.imdecode(message.data, flags) if len(message.data) else None
+    # A file that was cut short is decoded as far as it goes, without a word: its end must be looked for.
+    pixels = cv2.imdecode(message.data, flags) if _is_whole(message.data.tobytes()) else None
     if pixels is None:
         raise ValueError(
             f"{message.SCHEMA} at stamp {message.stamp} ({len(message.data)} bytes) cannot be decoded: "
@@ -77,3 +73,12 @@ def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels:
             f"more than max_pixels={max_pixels}"
         )
     return np.asarray(pixels)
+
+
+def _is_whole(data: bytes) -> bool:
+    """Whether a PNG, JPEG or WebP file goes on to its end mark or its declared length."""
+    if data.startswith(b"\x89PNG"):
+        return data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82")
+    if data.startswith(b"\xff\xd8"):
+        return data.rstrip(b"\0").endswith(b"\xff\xd9")
+    return len(data) >= 8 + int.from_bytes(data[4:8], "little")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +45,9 @@ class Segmenter(Operator):
         pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
         fit = Fit.plan("letterbox", (image.width, image.height), network.size)
         classes, confidence = network.run(fit.apply(pixels))
-        labels = _enlarge(classes[0].astype(np.uint8), fit, cv2.INTER_NEAREST)
+        labels = np.asarray(_enlarged(classes[0].astype(np.uint8), fit, cv2.INTER_NEAREST), np.uint8)
         wanted = self.with_confidence or self.confidence_threshold > 0
-        sure = _enlarge(confidence[0], fit, cv2.INTER_LINEAR) if wanted else None
+        sure = np.asarray(_enlarged(confidence[0], fit, cv2.INTER_LINEAR), np.float32) if wanted else None
         if sure is not None and self.confidence_threshold > 0:
             labels = np.where(sure < self.confidence_threshold, np.uint8(VOID), labels)
         return SegmentationMap(
@@ -58,7 +60,7 @@ class Segmenter(Operator):
         )
 
 
-def _enlarge(values: NDArray[np.generic], fit: Fit, interpolation: int) -> NDArray[np.generic]:
+def _enlarged(values: NDArray[Any], fit: Fit, interpolation: int) -> NDArray[Any]:
     """The part of the input that the image takes, at the image's size."""
     (x, y), (width, height) = fit.offset, fit.inner
     part = np.ascontiguousarray(values[y : y + height, x : x + width])

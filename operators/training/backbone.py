@@ -102,7 +102,7 @@ class MobileNetV2(nn.Module):
         return self
 
     def forward(self, x: Tensor) -> dict[int, Tensor]:
-        x = (x - self.mean) / self.std
+        x = (x - self.get_buffer("mean")) / self.get_buffer("std")
         maps: dict[int, Tensor] = {}
         for i, block in enumerate(self.features):
             x = block(x)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-import io
 import json
 import os
+import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,20 +32,19 @@ def export_network(
     import onnx  # heavy, and needed only here
 
     still = copy.deepcopy(network).cpu().eval()
-    buffer = io.BytesIO()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
         # The exporter that needs no further package; its successor needs onnxscript.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             still,
             (torch.zeros(1, 3, size[1], size[0]),),
-            buffer,
+            Path(folder) / "network.onnx",
             input_names=["image"],
             output_names=list(outputs),
             opset_version=_OPSET,
             dynamo=False,
         )
-    model = onnx.load_model_from_string(buffer.getvalue())
+        model = onnx.load(Path(folder) / "network.onnx")
     _store_as_half(model)
     model.producer_name = "dataflow"
     onnx.helper.set_model_props(model, {KEY: json.dumps(dict(facts), sort_keys=True)})

@@ -39,7 +39,7 @@ class WorldImage:
 
 
 def render(world: str, seed: int, frames: int, size: tuple[int, int], *, varied: bool) -> Iterator[WorldImage]:
-    """Images of a world, evenly spread over a minute. `varied` draws camera height, lens, light and noise by the seed."""
+    """Images of a world, evenly spread over a minute. `varied` draws lens, light and noise by the seed."""
     rng = np.random.default_rng((seed, 7))
     camera: dict[str, Any] = {"rate": frames / _SECONDS, "width": size[0], "height": size[1]}
     if varied:
@@ -77,8 +77,8 @@ def write_data(
 ) -> Iterator[tuple[int, int]]:
     """Renders worlds into a data folder; yields (worlds done, images written) after each.
 
-    Every second world is rendered at VGA and stored at half the size, as the operators shrink a VGA image; the others at
-    the stored size. Worlds that are already there are kept, so an interrupted rendering goes on.
+    Worlds of even seeds are rendered at VGA and stored at half the size, as the operators shrink a VGA image; the
+    others at the stored size. Worlds that are already there are kept, so an interrupted rendering goes on.
     """
     for name in ("images", "masks", "boxes", "annotations"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -101,17 +101,17 @@ def write_data(
 
 
 def _store(folder: Path, stem: str, taken: WorldImage) -> dict[str, Any]:
-    pixels, classes = taken.image.data, taken.masks.classes
+    pixels, classes = taken.image.data, taken.masks.classes.astype(np.uint8)
     scale = STORED[0] / taken.image.width
     if scale != 1:
         pixels = np.asarray(cv2.resize(pixels, STORED, interpolation=cv2.INTER_LINEAR), np.uint8)
-        classes = np.asarray(cv2.resize(classes, STORED, interpolation=cv2.INTER_NEAREST))
+        classes = np.asarray(cv2.resize(classes, STORED, interpolation=cv2.INTER_NEAREST), np.uint8)
     cv2.imwrite(
         str(folder / "images" / f"{stem}.jpg"),
         cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR),
         [cv2.IMWRITE_JPEG_QUALITY, 92],
     )
-    cv2.imwrite(str(folder / "masks" / f"{stem}.png"), classes.astype(np.uint8))
+    cv2.imwrite(str(folder / "masks" / f"{stem}.png"), classes)
     found = taken.objects
     visible = found.visible if found.visible is not None else np.ones(found.count, np.float32)
     pixel_counts = found.pixel_counts if found.pixel_counts is not None else np.zeros(found.count, np.int64)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from dataflow.cli import main
 from dataflow.cli.main import app
 
 COMMANDS = sorted(
@@ -56,3 +59,32 @@ def test_the_version_is_that_of_the_package(dataflow) -> None:
 def test_a_wrong_command_or_option_is_answered_with_the_nearest_and_code_2(dataflow) -> None:
     assert "Did you mean 'replay'" in dataflow("reply", code=2).stderr
     assert "--bogus" in dataflow("list", "--bogus", code=2).stderr
+
+
+def test_our_own_tracebacks_are_shown_only_when_asked_for(dataflow, small: Path, monkeypatch) -> None:
+    monkeypatch.setenv("DATAFLOW_TRACEBACK", "0")  # restored afterwards: the option sets it
+    assert "Traceback" not in dataflow("info", small, code=2).stderr
+
+    from typer.testing import CliRunner
+
+    told = CliRunner().invoke(app, ["--traceback", "info", str(small)])
+    assert told.exit_code == 2
+    assert "Traceback (most recent call last)" in told.stderr
+    assert "not an MCAP file" in told.stderr
+
+
+@pytest.mark.parametrize("asked", ["0", "1"])
+def test_a_fault_of_ours_is_one_message_and_code_2(monkeypatch, capsys, asked: str) -> None:
+    def faulty() -> None:
+        raise KeyError("nobody thought of this")
+
+    monkeypatch.setattr(main, "app", faulty)
+    monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
+
+    with pytest.raises(SystemExit) as ended:
+        main.main()
+
+    told = capsys.readouterr().err
+    assert ended.value.code == 2
+    assert "internal error: KeyError: 'nobody thought of this'" in told
+    assert ("Traceback" in told) == (asked == "1")

@@ -14,29 +14,32 @@ import pytest
 
 from dataflow.graph import Graph, load_graph
 from dataflow.runtime.attach import find_running
-from dataflow.runtime.execute import run
+from dataflow.runtime.plan import RunPlan
+from dataflow.runtime.supervisor import Supervisor
 
 
 class Background:
-    """A run on a thread of its own, that commands can attach to."""
+    """A run on a thread of its own, that commands can attach to, until it is told to stop."""
 
-    def __init__(self, graph: Graph, **options: object) -> None:
-        self.thread = threading.Thread(target=run, args=(graph,), kwargs=options)
+    def __init__(self, graph: Graph) -> None:
+        self.supervisor = Supervisor(RunPlan(graph, placement="one_host", window=(8, 1 << 20)))
+        self.thread = threading.Thread(target=self.supervisor.run)
         self.thread.start()
 
     def end(self) -> None:
+        self.supervisor.stop()
         self.thread.join(60)
         assert not self.thread.is_alive()
 
 
 @pytest.fixture(scope="module")
 def running(small: Path) -> Iterator[Background]:
-    """A graph that runs as long as the tests of this file need, and is then stopped by its source's end."""
-    graph = load_graph(small, settings=["count=1100", "sleep=0.02"])
-    background = Background(graph, placement="one_host", window=(8, 1 << 20))
+    """A graph that runs as long as the tests of this file need."""
+    background = Background(load_graph(small, settings=["count=1000000", "sleep=0.02"]))
     find_running("small", wait=30)
     yield background
-    background.end()
+    if background.thread.is_alive():
+        background.end()
 
 
 @pytest.mark.usefixtures("running")
@@ -108,8 +111,9 @@ def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, runn
 
 
 def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:
-    """The last test of the file: it waits for the end of the graph."""
+    """The last test of the file: it ends the graph."""
     saved = tmp_path / "live.rrd"
+    threading.Timer(1.0, running.supervisor.stop).start()
 
     told = dataflow("view", "--graph", "small", "--to", saved, "--stream", "left/*")
 

@@ -75,7 +75,7 @@ def test_diff_of_chosen_streams(dataflow, recorded, longer: Path) -> None:
     assert "the same: 1 stream" in dataflow("diff", path, longer, "--stream", "left/constant").stdout
     assert "did you mean 'left/fast'?" in dataflow("diff", path, longer, "--stream", "left/fats", code=2).stderr
     assert "0 or more" in dataflow("diff", path, longer, "--tolerance", "-1", code=2).stderr
-    assert "expected a recording" in dataflow("diff", path, path.parent / "x.mcap", code=2).stderr
+    assert f"did you mean {path}?" in dataflow("diff", path, path.parent / "rum.mcap", code=2).stderr
 
 
 def test_a_recording_is_saved_for_the_viewer(dataflow, recorded, tmp_path: Path) -> None:
@@ -83,7 +83,9 @@ def test_a_recording_is_saved_for_the_viewer(dataflow, recorded, tmp_path: Path)
 
     told = dataflow("view", recorded[0], "--to", saved, "--stream", "left/*", "--start", "0.1")
 
-    assert f"wrote {saved} (24 messages" in told.stdout  # fast: 19 at 0.1 ... 0.29 s + 1; slow 4; the static one
+    assert (
+        f"wrote {saved} (25 messages" in told.stdout
+    )  # 20 fast and 4 slow ones from 0.1 to 0.29 s, and the static one
     assert saved.read_bytes()[:4] == b"RRF2"
     assert "replace it with --overwrite" in dataflow("view", recorded[0], "--to", saved, code=2).stderr
 
@@ -95,7 +97,7 @@ def test_a_recording_is_saved_for_the_viewer(dataflow, recorded, tmp_path: Path)
         (["--to", "window"], "expected spawn, serve"),
         (["--to", "rerun+http://127.0.0.1:9/proxy"], "no viewer listens"),
         (["--to", "x.rrd", "--stream", "left/fats"], "did you mean 'left/fast'?"),
-        (["--to", "x.rrd", "--start", "7"], "ends 0.29 s after"),
+        (["--to", "x.rrd", "--stream", "left/fast", "--start", "7"], "ends 0.29 s after"),
         (["--to", "x.rrd", "--graph", "small"], "running graph"),
     ],
 )

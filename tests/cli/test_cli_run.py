@@ -18,8 +18,8 @@ def test_a_run_reports_operators_and_figures_on_stdout_and_progress_on_stderr(da
 
     assert "small  complete" in told.stdout
     assert any(line.split()[:3] == ["left", "10", "13"] for line in told.stdout.splitlines())  # firings, out
-    assert "running" in told.stderr
-    assert "running" not in told.stdout
+    assert "10 of 10 steps" in told.stderr
+    assert "steps" not in told.stdout
 
 
 def test_the_json_report_stands_alone_on_stdout(recorded) -> None:
@@ -181,3 +181,12 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
         os.sched_yield()
         signal.sigtimedwait([], 0.05)
     assert noted.read_text().strip() == str(saved)
+
+
+def test_a_viewer_that_fails_does_not_end_the_run(dataflow, small: Path, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setenv("RERUN_CLI_PATH", str(tmp_path / "absent"))
+
+    told = dataflow("run", small, "--view", "serve", "--one-host", "--rate", 1, "--set", "count=150")
+
+    assert "viewer: error: the Rerun program is missing" in told.stderr
+    assert "small  complete" in told.stdout

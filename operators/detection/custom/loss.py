@@ -83,7 +83,7 @@ def _in_map(wanted: Tensor, image: Tensor, center: Tensor, similar: Tensor, size
 def decode_maps(
     maps: Sequence[Tensor], anchors: Tensor, strides: Sequence[int], classes: int
 ) -> list[tuple[Tensor, Tensor]]:
-    """Per map the boxes (N, A, H, W, 4), corners in input pixels, and raw objectness and classes (N, A, H, W, 1 + C)."""
+    """Per map: boxes (N, A, H, W, 4), corners in input pixels; raw objectness and classes (N, A, H, W, 1 + C)."""
     decoded = []
     for level, (output, stride) in enumerate(zip(maps, strides, strict=True)):
         batch, _, height, width = output.shape

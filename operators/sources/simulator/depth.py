@@ -17,6 +17,9 @@ from operators.sources.simulator.settings import DepthCamera
 F32 = NDArray[np.float32]
 U16 = NDArray[np.uint16]
 
+_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE]
+"""Noise defeats PNG's filters: without them files are a tenth smaller and made in less time."""
+
 _STEP = 0.04  # a change of depth by this share between neighbours is an edge
 
 
@@ -46,7 +49,7 @@ def metres(levels: U16, quantum: float) -> F32:
 
 def png(levels: U16) -> NDArray[np.uint8]:
     """The bytes (N,) of a 16-bit grey PNG file."""
-    done, data = cv2.imencode(".png", levels, [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    done, data = cv2.imencode(".png", levels, _PNG)
     if not done:
         raise ValueError(f"depth of shape {levels.shape} could not be encoded as PNG")
     return np.asarray(data.reshape(-1), np.uint8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,11 +15,12 @@ BODY_TO_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0
 """`T_housing_optical` (4, 4): the optical frame (z forward, x right, y down) in a housing (x forward, y left, z up)."""
 
 
+@lru_cache(maxsize=64)
 def mounted(mount: Mount) -> Array:
     """`T_base_sensor` (4, 4) of (x, y, z, roll, pitch, yaw): turned about the fixed x, then y, then z axis (REP 103)."""
     x, y, z, roll, pitch, yaw = mount
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
-    return np.array(
+    T = np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],
             [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr, y],
@@ -25,3 +28,5 @@ def mounted(mount: Mount) -> Array:
             [0, 0, 0, 1],
         ]
     )
+    T.flags.writeable = False
+    return T

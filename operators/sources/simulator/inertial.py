@@ -16,16 +16,20 @@ from operators.sources.simulator.trajectory import Trajectory
 
 
 def true_reading(path: Trajectory, imu: Inertial, t: float) -> tuple[Array, Array]:
-    """Angular velocity (rad/s) and specific force (m/s²) in the sensor's frame, without error."""
+    """Angular velocity (rad/s) and specific force (m/s²) in the sensor's frame, without error.
+
+    The robot turns about its z axis alone: at the lever (x, y) from its origin a turn adds α × l + ω × (ω × l).
+    """
     motion = path.at([t])
     T_base_imu = mounted(imu.mount)
-    R_base_imu, lever = T_base_imu[:3, :3], T_base_imu[:3, 3]
-    R_world_base = motion.T_world_base()[0][:3, :3]
-    omega = np.array([0, 0, motion.yaw_rate[0]])
-    alpha = np.array([0, 0, motion.yaw_acceleration[0]])
-    acceleration = R_world_base.T @ np.array([*motion.acceleration[0], imu.gravity])
-    force = acceleration + np.cross(alpha, lever) + np.cross(omega, np.cross(omega, lever))
-    return R_base_imu.T @ omega, R_base_imu.T @ force
+    x, y, _ = T_base_imu[:3, 3]
+    rate, change = float(motion.yaw_rate[0]), float(motion.yaw_acceleration[0])
+    ax, ay = motion.acceleration[0]
+    c, s = math.cos(motion.yaw[0]), math.sin(motion.yaw[0])
+    forward = c * ax + s * ay - change * y - rate * rate * x
+    left = -s * ax + c * ay + change * x - rate * rate * y
+    R_imu_base = T_base_imu[:3, :3].T
+    return R_imu_base @ [0.0, 0.0, rate], R_imu_base @ [forward, left, imu.gravity]
 
 
 class ImuModel:

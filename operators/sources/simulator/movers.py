@@ -83,13 +83,16 @@ class Person:
         self._seat, self._grasp, self._hand = seat, grasp, hand
         self._path = Polyline(path)
         self._known: tuple[float, Posture] | None = None
+        self._parts: tuple[float, Array] | None = None
 
     def frame(self, t: float) -> Array:
         posture = self.posture(t)
         return pose(float(posture.pelvis[0]), float(posture.pelvis[1]), 0.0, posture.yaw)
 
     def parts(self, t: float) -> Array:
-        return self.body.poses(self.posture(t))
+        if self._parts is None or self._parts[0] != t:
+            self._parts = (t, self.body.poses(self.posture(t)))
+        return self._parts[1]
 
     def held(self, t: float) -> bool:
         """Whether the hand has the object."""

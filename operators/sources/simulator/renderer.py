@@ -29,7 +29,7 @@ I32 = NDArray[np.int32]
 _CHUNK = 1 << 14  # pixels shaded at once: the work stays in the cache (and remap takes no more than 32,767)
 _NONE = 0xFFFFFFFF
 _APART = 64.0  # metres between things in the scene of silhouettes; no world is wider than half of it
-_SILHOUETTE_RAYS = 1024  # about so many rays judge how much of a thing would be seen
+_SILHOUETTE_RAYS = 600  # about so many rays judge how much of a thing would be seen
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,31 @@ class Optics:
     cx: float
     cy: float
 
-    def directions(self) -> F32:
-        """(H, W, 3) directions in the optical frame with z = 1, so that distances along them are depths."""
-        return _directions(self)
+    def columns(self) -> Array:
+        """x / z (W,) of every column."""
+        return (np.arange(self.width) - self.cx) / self.fx
 
-
-@lru_cache(maxsize=8)
-def _directions(optics: Optics) -> F32:
-    u, v = np.meshgrid(np.arange(optics.width), np.arange(optics.height))
-    rays = np.stack([(u - optics.cx) / optics.fx, (v - optics.cy) / optics.fy, np.ones(u.shape)], axis=-1)
-    return rays.astype(np.float32)
+    def rows(self) -> Array:
+        """y / z (H,) of every row."""
+        return (np.arange(self.height) - self.cy) / self.fy
 
 
 @lru_cache(maxsize=8)
 def _inverse_lengths(optics: Optics) -> F32:
-    return np.asarray(1 / np.linalg.norm(optics.directions(), axis=-1), np.float32)
+    """(H, W) of the directions with z = 1."""
+    x, y = optics.columns(), optics.rows()
+    return np.asarray(1 / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2), np.float32)
+
+
+def _rays(T_world_camera: Array, optics: Optics) -> F32:
+    """Origin and direction (H, W, 6) of every pixel in the world; z = 1 in the camera, so distances are depths."""
+    rays = np.empty((optics.height, optics.width, 6), np.float32)
+    rays[..., :3] = T_world_camera[:3, 3]
+    x, y = optics.columns(), optics.rows()
+    for axis in range(3):
+        a, b, c = T_world_camera[axis, :3]
+        np.add((a * x).astype(np.float32)[None], (b * y + c).astype(np.float32)[:, None], out=rays[..., 3 + axis])
+    return rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,6 +177,7 @@ class Renderer:
         self._floor = _Floor(self._mesh, light, [k for k, thing in enumerate(things) if thing.label == "floor"])
         self._time: float | None = None
         self._apart: _Apart | None = None
+        self._corners: dict[int, Array] = {}
         self.at(0.0)
 
     def at(self, t: float) -> None:
@@ -192,11 +203,7 @@ class Renderer:
 
     def view(self, T_world_camera: Array, optics: Optics, *, color: bool = True) -> View:
         """What a camera at `T_world_camera` (optical frame) sees now."""
-        R = T_world_camera[:3, :3].astype(np.float32)
-        shape = (optics.height, optics.width)
-        rays = np.empty((*shape, 6), np.float32)
-        rays[..., :3] = T_world_camera[:3, 3]
-        np.matmul(optics.directions().reshape(-1, 3), R.T, out=rays.reshape(-1, 6)[:, 3:])
+        rays = _rays(T_world_camera, optics)
         depth, triangle, weights, normals = self._first_hit(self._scene, rays)
         for rows, columns in self._rectangles(T_world_camera, optics):
             part = np.ascontiguousarray(rays[rows, columns])
@@ -234,7 +241,7 @@ class Renderer:
     def silhouette(self, things: list[int], T_world_camera: Array, optics: Optics) -> Array:
         """Pixels (N,) that each thing (index) would cover if nothing stood before it and the image had no border.
 
-        Cast on a grid of about 1,000 rays per thing: exact where a thing's box in the image is smaller than that, else
+        Cast on a grid of about 600 rays per thing: exact where a thing's box in the image is smaller than that, else
         to about two per cent. Things that reach behind the camera are judged by what lies before it, within a
         border of one image size on each side.
         """
@@ -246,7 +253,7 @@ class Renderer:
         T_camera_world = invert(T_world_camera)
         R = T_world_camera[:3, :3].astype(np.float32)
         for slot, k in enumerate(things):
-            own = self._apart.vertices_of(k) if self.world.things[k].still else self._moved[self._vertices_of(k)]
+            own = self._corners_of(k) if self.world.things[k].still else self._moved[self._vertices_of(k)]
             rectangle = _rectangle(transform_points(T_camera_world, own), optics, margin=1.0)
             if rectangle is None:
                 continue
@@ -274,6 +281,13 @@ class Renderer:
                 counts[slot] = np.count_nonzero(near) * stride * stride
                 end += len(rays)
         return counts
+
+    def _corners_of(self, thing: int) -> Array:
+        """The eight corners of a still thing's box, in the world."""
+        if thing not in self._corners:
+            T, size = self.world.things[thing].box(0.0)
+            self._corners[thing] = transform_points(T, _CUBE * size)
+        return self._corners[thing]
 
     def _vertices_of(self, thing: int) -> NDArray[np.int64]:
         return self._mover_vertices[self._movers.index(thing)]
@@ -373,20 +387,14 @@ class _Apart:
     def __init__(self, still: _Mesh, moving: _Mesh, build: object) -> None:
         self._build = build
         self._still, self._moving = still, moving
-        of = _thing_of_vertex(still)
-        self.scene = build(still.vertices + _shift(of), still.triangles)  # type: ignore[operator]
+        self.scene = build(still.vertices + _shift(_thing_of_vertex(still)), still.triangles)  # type: ignore[operator]
         self._offset = _shift(_thing_of_vertex(moving))
-        order = np.argsort(of, kind="stable")
-        edges = np.searchsorted(of[order], np.arange(of.max(initial=0) + 2))
-        self._vertices = [still.vertices[order[a:b]] for a, b in zip(edges[:-1], edges[1:], strict=True)]
-
-    def vertices_of(self, thing: int) -> Array:
-        return self._vertices[thing]
 
     def movers(self, vertices: Array) -> object:
         return self._build(vertices + self._offset, self._moving.triangles)  # type: ignore[operator]
 
 
+_CUBE = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _SHRINK = np.array([0.5**k for k in range(LEVELS)], np.float32)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages.geometry import transform_points
+from dataflow.messages.geometry import invert, transform_points
 from operators.sources.simulator.shapes import Array, Shape, bounds
 from operators.sources.simulator.trajectory import Trajectory
 
@@ -61,11 +62,18 @@ class Thing:
 
     def box(self, t: float) -> tuple[Array, Array]:
         """`T_world_box` (4, 4), centred, and the full size (3,) of the tightest box along the thing's own axes."""
+        return self._still_box if self.still else self._box(t)
+
+    @cached_property
+    def _still_box(self) -> tuple[Array, Array]:
+        return self._box(0.0)
+
+    def _box(self, t: float) -> tuple[Array, Array]:
         T = self.mover.frame(t)
         if self.still:
             low, high = bounds(self.parts[0])
         else:
-            own = transform_points(np.linalg.inv(T), self.vertices(t))
+            own = transform_points(invert(T), self.vertices(t))
             low, high = own.min(axis=0), own.max(axis=0)
         T_box = T.copy()
         T_box[:3, 3] = transform_points(T, (low + high) / 2)

@@ -81,10 +81,10 @@ def noise(rng: Rng, cells_x: int, cells_y: int | None = None) -> NDArray[np.floa
     """Smooth noise (SIZE, SIZE) of unit standard deviation that repeats without a seam."""
     cells_y = cells_x if cells_y is None else cells_y
     grid = rng.standard_normal((cells_y, cells_x)).astype(np.float32)
-    wide = np.tile(grid, (3, 3))
-    full = cv2.resize(wide, (3 * SIZE, 3 * SIZE), interpolation=cv2.INTER_CUBIC)
-    middle = full[SIZE : 2 * SIZE, SIZE : 2 * SIZE]
-    return np.asarray(middle / max(float(middle.std()), 1e-6), np.float32)
+    along = (np.arange(SIZE, dtype=np.float32) + 0.5) / SIZE
+    x, y = np.meshgrid(along * cells_x - 0.5, along * cells_y - 0.5)
+    smooth = cv2.remap(grid, x.astype(np.float32), y.astype(np.float32), cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
+    return np.asarray(smooth / max(float(smooth.std()), 1e-6), np.float32)
 
 
 def _grey(rng: Rng, base: float, *layers: tuple[int, float]) -> NDArray[np.float32]:

@@ -85,7 +85,7 @@ def detections(
         class_names=THINGS,
         centers=_rows([T[:3, 3] for T, _ in oriented], 3),
         sizes=_rows([size for _, size in oriented], 3),
-        orientations=_rows([matrix_to_quaternion(T) for T, _ in oriented], 4),
+        orientations=_quaternions([T for T, _ in oriented]),
         scores=scores,
         class_ids=class_ids,
         ids=ids,
@@ -167,7 +167,7 @@ class TrueGraph:
             class_ids=np.array([CLASS_IDS["floor"], *(CLASS_IDS[t.label] for t in self._things)], np.int32),
             positions=_rows([(low + high) / 2, *(T[:3, 3] for T, _ in boxes)], 3),
             sizes=_rows([high - low, *(size for _, size in boxes)], 3),
-            orientations=_rows([np.array([0, 0, 0, 1.0]), *(matrix_to_quaternion(T) for T, _ in boxes)], 4),
+            orientations=_quaternions([np.eye(4), *(T for T, _ in boxes)]),
             subjects=np.array([node[r.subject] for r in relations], np.int32),
             objects=np.array([node[r.object] for r in relations], np.int32),
         )
@@ -175,3 +175,7 @@ class TrueGraph:
 
 def _rows(vectors: list[Array], width: int) -> Array:
     return np.array(vectors, np.float64).reshape(-1, width)
+
+
+def _quaternions(poses: list[Array]) -> Array:
+    return matrix_to_quaternion(np.array(poses).reshape(-1, 4, 4))

@@ -1,0 +1,138 @@
+"""How things move in the simulator: smoothly, within limits, and without running into each other."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from operators.sources.simulator.inertial import true_reading
+from operators.sources.simulator.movers import Person
+from operators.sources.simulator.scene import World
+from operators.sources.simulator.settings import Inertial
+from operators.sources.simulator.trajectory import Trajectory
+from operators.sources.simulator.worlds import NAMES, make_world
+
+ROBOT_RADIUS, ROBOT_HEIGHT = 0.22, 1.3
+OVAL = np.stack([2 * np.cos(np.arange(12) * math.pi / 6), np.sin(np.arange(12) * math.pi / 6)], axis=1)
+
+
+@functools.lru_cache
+def world(name: str, seed: int) -> World:
+    return make_world(name, seed, speed=0.6, hold=0.0, movers=True)
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(0, 60), st.sampled_from([0.0, 1.0]))
+def test_derivatives_of_the_path_are_those_of_its_values(t: float, hold: float) -> None:
+    path, h = Trajectory(OVAL, hold=hold), 1e-4
+    before, now, after = (path.at([t + 3 + dt]) for dt in (-h, 0.0, h))
+    np.testing.assert_allclose(now.velocity, (after.position - before.position) / (2 * h), atol=1e-5)
+    np.testing.assert_allclose(now.acceleration, (after.velocity - before.velocity) / (2 * h), atol=1e-4)
+    np.testing.assert_allclose(now.yaw_rate, (after.yaw - before.yaw) / (2 * h), atol=1e-5)
+    np.testing.assert_allclose(now.yaw_acceleration, (after.yaw_rate - before.yaw_rate) / (2 * h), atol=1e-4)
+
+
+def test_the_robot_stands_still_at_first_and_starts_without_a_jerk() -> None:
+    motion = Trajectory(OVAL, hold=2.0).at(np.arange(0, 5, 0.01))
+    assert np.ptp(motion.position[:200], axis=0).max() == 0
+    assert np.abs(np.diff(motion.acceleration, axis=0)).max() < 0.05
+
+
+def test_the_path_closes_and_heading_goes_on() -> None:
+    path = Trajectory(OVAL)
+    first, again = path.at([1.0]), path.at([1.0 + path.period])
+    np.testing.assert_allclose(again.position, first.position, atol=1e-9)
+    np.testing.assert_allclose(again.yaw - first.yaw, 2 * math.pi, atol=1e-9)
+
+
+def test_too_few_waypoints_are_refused() -> None:
+    with pytest.raises(ValueError, match="four waypoints"):
+        Trajectory([(0, 0), (1, 0), (0, 1)])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_speed_and_turning_stay_within_limits(name: str) -> None:
+    for seed in range(2):
+        path = world(name, seed).path
+        motion = path.at(np.linspace(0, path.period, 2000))
+        assert motion.speed().max() < 0.8
+        assert np.abs(motion.yaw_rate).max() < math.radians(45)
+        assert np.linalg.norm(motion.acceleration, axis=1).max() < 1.0
+
+
+def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> None:
+    path, imu = world("office", 0).path, Inertial(mount=(0.2, -0.1, 0.4, 0.0, 0.0, 0.5))
+    lever = np.array([0.2, -0.1])
+    dt, steps = 0.005, 2000
+    start = path.at([0.0])
+    R0 = start.T_world_base()[0][:2, :2]
+    yaw = float(start.yaw[0]) + 0.5
+    p = start.position[0] + R0 @ lever
+    v = start.velocity[0] + R0 @ (float(start.yaw_rate[0]) * np.array([-lever[1], lever[0]]))
+    for k in range(steps):
+        omega, force = true_reading(path, imu, (k + 0.5) * dt)
+        assert force[2] == pytest.approx(9.80665)
+        middle = yaw + omega[2] * dt / 2
+        a = np.array(
+            [math.cos(middle) * force[0] - math.sin(middle) * force[1],
+             math.sin(middle) * force[0] + math.cos(middle) * force[1]]
+        )  # fmt: skip
+        p = p + v * dt + a * dt * dt / 2
+        v = v + a * dt
+        yaw += omega[2] * dt
+    end = path.at([steps * dt])
+    expected = end.position[0] + end.T_world_base()[0][:2, :2] @ lever
+    assert yaw - 0.5 == pytest.approx(float(end.yaw[0]), abs=1e-4)
+    np.testing.assert_allclose(p, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seed", [0, 3])
+def test_the_robot_touches_nothing(name: str, seed: int) -> None:
+    here = world(name, seed)
+    track = here.path.at(np.arange(0, here.path.period, 0.1)).position
+    for thing in here.things:
+        if thing.still and thing.label not in ("floor", "ceiling"):
+            v = thing.vertices(0.0)
+            v = v[(v[:, 2] > 0.02) & (v[:, 2] < ROBOT_HEIGHT), :2]
+            gap = min((np.hypot(*(v - p).T).min() for p in track), default=9) if len(v) else 9
+            assert gap > ROBOT_RADIUS, f"{thing.label} {thing.id} stands {gap:.2f} m from the path"
+    for t in np.arange(0, 60, 0.5):
+        p = here.path.at([t]).position[0]
+        for thing in here.things:
+            if not thing.still:
+                v = thing.vertices(t)
+                gap = np.hypot(*(v[v[:, 2] < ROBOT_HEIGHT, :2] - p).T).min(initial=9)
+                assert gap > ROBOT_RADIUS, f"{thing.label} {thing.id} comes within {gap:.2f} m at {t} s"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
+    for thing in world(name, 0).things:
+        if thing.still:
+            continue
+        times = np.arange(0, 40, 0.04)
+        frames = np.array([thing.mover.frame(t)[:3, 3] for t in times])
+        assert np.linalg.norm(np.diff(frames, axis=0), axis=1).max() < 2.0 * 0.04
+        last = None
+        for t in times[::3]:
+            poses = thing.mover.parts(t)[:, :3, 3]
+            if last is not None:
+                assert np.linalg.norm(poses - last, axis=1).max() < 5.0 * 0.12, (thing.label, t)
+            last = poses
+        assert min(thing.vertices(t)[:, 2].min() for t in times[::25]) > -0.01
+
+
+def test_bones_keep_their_lengths() -> None:
+    person = next(t.mover for t in world("office", 0).things if isinstance(t.mover, Person))
+    for t in np.arange(0, 30, 0.7):
+        T = person.body.poses(person.posture(t))
+        for upper, lower, share in ((3, 4, 0.186), (8, 9, 0.186), (5, 6, 0.245), (10, 11, 0.245)):
+            bone = np.linalg.norm(T[upper, :3, 3] - T[lower, :3, 3])
+            assert bone == pytest.approx(share * person.body.height, rel=1e-6)
+        np.testing.assert_allclose(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (13, 1, 1)), atol=1e-9)
