@@ -85,6 +85,15 @@ Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="RATE", help="Pace: 1 is real time. Default: as fast as the graph goes."),
 ]
+Live = Annotated[
+    bool,
+    typer.Option(
+        "--live",
+        metavar=FLAG,
+        help="Time does not wait: sources run by the clock, and operators that are too slow drop messages as their "
+        "`live:` policies say. Everything dropped is counted and recorded.",
+    ),
+]
 Paranoid = Annotated[
     bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
 ]
@@ -106,6 +115,7 @@ def run(
     graph: GraphFile,
     settings: Settings = None,
     rate: Rate = None,
+    live: Live = False,
     paranoid: Paranoid = False,
     quiet: Quiet = False,
     one_host: OneHost = False,
@@ -129,14 +139,15 @@ def run(
       dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1 --json
+      dataflow run graphs/simulated_robot.yaml --live --record live.mcap
     """
     from dataflow.graph import load_graph
     from dataflow.runtime.execute import run as run_graph
 
     with friendly_errors():
-        loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+        loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
         outputs = _outputs(record, view, open_view, overwrite)
-        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid)
+        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid) | {"live": live}
         _execute(lambda watch: run_graph(loaded, watch=watch, **options), loaded, outputs, None, json=json, quiet=quiet)
 
 

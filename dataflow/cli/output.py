@@ -124,8 +124,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         case GraphError():
             return f"\n{error}", "", COULD_NOT_RUN
         case RunFailed():
-            stopped = str(error).startswith(("interrupted", "stopped"))
-            return str(error), error.details, INTERRUPTED if stopped else DIFFERENT
+            return str(error), error.details, INTERRUPTED if error.interrupted else DIFFERENT
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:

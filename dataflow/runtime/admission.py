@@ -21,6 +21,9 @@ from dataflow.sync import NEVER, Entry
 Clock = Callable[[], float]
 """Seconds, never going back."""
 
+EventClock = Callable[[], int]
+"""The event time that a device's message would be stamped with now, ns since the epoch."""
+
 
 class _Arrival(NamedTuple):
     """One thing that a stream said: a message, a frontier or its end."""
@@ -86,29 +89,36 @@ class AdmissionQueue:
 
 
 class Patience:
-    """How long a decision has waited, and which inputs it need not wait for any longer."""
+    """How long a decision has waited, and which inputs it need not wait for any longer.
 
-    def __init__(self, wait: Mapping[str, int | None], clock: Clock) -> None:
-        self.wait, self.clock = wait, clock
+    A decision waits from when it came up, and never before event time has reached its stamp: a tick that lies ahead
+    cannot be late.
+    """
+
+    def __init__(self, wait: Mapping[str, int | None], clock: Clock, event_clock: EventClock) -> None:
+        self.wait, self.clock, self.event_clock = wait, clock, event_clock
         self._stamp = NEVER
         self._since = 0.0
 
     def exhausted(self, stamp: int, needs: Mapping[str, int]) -> dict[str, int]:
         """Of the frontiers that a decision at `stamp` needs, those whose input has had its time."""
-        now = self.clock()
         if stamp != self._stamp:
-            self._stamp, self._since = stamp, now
-        waited = (now - self._since) * 1e9
+            self._stamp, self._since = stamp, self.clock()
         return {
             name: frontier
             for name, frontier in needs.items()
-            if (budget := self.wait.get(name)) is not None and waited >= budget
+            if (budget := self.wait.get(name)) is not None and self._left(stamp, budget) <= 0
         }
 
-    def due_in(self, needs: Mapping[str, int]) -> float | None:
+    def due_in(self, stamp: int, needs: Mapping[str, int]) -> float | None:
         """Seconds until the next input has had its time; None when there is nothing to give up."""
         budgets = [b for name in needs if (b := self.wait.get(name)) is not None]
-        return max(0.0, self._since + min(budgets) * 1e-9 - self.clock()) if budgets else None
+        return max(0.0, self._left(stamp, min(budgets))) if budgets else None
+
+    def _left(self, stamp: int, budget: int) -> float:
+        since_asked = self._since + budget * 1e-9 - self.clock()
+        since_stamp = (stamp + budget - self.event_clock()) * 1e-9
+        return max(since_asked, since_stamp)
 
 
 class LiveRunner(OperatorRunner):
@@ -124,6 +134,7 @@ class LiveRunner(OperatorRunner):
         paranoid: bool = False,
         operator: Operator | None = None,
         clock: Clock = time.monotonic,
+        event_clock: EventClock = time.time_ns,
     ) -> None:
         super().__init__(node, emitter, static=static, seed=seed, paranoid=paranoid, operator=operator)
         triggers = {
@@ -133,7 +144,7 @@ class LiveRunner(OperatorRunner):
             if stream not in static
         }
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers)
-        self.patience = Patience(node.live.wait, clock)
+        self.patience = Patience(node.live.wait, clock, event_clock)
         self.forced: Counter[tuple[str, str]] = Counter()
 
     @property
@@ -175,7 +186,7 @@ class LiveRunner(OperatorRunner):
     def next_due(self) -> float | None:
         """Seconds until a decision need not wait any longer; None when nothing waits for the clock."""
         held = None if self.ended else self.aligner.waiting()
-        return None if held is None else self.patience.due_in(held.needs)
+        return None if held is None else self.patience.due_in(held.stamp, held.needs)
 
     def take_drops(self) -> list[DropRecord]:
         mine, self.queue.dropped = self.queue.dropped, []

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 
@@ -66,21 +64,3 @@ def _until_connected(bus: Bus, found: RunningGraph) -> None:
         time.sleep(POLL / 5)
     while not expected <= set(bus.query_static(found.namespace, timeout=1.0)) and time.monotonic() < deadline:
         time.sleep(POLL)
-
-
-@contextlib.contextmanager
-def attached_viewer(graph: str, target: str | None) -> Iterator[None]:
-    """While the block runs: a viewer process that attaches to the graph of that name once it runs."""
-    if target is None:
-        yield
-        return
-    command = [sys.executable, "-m", "dataflow.cli.main", "view", "--graph", graph, "--to", target, "--wait", "120"]
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, process_group=0)
-    try:
-        yield
-    finally:
-        try:
-            process.wait(timeout=10.0)
-        except subprocess.TimeoutExpired:
-            process.terminate()
-            process.wait(timeout=5.0)

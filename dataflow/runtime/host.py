@@ -230,10 +230,21 @@ class Host:
             self.consumers.setdefault(stream, []).append(runner)
 
     def _runner(self, node: Node) -> OperatorRunner:
-        runner = LiveRunner if self.config.live else OperatorRunner
-        return runner(
-            node, self.outlet, static=self.static, seed=self.graph.seed, paranoid=self.config.paranoid
-        )
+        common: dict[str, Any] = {
+            "static": self.static,
+            "seed": self.graph.seed,
+            "paranoid": self.config.paranoid,
+        }
+        if self.config.live:
+            return LiveRunner(node, self.outlet, **common, event_clock=self._event_clock)
+        return OperatorRunner(node, self.outlet, **common)
+
+    def _event_clock(self) -> int:
+        """Event time now: the clock's own, or, where sources are held to the clock, as far as they have been let."""
+        if self._start is None:
+            return time.time_ns()
+        first, at = self._start
+        return first + round((time.time() - at) * 1e9 * (self.config.rate or 1.0))
 
     def _recorded_runner(self, node: Node) -> RecordedRunner:
         assert self.config.verify is not None

@@ -84,11 +84,16 @@ class RunReport:
 
 
 class RunFailed(RuntimeError):
-    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words."""
+    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words.
 
-    def __init__(self, message: str, details: str = "", operator: str | None = None) -> None:
+    `interrupted`: it was asked to end.
+    """
+
+    def __init__(
+        self, message: str, details: str = "", operator: str | None = None, *, interrupted: bool = False
+    ) -> None:
         super().__init__(message)
-        self.details, self.operator = details, operator
+        self.details, self.operator, self.interrupted = details, operator, interrupted
 
 
 @dataclass(slots=True)
@@ -246,7 +251,7 @@ class Supervisor:
         while True:
             self._receive(TICK)
             if self._stop_asked:
-                raise RunFailed("interrupted while starting")
+                raise RunFailed("interrupted while starting", interrupted=True)
             processes = self._processes.values()
             if all(p.ready for p in processes):
                 if not probing:
@@ -287,7 +292,7 @@ class Supervisor:
                 self.status.phase = "stopping"
                 self._send_all("stop")
             if self._stop_asked > 1:
-                raise RunFailed("stopped before everything was drained")
+                raise RunFailed("stopped before everything was drained", interrupted=True)
             quiet = time.monotonic() - self._heard
             if quiet > self.plan.stall_timeout:
                 self._fail_stalled()

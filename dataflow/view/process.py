@@ -61,7 +61,7 @@ def start(arguments: Sequence[str], ports: Sequence[int], *, outlive: bool) -> s
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
-        start_new_session=outlive,
+        start_new_session=True,
         preexec_fn=None if outlive else _die_with_parent(),
     )
     deadline = time.monotonic() + _START_TIMEOUT

@@ -55,9 +55,9 @@ def assign(truth: Truth, anchors: Tensor, strides: Sequence[int], sizes: Sequenc
     ratio = size[:, None, None] / anchors[None]  # (T, L, A, 2)
     worst = torch.maximum(ratio, 1 / ratio).amax(dim=3)
     similar = worst < MAX_RATIO
-    nearest = worst.flatten(1).argmin(dim=1) if len(wanted) else worst.new_zeros(0, dtype=torch.long)
-    lonely = torch.nonzero(~similar.flatten(1).any(dim=1)).flatten()
-    similar.view(len(wanted), -1)[lonely, nearest[lonely]] = True
+    if len(wanted):
+        lonely = torch.nonzero(~similar.flatten(1).any(dim=1)).flatten()
+        similar.view(len(wanted), -1)[lonely, worst.flatten(1).argmin(dim=1)[lonely]] = True
     return [
         _in_map(wanted, truth.image[wanted], center / stride, similar[:, level], sizes[level])
         for level, stride in enumerate(strides)

@@ -20,6 +20,7 @@ from operators.detection.custom.augmentation import view
 from operators.detection.custom.dataset import DataError, labelled, read_detection_data
 from operators.detection.custom.decode import decode_grid, find_boxes
 from operators.detection.decode import Candidates
+from operators.detection.nms import intersection_over_union
 from operators.training.augmentation import NONE, Variation, fitted, tensor_of, warp
 from operators.weights import NetworkFileError
 
@@ -103,32 +104,35 @@ def dataflow_command(*words: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path: Path) -> None:
-    data, out = write_yolo(tmp_path / "mine", 48), tmp_path / "mine.onnx"
-    options = ["--epochs", "22", "--batch", "8", "--size", "160x128", "--width", "0.35", "--threads", "1"]
-    options += ["--learning-rate", "0.004", "--evaluate-every", "11"]
-    trained = dataflow_command("train", "detector", str(data), "--out", str(out), *options, "--json")
+    data, out = write_yolo(tmp_path / "mine", 40), tmp_path / "mine.onnx"
+    options = ["--epochs", "24", "--batch", "8", "--size", "128x96", "--width", "0.25", "--threads", "1"]
+    options += ["--learning-rate", "0.005", "--evaluate-every", "12", "--json"]
+    trained = dataflow_command("train", "detector", str(data), "--out", str(out), *options)
     assert trained.returncode == 0, trained.stderr
-    assert json.loads(trained.stdout)["scores"]["ap50"] > 0.6
+    assert json.loads(trained.stdout)["scores"]["ap50"] > 0.5
 
     unseen = write_coco(tmp_path / "unseen", 30, seed=1000)
     scored = dataflow_command("evaluate", "detector", str(unseen), "--weights", str(out), "--all", "--json")
     assert scored.returncode == 0, scored.stderr
-    assert json.loads(scored.stdout)["ap50"] > 0.6
+    assert json.loads(scored.stdout)["ap50"] > 0.5
 
-    detector = CustomDetector(weights=str(out))
+    detector, again = CustomDetector(weights=str(out)), CustomDetector(weights=str(out))
     detector.setup()
-    again = CustomDetector(weights=str(out))
     again.setup()
-    pixels, objects = scene(2000)
-    image = Image(stamp=5, frame="camera", data=np.ascontiguousarray(np.kron(pixels, np.ones((3, 3, 1), np.uint8))))
-    found = detector.process(image)
-    assert found.digest() == again.process(image).digest()
-    assert (found.stamp, found.frame, found.width, found.height) == (5, "camera", 480, 384)
-    assert found.class_names == ("crate", "ball")
-    for kind, box in objects:
-        same = found.boxes[found.class_ids == kind]
-        assert len(same)
-        assert np.abs(same - 3 * np.array(box)).max(axis=1).min() < 30  # in the pixels of the larger image
+    near = total = 0
+    for seed in range(2000, 2010):
+        pixels, objects = scene(seed)
+        large = np.ascontiguousarray(np.kron(pixels, np.ones((3, 3, 1), np.uint8)))
+        image = Image(stamp=seed, frame="camera", data=large)
+        found = detector.process(image)
+        assert found.digest() == again.process(image).digest()
+        assert (found.stamp, found.frame, found.width, found.height) == (seed, "camera", 480, 384)
+        assert found.class_names == ("crate", "ball")
+        for kind, box in objects:
+            total += 1
+            same = found.boxes[found.class_ids == kind]
+            near += bool((intersection_over_union(np.array(box, np.float32) * 3, same) > 0.5).any())
+    assert near / total > 0.6  # boxes in the pixels of the larger image
 
 
 def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) -> None:
@@ -247,8 +251,9 @@ def test_a_folder_of_real_photographs_is_read(data_dir: Path) -> None:
     assert len(data.classes) == 80
     assert any("images/ is used" in note for note in data.notes)
     objects = sum(len(image.boxes) for image in (*data.training, *data.validation))
-    rows = sum(len(file.read_text().split("\n")) - 1 for file in (data_dir / "coco128" / "labels").iterdir())
-    assert objects == rows
+    images = {file.stem for file in (data_dir / "coco128" / "images").iterdir()}
+    labels = [file for file in (data_dir / "coco128" / "labels").iterdir() if file.stem in images]
+    assert objects == sum(len(file.read_text().splitlines()) for file in labels) > 900
 
 
 # ---- anchors
@@ -355,8 +360,8 @@ def test_a_map_of_another_shape_is_refused_with_the_right_one() -> None:
 
 def truth_of(*rows: tuple[int, int, list[float], bool]) -> Truth:
     return Truth(
-        torch.tensor([r[0] for r in rows]),
-        torch.tensor([r[1] for r in rows]),
+        torch.tensor([r[0] for r in rows], dtype=torch.int64),
+        torch.tensor([r[1] for r in rows], dtype=torch.int64),
         torch.tensor([r[2] for r in rows], dtype=torch.float32).reshape(-1, 4),
         torch.tensor([r[3] for r in rows], dtype=torch.bool),
     )
@@ -409,22 +414,23 @@ def test_the_right_answer_costs_least_and_ignored_objects_nothing() -> None:
 
 def test_training_steps_lower_the_loss_and_do_not_depend_on_the_order_of_objects() -> None:
     torch.manual_seed(0)
+    torch.set_num_threads(1)
     network, anchors = GridDetector(2, width=0.25, channels=32), torch.from_numpy(ANCHORS)
-    images = torch.rand(2, 3, 128, 160)
-    rows = [(0, 0, [10.0, 10, 40, 40], False), (1, 1, [50.0, 30, 110, 90], False), (0, 1, [12.0, 11, 41, 42], False)]
+    images = torch.rand(2, 3, 64, 64)
+    rows = [(0, 0, [4.0, 10, 24, 40], False), (1, 1, [10.0, 8, 60, 60], False), (0, 1, [5.0, 11, 25, 42], False)]
     maps = network(images)
     one, other = (detection_loss(maps, truth_of(*r), anchors, STRIDES, 2) for r in (rows, rows[::-1]))
     for name in one:
         assert one[name].item() == pytest.approx(other[name].item(), rel=1e-5)
     optimizer = torch.optim.Adam(network.parameters(), 3e-3)
     costs = []
-    for _ in range(12):
+    for _ in range(30):
         cost = torch.stack(list(detection_loss(network(images), truth_of(*rows), anchors, STRIDES, 2).values())).sum()
         optimizer.zero_grad()
         cost.backward()
         optimizer.step()
         costs.append(cost.item())
-    assert costs[-1] < 0.7 * costs[0]
+    assert costs[-1] < 0.8 * costs[0]
 
 
 # ---- augmentation

@@ -38,8 +38,7 @@ def box_texture() -> NDArray[np.uint8]:
     """Smooth random spots: corners at every scale."""
     rng = np.random.default_rng(4)
     layers = [
-        cv2.resize(rng.random((n, n), np.float32), (1024, 1024), interpolation=cv2.INTER_CUBIC)
-        for n in (16, 64, 160)
+        cv2.resize(rng.random((n, n), np.float32), (1024, 1024), interpolation=cv2.INTER_CUBIC) for n in (16, 64, 160)
     ]
     mixed = sum(layers) / 3.0
     return np.clip((mixed - 0.5) * 400 + 128, 0, 255).astype(np.uint8)
@@ -53,9 +52,7 @@ def render(T_world_camera: NDArray[np.float64], K: NDArray[np.float64]) -> Frame
     u, v = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
     x, y = (u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1]
     R, o = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    d = [
-        (R[k, 0] * x + R[k, 1] * y + R[k, 2] + 1e-9).astype(np.float32) for k in range(3)
-    ]  # z = 1 in the camera
+    d = [(R[k, 0] * x + R[k, 1] * y + R[k, 2] + 1e-9).astype(np.float32) for k in range(3)]  # z = 1 in the camera
     walls = [np.maximum((ROOM[0][k] - o[k]) / d[k], (ROOM[1][k] - o[k]) / d[k]) for k in range(3)]
     near = [np.minimum((CRATE[0][k] - o[k]) / d[k], (CRATE[1][k] - o[k]) / d[k]) for k in range(3)]
     far = [np.maximum((CRATE[0][k] - o[k]) / d[k], (CRATE[1][k] - o[k]) / d[k]) for k in range(3)]
@@ -203,8 +200,7 @@ def test_pure_rotation_is_followed() -> None:
 def test_exposure_changes_are_followed() -> None:
     frames, poses = sequence(40)
     flicker = [
-        (cv2.convertScaleAbs(gray, alpha=0.6 + 0.4 * (i % 5 != 0)), depth)
-        for i, (gray, depth) in enumerate(frames)
+        (cv2.convertScaleAbs(gray, alpha=0.6 + 0.4 * (i % 5 != 0)), depth) for i, (gray, depth) in enumerate(frames)
     ]
     results = follow(flicker)
     assert all(r.status is Status.TRACKED for r in results[1:])
@@ -340,9 +336,7 @@ def test_depth_out_of_range_is_not_used() -> None:
         (np.zeros((240, 320), np.uint8), np.ones((240, 320), np.float32), 0, "does not follow"),  # same stamp
     ],
 )
-def test_wrong_input_is_refused(
-    image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int, message: str
-) -> None:
+def test_wrong_input_is_refused(image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int, message: str) -> None:
     odometry = RgbdOdometry(camera())
     odometry.track(np.zeros((240, 320), np.uint8), np.ones((240, 320), np.float32), 0)
     with pytest.raises(ValueError, match=message):
@@ -378,9 +372,7 @@ def test_same_frames_give_the_same_bytes_in_another_process(repository: Path) ->
         "m=u.module_from_spec(s);s.loader.exec_module(m);"
         "print(m.digest(m.follow(m.sequence(25, 3.0)[0][:12])))"
     )
-    other = subprocess.run(
-        [sys.executable, "-c", script], cwd=repository, capture_output=True, text=True, check=True
-    )
+    other = subprocess.run([sys.executable, "-c", script], cwd=repository, capture_output=True, text=True, check=True)
     assert other.stdout.strip() == digest(follow(sequence(25, 3.0)[0][:12]))
 
 

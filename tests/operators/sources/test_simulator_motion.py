@@ -135,4 +135,6 @@ def test_bones_keep_their_lengths() -> None:
         for upper, lower, share in ((3, 4, 0.186), (8, 9, 0.186), (5, 6, 0.245), (10, 11, 0.245)):
             bone = np.linalg.norm(T[upper, :3, 3] - T[lower, :3, 3])
             assert bone == pytest.approx(share * person.body.height, rel=1e-6)
-        np.testing.assert_allclose(T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (13, 1, 1)), atol=1e-9)
+        np.testing.assert_allclose(
+            T[:, :3, :3] @ T[:, :3, :3].transpose(0, 2, 1), np.tile(np.eye(3), (13, 1, 1)), atol=1e-9
+        )
