@@ -134,17 +134,11 @@ def score(estimate: list[Matrix], truth: list[Matrix], delta: int) -> dict[str, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "rgbd_7scenes"
-    parser.add_argument(
-        "--data", type=Path, default=data, help="a 7-Scenes folder (default: the project's data)"
-    )
+    parser.add_argument("--data", type=Path, default=data, help="a 7-Scenes folder (default: the project's data)")
     parser.add_argument("--stride", type=int, default=1, help="use every stride-th frame: faster motion")
-    parser.add_argument(
-        "--color-focal", type=float, default=525.0, help="focal length of the colour camera, px"
-    )
+    parser.add_argument("--color-focal", type=float, default=525.0, help="focal length of the colour camera, px")
     parser.add_argument("--delta", type=int, default=30, help="frames over which RPE is taken")
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     arguments = parser.parse_args()

@@ -463,9 +463,7 @@ def _port_types(hint: Any) -> tuple[type[Message], ...]:
     found: list[type[Message]] = []
     for argument in typing.get_args(hint):
         members = (
-            typing.get_args(argument)
-            if typing.get_origin(argument) in (typing.Union, types.UnionType)
-            else (argument,)
+            typing.get_args(argument) if typing.get_origin(argument) in (typing.Union, types.UnionType) else (argument,)
         )
         for member in members:
             if not (isinstance(member, type) and issubclass(member, Message)):
@@ -476,9 +474,7 @@ def _port_types(hint: Any) -> tuple[type[Message], ...]:
 
 def _input_port(name: str, port: In[Any] | Sampled[Any] | Batch[Any], accepted: tuple[type[Message], ...]) -> InputPort:
     if isinstance(port, Sampled):
-        return InputPort(
-            name, "sampled", accepted, port.many, port.doc, port.max_age, port.required, port.before
-        )
+        return InputPort(name, "sampled", accepted, port.many, port.doc, port.max_age, port.required, port.before)
     if isinstance(port, Batch):
         return InputPort(name, "batch", accepted, port.many, port.doc, max_age=port.max_age, max=port.max)
     return InputPort(name, "in", accepted, port.many, port.doc)

@@ -1,7 +1,7 @@
 """Tests of single operators: `play` runs one operator on streams, through the real aligner, without a graph.
 
-    outputs = play(CloudBuilder(stride=4), {"depth": depths, "image": images, "camera": [info]})
-    assert len(outputs["cloud"]) == len(depths)
+outputs = play(CloudBuilder(stride=4), {"depth": depths, "image": images, "camera": [info]})
+assert len(outputs["cloud"]) == len(depths)
 """
 
 from __future__ import annotations

@@ -214,4 +214,3 @@ class LiveRunner(OperatorRunner):
             self.forced[name, "timeout"] += 1
             self.aligner.force(name, frontier)
         return bool(exhausted)
-

@@ -8,7 +8,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
-from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording import Recorded, Recording
 from dataflow.runtime.firings import Emission

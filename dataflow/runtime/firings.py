@@ -142,7 +142,8 @@ def decode_batch(data: bytes) -> Batch:
         operator, incarnation, first = batch["operator"], batch["incarnation"], batch["first"]
         names, streams = batch["inputs"], batch["streams"]
         records = tuple(
-            _record(operator, incarnation, first + offset, row, names, streams) for offset, row in enumerate(batch["rows"])
+            _record(operator, incarnation, first + offset, row, names, streams)
+            for offset, row in enumerate(batch["rows"])
         )
     except FiringRecordError:
         raise
@@ -151,7 +152,9 @@ def decode_batch(data: bytes) -> Batch:
     return Batch(operator, incarnation, bool(batch["last"]), records)
 
 
-def _record(operator: str, incarnation: int, index: int, row: list[Any], names: list[str], streams: list[str]) -> FiringRecord:
+def _record(
+    operator: str, incarnation: int, index: int, row: list[Any], names: list[str], streams: list[str]
+) -> FiringRecord:
     kind, stamp, tick, inputs, stale, late, outputs, outcome, drops, detail, wall_start, duration = row
     return FiringRecord(
         operator=operator,

@@ -334,9 +334,7 @@ class Host:
                 self._check_gap(stream, envelope)
                 message = envelope.message
                 assert message is not None
-                entry = Entry(
-                    envelope.stamp, message, envelope.seq, envelope.incarnation, message.digest(), stream
-                )
+                entry = Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, message.digest(), stream)
                 for runner in runners:
                     runner.push(stream, entry)
             case Kind.FRONTIER:
@@ -363,9 +361,7 @@ class Host:
         """Runs what is decided; then, when nothing is, admits from the feeds. True when anything was done."""
         worked = False
         while self.inbox.empty():
-            if any([runner.step() for runner in reversed(self.runners)]):
-                worked = True
-            elif self._admit():
+            if any([runner.step() for runner in reversed(self.runners)]) or self._admit():
                 worked = True
             else:
                 self._keep_promises()
@@ -485,7 +481,13 @@ class Host:
         """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
         counts = {}
         for source in self.sources:
-            counts[source.node.name] = [source.firings, source.ports.emitted, source.overflow, source.busy_ns, source.last]
+            counts[source.node.name] = [
+                source.firings,
+                source.ports.emitted,
+                source.overflow,
+                source.busy_ns,
+                source.last,
+            ]
         for runner in self.runners:
             drops = sum(runner.drops.values())
             counts[runner.node.name] = [runner.firings, runner.ports.emitted, drops, runner.busy_ns, runner.done]
@@ -513,9 +515,7 @@ class Host:
         return {
             "streams": streams,
             "counts": self._counts(),
-            "drops": {
-                r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners
-            },
+            "drops": {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners},
             "summaries": {r.node.name: dict(s) for r in self.runners if (s := r.operator.summary())},
             "transport": {**self.bus.counters(), "malformed": self.malformed},
             "verifications": [r.result.to_wire() for r in self.runners if isinstance(r, RecordedRunner)],
@@ -544,7 +544,12 @@ class Host:
                 idle = self.inbox.empty() and not self._waits_for_clock() and all(s.ended for s in self.live)
                 full = self.window.full and any(not f.ended for f in self.feeds)
                 self.channel.send(
-                    "state", round=fields["round"], idle=idle, sent=self.outlet.sent, received=self.received, full=full,
+                    "state",
+                    round=fields["round"],
+                    idle=idle,
+                    sent=self.outlet.sent,
+                    received=self.received,
+                    full=full,
                     waiting=self._waiting(),
                 )
             case "stop":

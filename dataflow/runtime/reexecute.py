@@ -142,7 +142,9 @@ class RecordedRunner:
             raise OperatorFailure(self.node.name, "setup()", error) from error
         if self._setup is not None:
             before = self._setup.detail.get("files", {})
-            self.result.files_changed = sorted(f for f, digest in self.operator.files.items() if before.get(f) != digest)
+            self.result.files_changed = sorted(
+                f for f, digest in self.operator.files.items() if before.get(f) != digest
+            )
             self._compare(self._setup, statics)
         for state in self.ports.states.values():
             if state.port.static:

@@ -137,7 +137,14 @@ class Recorder:
         duration = time.time_ns() - started
         self.emitter.record(
             FiringRecord(
-                self.operator, self.incarnation, self.index, kind, stamp, wall_start=started, duration=duration, **fields
+                self.operator,
+                self.incarnation,
+                self.index,
+                kind,
+                stamp,
+                wall_start=started,
+                duration=duration,
+                **fields,
             )
         )
         self.index += 1

@@ -76,7 +76,7 @@ class SinkHost:
         self.config, self.channel, self.inbox = config, channel, inbox
         self.graph = Graph.from_json(config.graph)
         self.make_sink = make_sink
-        self.frontiers = {s: NEVER for s in config.streams}
+        self.frontiers = dict.fromkeys(config.streams, NEVER)
         self.firings_open = {firings_key(self.graph.namespace, o): o for o in config.firings}
         self.sink: StreamSink | None = None
         self.received = 0

@@ -344,12 +344,7 @@ class Supervisor:
                 self._send(process, "grow")
             self._heard = time.monotonic()
             return
-        waiting = {
-            node: held
-            for p in processes
-            if p.state is not None
-            for node, held in p.state["waiting"].items()
-        }
+        waiting = {node: held for p in processes if p.state is not None for node, held in p.state["waiting"].items()}
         lines = [
             f"  {node} waits at stamp {stamp} for " + (", ".join(f"{i} (≥ {f})" for i, f in needs.items()) or "input")
             for node, (stamp, needs) in waiting.items()

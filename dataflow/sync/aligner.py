@@ -81,9 +81,7 @@ class Aligner:
         bounding: list[Lane] = []
         if spec.every is not None:
             bounds = spec.bounds_of_ticks()
-            bounding = [
-                lane for name, stream in bounds for lane in self._lanes[name] if lane.state.name == stream
-            ]
+            bounding = [lane for name, stream in bounds for lane in self._lanes[name] if lane.state.name == stream]
             self._ticks = Ticks(spec.every, bounding)
         self._finals = {lane.state.name: lane.state for lane in (*triggers, *bounding)}
 
@@ -126,9 +124,7 @@ class Aligner:
         """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back."""
         state = self._stream(stream)
         if frontier >= FOREVER:
-            raise ValueError(
-                f"stream {stream!r}: a frontier lies before the end of time; end() is for end of stream"
-            )
+            raise ValueError(f"stream {stream!r}: a frontier lies before the end of time; end() is for end of stream")
         if state.advance(frontier):
             for lane in state.lanes:
                 lane.raise_frontier(frontier)
@@ -371,9 +367,7 @@ class Aligner:
     # Bookkeeping
 
     def _add_lanes(self, name: str, role: Role, streams: tuple[str, ...], delay: int = 0) -> None:
-        self._lanes[name] = tuple(
-            Lane(name, role, self._streams[stream], delay) for stream in sorted(streams)
-        )
+        self._lanes[name] = tuple(Lane(name, role, self._streams[stream], delay) for stream in sorted(streams))
         for lane in self._lanes[name]:
             lane.state.lanes.append(lane)
 

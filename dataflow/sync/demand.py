@@ -76,9 +76,7 @@ def stuck_cycle(edges: Iterable[Edge]) -> Cycle | None:
     distance = dict.fromkeys(nodes, 0)
     via: dict[str, Edge] = {}
     improved = ""
-    for _ in range(
-        scale
-    ):  # the longest path from anywhere; what still grows after len(nodes) rounds hangs on a cycle
+    for _ in range(scale):  # the longest path from anywhere; what still grows after len(nodes) rounds hangs on a cycle
         improved = ""
         for edge in live:
             longer = distance[edge.producer] + edge.demand * scale + 1

@@ -15,9 +15,7 @@ class DropLog:
 
     def entry(self, lane: Lane, entry: Entry, reason: DropReason, because: str = "") -> None:
         """A message is dropped on its way into one input."""
-        self._add(
-            Drop(lane.input, lane.state.name, entry.stamp, entry.seq, entry.incarnation, reason, because)
-        )
+        self._add(Drop(lane.input, lane.state.name, entry.stamp, entry.seq, entry.incarnation, reason, because))
 
     def tick(self, stamp: int, reason: DropReason, because: str) -> None:
         """A tick is dropped."""

@@ -78,11 +78,7 @@ class Join:
     def reject(self, reason: DropReason, because: str) -> None:
         """Decides `stamp`, which has matched, without a firing."""
         for name, entry in self.take().items():
-            lane = (
-                self._anchor
-                if name == self._anchor.input
-                else next(o for o in self._others if o.input == name)
-            )
+            lane = self._anchor if name == self._anchor.input else next(o for o in self._others if o.input == name)
             assert isinstance(entry, Entry)
             self._drop(lane, entry, reason, because)
 
@@ -120,9 +116,7 @@ class Join:
 
     def _partner(self, lane: Lane, stamp: int) -> Entry | _Unknown | None:
         entries = lane.entries
-        while (
-            len(entries) > 1 and entries[1].stamp <= stamp
-        ):  # for this anchor and all later ones the next is nearer
+        while len(entries) > 1 and entries[1].stamp <= stamp:  # for this anchor and all later ones the next is nearer
             self._discard(lane)
         below = above = None  # the newest at or before the anchor, the oldest after it
         if entries and entries[0].stamp <= stamp:
@@ -174,8 +168,7 @@ class Join:
         """Discards what no anchor above the anchor's frontier can match."""
         frontier, entries = self._anchor.frontier, lane.entries
         while entries and (
-            entries[0].stamp + self._tolerance <= frontier
-            or (len(entries) > 1 and entries[1].stamp <= frontier + 1)
+            entries[0].stamp + self._tolerance <= frontier or (len(entries) > 1 and entries[1].stamp <= frontier + 1)
         ):
             self._discard(lane)
 

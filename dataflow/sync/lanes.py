@@ -80,9 +80,7 @@ class StreamState:
     def reset(self, incarnation: int) -> None:
         """Begins a new incarnation, which is open, and late up to where the old ones came."""
         if incarnation <= self.incarnation:
-            raise StreamOrderError(
-                f"stream {self.name!r}: incarnation {incarnation} after {self.incarnation}"
-            )
+            raise StreamOrderError(f"stream {self.name!r}: incarnation {incarnation} after {self.incarnation}")
         self.incarnation = incarnation
         if self.static:
             self.last = NEVER
@@ -101,9 +99,7 @@ class StreamState:
         if entry.stamp <= self.floor:
             return
         if entry.stamp <= self.last:
-            raise StreamOrderError(
-                f"{where} does not come after {format_stamp(self.last)}: stamps strictly increase"
-            )
+            raise StreamOrderError(f"{where} does not come after {format_stamp(self.last)}: stamps strictly increase")
         raise StreamOrderError(f"{where} breaks the promised frontier {format_stamp(self.promised)}")
 
 

@@ -72,9 +72,7 @@ class Merge:
         stamp = self.stamp
         assert stamp is not None
         popped = [
-            (lane, lane.entries.popleft())
-            for lane in self._lanes
-            if lane.entries and lane.entries[0].stamp == stamp
+            (lane, lane.entries.popleft()) for lane in self._lanes if lane.entries and lane.entries[0].stamp == stamp
         ]
         self.decided = stamp
         return popped

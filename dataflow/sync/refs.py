@@ -27,9 +27,7 @@ class RunRef:
     last_seq: int
 
     def __iter__(self) -> Iterator[MessageRef]:
-        return (
-            MessageRef(self.stream, self.incarnation, seq) for seq in range(self.first_seq, self.last_seq + 1)
-        )
+        return (MessageRef(self.stream, self.incarnation, seq) for seq in range(self.first_seq, self.last_seq + 1))
 
 
 InputRef = MessageRef | None | tuple[RunRef, ...] | Mapping[str, MessageRef]

@@ -27,9 +27,7 @@ class RecordedAligner:
         self._records: Iterator[FiringInputs] = iter(records)
         self._next = next(self._records, None)
         self._held: dict[str, dict[Position, Entry]] = {stream: {} for stream in spec.streams}
-        self._from: dict[str, dict[str, Position]] = {
-            stream: {} for stream in spec.streams
-        }  # stream -> input -> ...
+        self._from: dict[str, dict[str, Position]] = {stream: {} for stream in spec.streams}  # stream -> input -> ...
         self._reused = frozenset(s.name for s in spec.inputs if isinstance(s, SampledSpec))
         for declared in spec.inputs:
             for stream in declared.streams:
@@ -39,9 +37,7 @@ class RecordedAligner:
     def push(self, stream: str, entry: Entry) -> None:
         """A message arrives; streams may be interleaved in any way."""
         if stream not in self._held:
-            raise KeyError(
-                f"stream {stream!r} feeds no input; those that do: {', '.join(sorted(self._held))}"
-            )
+            raise KeyError(f"stream {stream!r} feeds no input; those that do: {', '.join(sorted(self._held))}")
         if not entry.stream:
             entry = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
         position = (entry.incarnation, entry.seq)

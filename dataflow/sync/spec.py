@@ -52,9 +52,7 @@ class SampledSpec:
         if self.max_age is not None and self.max_age < 0:
             raise ValueError(f"input {self.name!r}: max_age {self.max_age} ns is negative")
         if self.before is not None and self.before < 1:
-            raise ValueError(
-                f"input {self.name!r}: before must be at least 1 ns, not {self.before}; None means none"
-            )
+            raise ValueError(f"input {self.name!r}: before must be at least 1 ns, not {self.before}; None means none")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,18 +108,12 @@ class AlignSpec:
         if self.joins:
             for trigger in self.triggers:
                 if trigger.many:
-                    raise ValueError(
-                        f"input {trigger.name!r}: a join takes one stream per trigger; use merge"
-                    )
+                    raise ValueError(f"input {trigger.name!r}: a join takes one stream per trigger; use merge")
                 if trigger.streams[0] in self.static:
-                    raise ValueError(
-                        f"input {trigger.name!r}: a static stream cannot be joined; declare it Sampled"
-                    )
+                    raise ValueError(f"input {trigger.name!r}: a static stream cannot be joined; declare it Sampled")
         if self.every is None:
             if not self.triggers:
-                raise ValueError(
-                    "an operator without a trigger needs `every`: nothing would ever make it fire"
-                )
+                raise ValueError("an operator without a trigger needs `every`: nothing would ever make it fire")
         elif self.every < 1:
             raise ValueError(f"every must be at least 1 ns, not {self.every}")
         elif not self.bounds_of_ticks():

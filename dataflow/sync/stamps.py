@@ -51,14 +51,10 @@ def parse_duration(value: str | int) -> int:
         match = _DURATION.fullmatch(value)
         if match is None:
             hint = " (a bare number needs a unit)" if re.fullmatch(r"\s*-?[\d.]+\s*", value) else ""
-            raise ValueError(
-                f"duration {value!r}: expected a number and a unit, such as '100ms' or '1.5s'{hint}"
-            )
+            raise ValueError(f"duration {value!r}: expected a number and a unit, such as '100ms' or '1.5s'{hint}")
         sign, digits, unit = match.groups()
         if unit not in NANOSECONDS:
-            raise ValueError(
-                f"duration {value!r}: unknown unit {unit!r}; the units are {', '.join(NANOSECONDS)}"
-            )
+            raise ValueError(f"duration {value!r}: unknown unit {unit!r}; the units are {', '.join(NANOSECONDS)}")
         exact = Fraction(digits) * NANOSECONDS[unit]
         if exact.denominator != 1:
             raise ValueError(f"duration {value!r} is not a whole number of nanoseconds")
@@ -71,9 +67,7 @@ def parse_duration(value: str | int) -> int:
 def format_duration(duration: int) -> str:
     """The exact text of `duration` (ns) in the largest unit from ns to s that it fills: ``"1.5s"``."""
     sign, magnitude = ("-", -duration) if duration < 0 else ("", duration)
-    unit = next(
-        (u for u in ("s", "ms", "us") if magnitude >= NANOSECONDS[u]), "s" if magnitude == 0 else "ns"
-    )
+    unit = next((u for u in ("s", "ms", "us") if magnitude >= NANOSECONDS[u]), "s" if magnitude == 0 else "ns")
     whole, rest = divmod(magnitude, NANOSECONDS[unit])
     decimals = f"{rest:0{len(str(NANOSECONDS[unit])) - 1}d}".rstrip("0") if rest else ""
     return f"{sign}{whole}{'.' + decimals if decimals else ''}{unit}"

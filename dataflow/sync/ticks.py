@@ -53,9 +53,7 @@ class Ticks:
 
     def needs_to_start(self, stamp: int) -> dict[str, int]:
         """The frontiers with which the first tick would be known, as far as `stamp`."""
-        return {
-            lane.input: stamp for lane in self._lanes if lane.state.first is None and lane.frontier < stamp
-        }
+        return {lane.input: stamp for lane in self._lanes if lane.state.first is None and lane.frontier < stamp}
 
     def _find_start(self) -> None:
         """The grid point at or after the first stamp of all; a silent stream may begin above its frontier."""

@@ -41,13 +41,13 @@ class DepthDecoder(Operator):
     def process(self, compressed: CompressedDepth) -> DepthImage:
         """Raises ValueError where the bytes are not a whole image."""
         levels = _decoded(compressed, cv2.IMREAD_UNCHANGED, self.max_pixels)
-        metres = depth_in_metres(levels.astype(np.uint16, copy=False), compressed.quantizer, compressed.scale, compressed.offset)
+        metres = depth_in_metres(
+            levels.astype(np.uint16, copy=False), compressed.quantizer, compressed.scale, compressed.offset
+        )
         return DepthImage(stamp=compressed.stamp, frame=compressed.frame, data=metres)
 
 
-def depth_in_metres(
-    levels: NDArray[np.uint16], quantizer: str, scale: float, offset: float
-) -> NDArray[np.float32]:
+def depth_in_metres(levels: NDArray[np.uint16], quantizer: str, scale: float, offset: float) -> NDArray[np.float32]:
     """Metres of pixel values v: scale · v + offset (linear) or scale / (v − offset) (inverse); 0 where v is 0.
 
     An inverse value at or below the offset has no depth either: it is 0.

@@ -24,21 +24,15 @@ class RgbdCamera:
         for name, shape in (("K_color", (3, 3)), ("K_depth", (3, 3)), ("T_depth_color", (4, 4))):
             value = np.array(getattr(self, name), np.float64)
             if value.shape != shape or not np.isfinite(value).all():
-                raise ValueError(
-                    f"RgbdCamera.{name} must be a finite {shape} matrix, got shape {value.shape}"
-                )
+                raise ValueError(f"RgbdCamera.{name} must be a finite {shape} matrix, got shape {value.shape}")
             object.__setattr__(self, name, value)
         for name in ("K_color", "K_depth"):
             K = getattr(self, name)
             if K[0, 0] <= 0 or K[1, 1] <= 0:
-                raise ValueError(
-                    f"RgbdCamera.{name} must have positive focal lengths, got {K[0, 0]} and {K[1, 1]}"
-                )
+                raise ValueError(f"RgbdCamera.{name} must have positive focal lengths, got {K[0, 0]} and {K[1, 1]}")
         R = self.T_depth_color[:3, :3]
         if np.abs(R @ R.T - np.eye(3)).max() > 1e-3 or np.linalg.det(R) < 0:
-            raise ValueError(
-                "RgbdCamera.T_depth_color must be a rigid motion: its rotation block is not a rotation"
-            )
+            raise ValueError("RgbdCamera.T_depth_color must be a rigid motion: its rotation block is not a rotation")
         object.__setattr__(self, "T_color_depth", invert(self.T_depth_color))
 
     T_color_depth: Matrix = field(init=False)

@@ -20,9 +20,7 @@ def detect_corners(gray: Gray, count: int) -> Pixels:
     return np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
-def track_corners(
-    gray_from: Gray, gray_to: Gray, pixels_from: Pixels, guess_to: Pixels
-) -> tuple[Pixels, Mask]:
+def track_corners(gray_from: Gray, gray_to: Gray, pixels_from: Pixels, guess_to: Pixels) -> tuple[Pixels, Mask]:
     """Follow pixels (N, 2) from one image into another, starting at a guess. Bouguet, 2000."""
     if len(pixels_from) == 0:
         return np.zeros((0, 2)), np.zeros(0, bool)
@@ -53,9 +51,7 @@ class OrbMatcher:
     """Descriptors and mutual nearest matches. Rublee et al., "ORB", 2011."""
 
     def __init__(self, count: int = 1000) -> None:
-        self._orb = cv2.ORB.create(
-            count, scaleFactor=1.2, nlevels=8, edgeThreshold=15, patchSize=31, fastThreshold=7
-        )
+        self._orb = cv2.ORB.create(count, scaleFactor=1.2, nlevels=8, edgeThreshold=15, patchSize=31, fastThreshold=7)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
 
     def describe(self, gray: Gray) -> tuple[Pixels, NDArray[np.uint8]]:
@@ -70,6 +66,4 @@ class OrbMatcher:
         if len(descriptors_a) == 0 or len(descriptors_b) == 0:
             return np.zeros((0, 2), np.int64)
         matches = self._matcher.match(descriptors_a, descriptors_b)
-        return np.array([(m.queryIdx, m.trainIdx) for m in matches if m.distance < 64], np.int64).reshape(
-            -1, 2
-        )
+        return np.array([(m.queryIdx, m.trainIdx) for m in matches if m.distance < 64], np.int64).reshape(-1, 2)

@@ -71,9 +71,7 @@ class RgbdOdometryConfig:
 
     def __post_init__(self) -> None:
         if not 0 < self.near < self.far:
-            raise ValueError(
-                f"RgbdOdometryConfig needs 0 < near < far metres, got near={self.near}, far={self.far}"
-            )
+            raise ValueError(f"RgbdOdometryConfig needs 0 < near < far metres, got near={self.near}, far={self.far}")
         for name in ("image_width", "surface_width", "corners", "references", "keyframes"):
             if getattr(self, name) < 1:
                 raise ValueError(f"RgbdOdometryConfig.{name} must be at least 1, got {getattr(self, name)}")
@@ -194,9 +192,7 @@ class RgbdOdometry:
         factor = max(1, gray.shape[1] // self.config.image_width)
         if factor > 1:
             height, width = gray.shape[0] // factor, gray.shape[1] // factor
-            gray = cv2.resize(
-                gray[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA
-            )
+            gray = cv2.resize(gray[: height * factor, : width * factor], (width, height), interpolation=cv2.INTER_AREA)
         self._working = replace(self.camera, K_color=scaled_intrinsics(self.camera.K_color, 1.0 / factor))
         block = max(1, depth.shape[1] // self.config.surface_width)
         surface = Surface.from_depth(depth, self.camera.K_depth, self.config.near, self.config.far, block)
@@ -309,9 +305,7 @@ class RgbdOdometry:
         if fit.depth_agrees and fit.weakest_sigma < 0.05:
             return Status.DEPTH
         newest = self._keyframes[-1]
-        if len(newest.points) < self.config.min_inliers and not (
-            self.config.refine and newest.surface.coverage > 0.05
-        ):
+        if len(newest.points) < self.config.min_inliers and not (self.config.refine and newest.surface.coverage > 0.05):
             return Status.RESTARTED  # a keyframe of nothing, taken in the dark: waiting for it is in vain
         blind_s = self._motion.blind_s + (stamp - self._motion.stamp) * 1e-9
         if blind_s <= self.config.patience_s:
@@ -326,9 +320,7 @@ class RgbdOdometry:
             return None
         newest = self._keyframes[-1]
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, self._depth(frame.surface))
-        moved = baseline > self.config.keyframe_distance or (
-            fit.compared > 0 and fit.compared < 0.5 * fit.offered
-        )
+        moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * fit.offered)
         starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
         if not (moved or starved) or frame.surface.coverage < 0.5 * newest.surface.coverage:
             return None
@@ -344,9 +336,7 @@ class RgbdOdometry:
         corners = detect_corners(frame.gray, self.config.corners)
         points, known = self._working.depth_at(corners, frame.depth, self.config.near, self.config.far)
         orb_pixels, descriptors = self._orb.describe(frame.gray)
-        orb_points, orb_known = self._working.depth_at(
-            orb_pixels, frame.depth, self.config.near, self.config.far
-        )
+        orb_points, orb_known = self._working.depth_at(orb_pixels, frame.depth, self.config.near, self.config.far)
         return Keyframe(
             stamp, self._motion.T_world_camera, self._covariance, frame.gray, frame.surface,
             corners[known], points[known], orb_points[orb_known], descriptors[orb_known],
@@ -388,14 +378,10 @@ class RgbdOdometry:
         self._motion, self._covariance, self._shapes = state.motion, state.covariance, state.shapes
         self._keyframes = list(state.keyframes)
 
-    def _result(
-        self, stamp: int, status: Status, inliers: int, depth_inliers: float, keyframe: bool
-    ) -> TrackResult:
+    def _result(self, stamp: int, status: Status, inliers: int, depth_inliers: float, keyframe: bool) -> TrackResult:
         assert self._motion is not None
         T, velocity = self._motion.T_world_camera.copy(), self._motion.velocity.copy()
-        return TrackResult(
-            stamp, T, self._covariance.copy(), velocity, inliers, depth_inliers, status, keyframe
-        )
+        return TrackResult(stamp, T, self._covariance.copy(), velocity, inliers, depth_inliers, status, keyframe)
 
     def _check(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> None:
         if image.dtype != np.uint8 or not (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3)):
@@ -407,9 +393,7 @@ class RgbdOdometry:
                 raise ValueError(f"{name} must be at least 32 x 32 pixels, got {shape}")
         shapes = (image.shape[:2], depth.shape)
         if self._shapes not in (None, shapes):
-            raise ValueError(
-                f"image and depth sizes changed from {self._shapes} to {shapes}: one camera, one size"
-            )
+            raise ValueError(f"image and depth sizes changed from {self._shapes} to {shapes}: one camera, one size")
         if self._motion is not None and stamp <= self._motion.stamp:
             raise ValueError(f"stamp {stamp} ns does not follow the last frame's {self._motion.stamp} ns")
         self._shapes = shapes

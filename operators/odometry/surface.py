@@ -42,9 +42,7 @@ class Surface:
         valid = cv2.inRange(depth, near, far)  # 255 or 0; a NaN compares false
         inverse = np.zeros_like(depth)
         cv2.copyTo(cv2.divide(1.0, depth), valid, inverse)
-        mean, square, share = (
-            _block_mean(x, w, h) for x in (inverse, inverse * inverse, valid / np.float32(255))
-        )
+        mean, square, share = (_block_mean(x, w, h) for x in (inverse, inverse * inverse, valid / np.float32(255)))
         enough = share >= 0.5
         share[~enough] = 1.0
         mean /= share

@@ -40,15 +40,11 @@ class VisualOdometry(Operator):
     )
     odometry: Out[Odometry] = Out(doc="the depth camera in the odometry frame, with covariance and velocity")
 
-    odometry_frame: str = Param(
-        "odom", min_length=1, doc="name of the frame that the first depth camera defines"
-    )
+    odometry_frame: str = Param("odom", min_length=1, doc="name of the frame that the first depth camera defines")
     near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
     far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
     depth_noise_floor: float = Param(0.002, gt=0, doc="standard deviation of a near depth", unit="m")
-    depth_noise_quadratic: float = Param(
-        0.002, ge=0, doc="and what it grows by per depth squared", unit="1/m"
-    )
+    depth_noise_quadratic: float = Param(0.002, ge=0, doc="and what it grows by per depth squared", unit="1/m")
     corners: int = Param(300, ge=30, doc="most corners tracked from a keyframe")
     min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
     refine: bool = Param(True, doc="refine with the depth image; off leaves the features alone")
@@ -56,9 +52,7 @@ class VisualOdometry(Operator):
         0.1, gt=0, doc="change of view that makes a new keyframe: angle plus baseline over depth", unit="rad"
     )
     keyframes: int = Param(12, ge=1, doc="keyframes remembered")
-    patience: float = Param(
-        0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s"
-    )
+    patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
     give_up: float = Param(2.0, ge=0, doc="and until it begins anew at the predicted pose", unit="s")
 
     _tracker: _Tracker | None = None
@@ -89,9 +83,7 @@ class VisualOdometry(Operator):
         """The clock of a stream began anew, so nothing before it can be compared with."""
         self._tracker = None
 
-    def _tracking(
-        self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None
-    ) -> RgbdOdometry:
+    def _tracking(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdOdometry:
         """The tracker, made once for each calibration."""
         given = (image_info, depth_info, extrinsics)
         if self._tracker is None or self._tracker.calibration != given:
@@ -125,12 +117,9 @@ def about_fixed_axes(covariance: Matrix, T_world_camera: Matrix) -> NDArray[np.f
 def _check(port: str, image: Image | DepthImage, info: CameraInfo) -> None:
     if (image.width, image.height) != (info.width, info.height):
         raise ValueError(
-            f"{port} has {image.width}x{image.height} pixels, "
-            f"but {port}_info describes {info.width}x{info.height}"
+            f"{port} has {image.width}x{image.height} pixels, but {port}_info describes {info.width}x{info.height}"
         )
     if image.frame != info.frame:
         raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")
     if info.distortion is not None and np.any(info.distortion):
-        raise ValueError(
-            f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first"
-        )
+        raise ValueError(f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first")

@@ -309,9 +309,7 @@ class SimulatedRobot(Source):
         return {"radar_scan": radar.scan(self._stage, self.radar, t, rng, tick.stamp, "radar")}
 
     def _landmarks(self, t: float, tick: Tick, rng: Rng) -> Messages:
-        return {
-            "sightings": landmarks.sightings(self._stage, self.landmarks, t, rng, tick.stamp, "landmark_sensor")
-        }
+        return {"sightings": landmarks.sightings(self._stage, self.landmarks, t, rng, tick.stamp, "landmark_sensor")}
 
     def _gnss(self, t: float, tick: Tick, rng: Rng) -> Messages:
         return {"fix": self._gnss_model.measure(self._stage.world.path, t, rng, tick.stamp, "gnss")}
@@ -326,9 +324,7 @@ class SimulatedRobot(Source):
                 frame=self.world_frame,
                 child_frame=self.depth_frame,
             ),
-            "true_base": truth.base_state(
-                self._stage.world.path, t, tick.stamp, self.world_frame, self.base_frame
-            ),
+            "true_base": truth.base_state(self._stage.world.path, t, tick.stamp, self.world_frame, self.base_frame),
         }
 
     def _activities(self, t: float, tick: Tick, rng: Rng) -> Messages:

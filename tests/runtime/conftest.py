@@ -25,8 +25,7 @@ def _no_orphans() -> Iterator[None]:
     assert not left
 
 
-@pytest.fixture()
+@pytest.fixture
 def mixed() -> Graph:
     """Every kind of input; small."""
     return load_graph(HERE / "mixed.yaml")
-

@@ -139,7 +139,7 @@ operators:
 """
 
 
-@pytest.fixture()
+@pytest.fixture
 def long_run(tmp_path: Path) -> Running:
     (tmp_path / "long.yaml").write_text(GRAPH)
     running = Running("run", "long.yaml", "--record", "run.mcap", "-q", cwd=tmp_path)

@@ -43,9 +43,18 @@ input_refs = st.one_of(
         lambda d: {s: MessageRef(s, i, n) for s, (i, n) in d.items()}
     ),
 )
-emissions = st.one_of(st.none(), st.builds(Emission, numbers, st.integers(0, 2**60), st.binary(min_size=16, max_size=16)))
+emissions = st.one_of(
+    st.none(), st.builds(Emission, numbers, st.integers(0, 2**60), st.binary(min_size=16, max_size=16))
+)
 drops = st.builds(
-    DropRecord, names, names, st.integers(0, 9), numbers, st.integers(0, 2**60), st.sampled_from(["late", "unused"]), names
+    DropRecord,
+    names,
+    names,
+    st.integers(0, 9),
+    numbers,
+    st.integers(0, 2**60),
+    st.sampled_from(["late", "unused"]),
+    names,
 )
 
 

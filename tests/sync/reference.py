@@ -22,11 +22,7 @@ def matches(spec: AlignSpec, streams: Streams) -> dict[int, dict[str, Entry]]:
         partners = {spec.triggers[0].name: anchor[stamp]}
         for trigger, other in zip(spec.triggers[1:], others, strict=True):
             near = nearest(stamp, list(other))
-            if (
-                near is not None
-                and abs(near - stamp) <= spec.tolerance
-                and nearest(near, list(anchor)) == stamp
-            ):
+            if near is not None and abs(near - stamp) <= spec.tolerance and nearest(near, list(anchor)) == stamp:
                 partners[trigger.name] = other[near]
         if len(partners) == len(spec.triggers):
             matched[stamp] = partners

@@ -48,9 +48,7 @@ def tell(aligner: Aligner, step: Step) -> None:
     getattr(aligner, what)(stream, argument)
 
 
-def run(
-    spec: AlignSpec, steps: Iterable[Step], after: Callable[[Aligner], None] | None = None
-) -> list[Firing]:
+def run(spec: AlignSpec, steps: Iterable[Step], after: Callable[[Aligner], None] | None = None) -> list[Firing]:
     """The firings of a fresh aligner, polled after each step."""
     aligner = Aligner(spec)
     fired: list[Firing] = []
@@ -119,9 +117,7 @@ def specs(draw: st.DrawFn) -> AlignSpec:
     static = frozenset(s for s in shared if draw(st.integers(0, 5)) == 0 and not (joins and s in triggering))
     every = draw(st.none() | st.integers(3, 15))
     bounding = any(
-        s not in static
-        for i in (*triggers, *(x for x in sampled if x.before is None), *batches)
-        for s in i.streams
+        s not in static for i in (*triggers, *(x for x in sampled if x.before is None), *batches) for s in i.streams
     )
     if not bounding:
         every = None
@@ -152,9 +148,7 @@ def scenarios(draw: st.DrawFn) -> Scenario:
         )
         said: list[Step] = []
         reached = -3
-        for message, upto in zip(
-            [*messages, None], [*stamps, None if final is None else final + 1], strict=True
-        ):
+        for message, upto in zip([*messages, None], [*stamps, None if final is None else final + 1], strict=True):
             for _ in range(draw(st.integers(0, 2))):
                 if upto is not None and reached < upto - 1:
                     reached = draw(st.integers(reached, upto - 1))

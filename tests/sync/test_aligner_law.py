@@ -54,9 +54,7 @@ def test_firings_and_drops_follow_the_rules_for_every_interleaving(scenario: Sce
 
 @settings(max_examples=50, deadline=None)
 @given(scenarios(), seeds, seeds)
-def test_values_given_to_firings_are_independent_of_arrival_order(
-    scenario: Scenario, one: int, two: int
-) -> None:
+def test_values_given_to_firings_are_independent_of_arrival_order(scenario: Scenario, one: int, two: int) -> None:
     first = run(scenario.spec, interleave(scenario.says, random.Random(one)))
     second = run(scenario.spec, interleave(scenario.says, random.Random(two)))
     assert repr(first) == repr(second)

@@ -59,9 +59,7 @@ class Graph:
                     )
             for sampled in spec.sampled:
                 for s in sampled.streams:
-                    found.append(
-                        Edge(s, consumer, sampled.name, "sampled", sampled.before, lag=self.lags.get(s, 0))
-                    )
+                    found.append(Edge(s, consumer, sampled.name, "sampled", sampled.before, lag=self.lags.get(s, 0)))
             for batch in spec.batches:
                 for s in batch.streams:
                     found.append(Edge(s, consumer, batch.name, "batch", lag=self.lags.get(s, 0)))
@@ -133,9 +131,7 @@ def source(name: str, *stamps: int) -> list[Step]:
 def graphs(draw: st.DrawFn) -> Graph:
     names = [f"n{i}" for i in range(draw(st.integers(1, 4)))]
     sources = {
-        name: source(
-            name, *draw(st.lists(st.integers(0, 40), unique=True, min_size=1, max_size=6).map(sorted))
-        )
+        name: source(name, *draw(st.lists(st.integers(0, 40), unique=True, min_size=1, max_size=6).map(sorted)))
         for name in ("s0", "s1")
     }
     anywhere = st.sampled_from([*names, "s0", "s1"])
@@ -143,9 +139,7 @@ def graphs(draw: st.DrawFn) -> Graph:
     specs = {}
     for name in names:
         before = st.sampled_from([None, 1, 1, 3, 12])
-        triggers = tuple(
-            TriggerSpec(f"t{i}", (draw(mostly_sources),)) for i in range(draw(st.integers(0, 2)))
-        )
+        triggers = tuple(TriggerSpec(f"t{i}", (draw(mostly_sources),)) for i in range(draw(st.integers(0, 2))))
         sampled = tuple(
             SampledSpec(f"x{i}", (draw(anywhere),), draw(st.none() | st.integers(0, 20)), False, draw(before))
             for i in range(draw(st.integers(0, 2)))
@@ -165,9 +159,7 @@ def graphs(draw: st.DrawFn) -> Graph:
 
 @settings(max_examples=150, deadline=None)
 @given(graphs(), st.integers(0, 2**32 - 1))
-def test_accepted_graphs_run_to_their_end_the_same_way_in_any_order_of_delivery(
-    graph: Graph, seed: int
-) -> None:
+def test_accepted_graphs_run_to_their_end_the_same_way_in_any_order_of_delivery(graph: Graph, seed: int) -> None:
     if stuck_cycle(graph.edges()) is not None:
         return
     log, ended = execute(graph, seed)
@@ -243,9 +235,7 @@ def test_feedback_without_delay_is_refused_and_does_deadlock_when_wired() -> Non
     assert (log, ended) == ({"filter": [], "plan": []}, False)
 
 
-@pytest.mark.parametrize(
-    ("before", "lag", "accepted"), [(1, 0, True), (1, 1, False), (5, 4, True), (5, 5, False)]
-)
+@pytest.mark.parametrize(("before", "lag", "accepted"), [(1, 0, True), (1, 1, False), (5, 4, True), (5, 5, False)])
 def test_feedback_must_reach_farther_back_than_the_port_lags(before: int, lag: int, accepted: bool) -> None:
     graph = feedback(before, lag)
     assert (stuck_cycle(graph.edges()) is None) == accepted

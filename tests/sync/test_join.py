@@ -137,9 +137,7 @@ def test_one_hopeless_input_passes_the_anchor_without_waiting_for_the_others() -
     assert aligner.drops == {("a", "unmatched"): 1, ("y", "unmatched"): 1}
 
 
-def decided_by_rule(
-    tolerance: int, anchor: int, anchors: list[int], a_front: int, xs: list[int], x_front: int
-) -> bool:
+def decided_by_rule(tolerance: int, anchor: int, anchors: list[int], a_front: int, xs: list[int], x_front: int) -> bool:
     """Rule 2's condition, word for word: is enough known of the other input to decide `anchor`?"""
     below = [x for x in xs if x <= anchor]
     enough = min(anchor + tolerance, 2 * anchor - max(below) - 1) if below else anchor + tolerance
@@ -176,9 +174,7 @@ def test_an_anchor_is_decided_no_later_than_the_rule_says(
         _, stream, argument = step
         if isinstance(argument, Entry):
             seen[stream].append(argument.stamp)
-        front[stream] = max(
-            front[stream], argument.stamp if isinstance(argument, Entry) else int(str(argument))
-        )
+        front[stream] = max(front[stream], argument.stamp if isinstance(argument, Entry) else int(str(argument)))
         fired |= {f.stamp for f in poll_all(aligner)}
         decided = takewhile(
             lambda t: decided_by_rule(tolerance, t, seen["a"], front["a"], seen["x"], front["x"]), seen["a"]

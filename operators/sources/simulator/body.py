@@ -66,7 +66,10 @@ class Body:
         h = self.height
         forward, left, up = _axes(posture.yaw, posture.lean)
         ahead = _axes(posture.yaw, 0.0)[0]
-        poses = [_frame(posture.pelvis - 0.02 * h * up, forward, up), _frame(posture.pelvis + 0.05 * h * up, forward, up)]
+        poses = [
+            _frame(posture.pelvis - 0.02 * h * up, forward, up),
+            _frame(posture.pelvis + 0.05 * h * up, forward, up),
+        ]
         head_forward, _, head_up = _axes(posture.yaw, posture.lean * 0.4)
         poses.append(_frame(posture.pelvis + h * (_TORSO + _NECK) * up, head_forward, head_up))
         for side in (0, 1):
@@ -156,5 +159,3 @@ def _two_bones(root: Array, target: Array, first: float, second: float, bend: Ar
     side /= max(float(np.linalg.norm(side)), 1e-9)
     off = math.sqrt(max(first * first - along * along, 0))
     return root + along * direction + off * side, root + d * direction
-
-

@@ -52,7 +52,8 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         decorate(builder, rng, wall, windows=False, taken=spans)
 
     lights = tuple(
-        Light((px, py, height - 0.1), rng.uniform(1.5, 1.9), radius=0.3) for px, py in _lamp_places(x - width / 2, y - width / 2)
+        Light((px, py, height - 0.1), rng.uniform(1.5, 1.9), radius=0.3)
+        for px, py in _lamp_places(x - width / 2, y - width / 2)
     )
     landmarks = np.array(
         [

@@ -95,7 +95,9 @@ def hang(builder: Builder, wall: Wall, pattern: str, along: float, up: float, wi
     builder.surface("wall", moved(shape, wall.place(0.0, along, up)))
 
 
-def decorate(builder: Builder, rng: Rng, wall: Wall, *, windows: bool, taken: Sequence[tuple[float, float]] = ()) -> None:
+def decorate(
+    builder: Builder, rng: Rng, wall: Wall, *, windows: bool, taken: Sequence[tuple[float, float]] = ()
+) -> None:
     """Covers a wall with pictures and perhaps windows, except the spans `taken` (from, to) along it."""
     cursor = -wall.length / 2 + 0.3
     while True:
@@ -107,7 +109,15 @@ def decorate(builder: Builder, rng: Rng, wall: Wall, *, windows: bool, taken: Se
         span = (cursor, cursor + width)
         if all(span[1] < a or b < span[0] for a, b in taken):
             count = {"window": 2, "whiteboard": 2, "poster": 8}[kind]
-            hang(builder, wall, f"{kind}:{rng.integers(count)}", cursor + width / 2, rng.uniform(1.5, 1.72), width, height)
+            hang(
+                builder,
+                wall,
+                f"{kind}:{rng.integers(count)}",
+                cursor + width / 2,
+                rng.uniform(1.5, 1.72),
+                width,
+                height,
+            )
         cursor += width + rng.uniform(0.15, 0.7)
 
 
@@ -208,7 +218,9 @@ def put_desk(
     scatter(builder, rng, id, T, surface, wanted, taken=taken)
     if chair:
         seat, _ = furniture.chair(rng)
-        T_chair = T @ pose(depth / 2 + rng.uniform(0.2, 0.38), offset + rng.uniform(-0.1, 0.1), 0, math.pi + rng.uniform(-0.5, 0.5))
+        T_chair = T @ pose(
+            depth / 2 + rng.uniform(0.2, 0.38), offset + rng.uniform(-0.1, 0.1), 0, math.pi + rng.uniform(-0.5, 0.5)
+        )
         builder.put("chair", seat, T_chair, on=FLOOR)
     return Desk(id, T, surface)
 
@@ -267,7 +279,9 @@ def line_wall(
             names += ["shelf"] * 3 if room > 1.0 else []
             names += ["desk"] * 4 if room > 1.6 and depth >= 1.55 else []
             name = names[int(rng.integers(len(names)))]
-            width = {"shelf": min(room, rng.uniform(0.7, 1.4)), "desk": min(room, rng.uniform(1.2, 1.7))}.get(name, 0.55)
+            width = {"shelf": min(room, rng.uniform(0.7, 1.4)), "desk": min(room, rng.uniform(1.2, 1.7))}.get(
+                name, 0.55
+            )
             _stand(builder, rng, wall, name, cursor + width / 2, width, depth)
             cursor += width + rng.uniform(0.08, 0.45)
 

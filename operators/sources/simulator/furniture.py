@@ -165,7 +165,9 @@ def plant(rng: Rng, height: float) -> Shape:
     """A potted plant."""
     radius = height * rng.uniform(0.13, 0.19)
     pot_height = height * rng.uniform(0.22, 0.34)
-    pot = Material("plain", tone(rng, (0.0, 0.12), (0.1, 0.75), (0.35, 0.92)) if rng.uniform() < 0.7 else any_tone(rng), tile=0.3)
+    pot = Material(
+        "plain", tone(rng, (0.0, 0.12), (0.1, 0.75), (0.35, 0.92)) if rng.uniform() < 0.7 else any_tone(rng), tile=0.3
+    )
     soil = Material("carpet", (0.28, 0.2, 0.14), tile=0.2)
     shape = lathe([(0, 0), (radius * 0.7, 0), (radius, pot_height), (radius * 0.88, pot_height)], pot, segments=14)
     shape += lathe([(radius * 0.9, pot_height * 0.92), (0, pot_height * 0.95)], soil, segments=14)
@@ -183,7 +185,10 @@ def plant(rng: Rng, height: float) -> Shape:
         T[:3, 3] = [s * size / 2, 0, min(pot_height + reach + c * size / 2, height - c * size / 2)]
         stem = at(moved(leaf, T), yaw=turn)
         shape += stem
-    shape += at(bone((height - pot_height) * 0.6, 0.015, 0.008, Material("wood", (0.35, 0.3, 0.15), tile=0.3), segments=6), z=pot_height * 0.9)
+    shape += at(
+        bone((height - pot_height) * 0.6, 0.015, 0.008, Material("wood", (0.35, 0.3, 0.15), tile=0.3), segments=6),
+        z=pot_height * 0.9,
+    )
     return shape
 
 
@@ -198,7 +203,9 @@ def bin(rng: Rng) -> Shape:
         return shape + lathe([(radius * 0.93, height), (low, height * 0.25), (0, height * 0.25)], inner)
     shape = lathe([(0, 0), (radius, 0), (radius, height * 0.85)], body)
     lid = Material("plain", dark(rng), tile=0.3)
-    return shape + lathe([(radius * 1.04, height * 0.85), (radius, height * 0.93), (radius * 0.6, height), (0, height)], lid)
+    return shape + lathe(
+        [(radius * 1.04, height * 0.85), (radius, height * 0.93), (radius * 0.6, height), (0, height)], lid
+    )
 
 
 def floor_lamp(rng: Rng) -> Shape:
@@ -230,7 +237,12 @@ def rover(rng: Rng) -> Shape:
         r = rng.uniform(0.17, 0.22)
         h = rng.uniform(0.42, 0.62)
         shape = lathe([(0, 0.03), (r, 0.03), (r, 0.14), (r * 0.62, 0.2)], shell, segments=20)
-        shape += at(lathe([(r * 0.62, 0.0), (r * 0.5, h - 0.3), (r * 0.72, h - 0.2), (r * 0.6, h - 0.08), (0, h - 0.04)], shell), z=0.2)
+        shape += at(
+            lathe(
+                [(r * 0.62, 0.0), (r * 0.5, h - 0.3), (r * 0.72, h - 0.2), (r * 0.6, h - 0.08), (0, h - 0.04)], shell
+            ),
+            z=0.2,
+        )
         face = h + 0.04
         shape += box((0.03, r * 0.9, 0.07), eye, center=(r * 0.62, 0, face))
     else:

@@ -46,7 +46,9 @@ class Place:
     """(2,) where one stands before sitting down."""
 
 
-def set_place(builder: Builder, rng: Rng, table: int, T_table: Array, surface: Surface, along: float, sense: int) -> Place:
+def set_place(
+    builder: Builder, rng: Rng, table: int, T_table: Array, surface: Surface, along: float, sense: int
+) -> Place:
     """A swivel chair on the table's +x side at `along` (y), facing along y by `sense` (1 or -1), and a mug."""
     shape, seat = furniture.chair(rng, swivel=True)
     edge = surface.x + surface.half_x + 0.04
@@ -105,7 +107,9 @@ def add_desk_worker(builder: Builder, rng: Rng, wall: Wall, along: float, sense:
     return seat_person(builder, rng, place, path, timeline)
 
 
-def add_drinker(builder: Builder, rng: Rng, table: int, T_table: Array, surface: Surface, along: float, sense: int) -> int:
+def add_drinker(
+    builder: Builder, rng: Rng, table: int, T_table: Array, surface: Surface, along: float, sense: int
+) -> int:
     """A person who sits beside a table all the time and drinks now and then."""
     place = set_place(builder, rng, table, T_table, surface, along, sense)
     timeline = coffee_break(place.yaw, place.mug, phase=rng.uniform(0, 12))
@@ -123,7 +127,15 @@ def add_walker(builder: Builder, rng: Rng, path: Array) -> int:
 
 
 def add_ball(
-    builder: Builder, rng: Rng, a: Array, b: Array, *, radius: float, z: float = 0.0, on: int = FLOOR, seconds: float = 4.0
+    builder: Builder,
+    rng: Rng,
+    a: Array,
+    b: Array,
+    *,
+    radius: float,
+    z: float = 0.0,
+    on: int = FLOOR,
+    seconds: float = 4.0,
 ) -> int:
     """A ball that rolls between two points (2,)."""
     rolling = Rolling(a, b, radius, z=z, seconds=seconds, phase=rng.uniform(0, 10))
@@ -143,4 +155,3 @@ def add_rover(builder: Builder, rng: Rng, waypoints: Array, *, speed: float = 0.
     builder.relate(id, "on", FLOOR)
     builder.scripts.append(lambda t: driving.doing(id, t))
     return id
-

@@ -282,7 +282,9 @@ def person_doing(thing: int, person: Person, t: float) -> Doing:
 class Rolling:
     """A ball of a radius that rolls from a to b (2,) on the plane z, rests, and rolls back."""
 
-    def __init__(self, a: Array, b: Array, radius: float, *, z: float = 0.0, seconds: float = 4.0, phase: float = 0.0) -> None:
+    def __init__(
+        self, a: Array, b: Array, radius: float, *, z: float = 0.0, seconds: float = 4.0, phase: float = 0.0
+    ) -> None:
         self._a, self._b, self.radius, self._z = np.asarray(a, float), np.asarray(b, float), radius, z
         way = float(np.linalg.norm(self._b - self._a))
         self.timeline = Timeline(

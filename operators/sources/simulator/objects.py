@@ -39,12 +39,24 @@ def mug(rng: Rng) -> Shape:
 def bottle(rng: Rng) -> Shape:
     """A bottle with a label and a cap."""
     r, h = rng.uniform(0.03, 0.043), rng.uniform(0.2, 0.3)
-    glass = Material("plain", tone(rng, (0.25, 0.65), (0.2, 0.9), (0.3, 0.85)) if rng.uniform() < 0.7 else any_tone(rng), tile=0.2)
+    glass = Material(
+        "plain", tone(rng, (0.25, 0.65), (0.2, 0.9), (0.3, 0.85)) if rng.uniform() < 0.7 else any_tone(rng), tile=0.2
+    )
     label = Material(f"label:{rng.integers(4)}", tile=0)
     body = h * rng.uniform(0.52, 0.64)
     shape = lathe([(0, 0), (r, 0), (r, body * 0.25)], glass, segments=16)
     shape += lathe([(r * 1.01, body * 0.25), (r * 1.01, body * 0.85)], label, segments=16)
-    shape += lathe([(r, body * 0.85), (r, body), (r * 0.72, body + (h - body) * 0.35), (r * 0.36, body + (h - body) * 0.6), (r * 0.36, h * 0.93)], glass, segments=16)
+    shape += lathe(
+        [
+            (r, body * 0.85),
+            (r, body),
+            (r * 0.72, body + (h - body) * 0.35),
+            (r * 0.36, body + (h - body) * 0.6),
+            (r * 0.36, h * 0.93),
+        ],
+        glass,
+        segments=16,
+    )
     cap = Material("plain", any_tone(rng), tile=0.1)
     return shape + at(lathe([(r * 0.42, 0), (r * 0.42, h * 0.08), (0, h * 0.08)], cap, segments=12), z=h * 0.92)
 
@@ -79,7 +91,12 @@ def ball(rng: Rng, radius: float) -> Shape:
     """A ball about its middle."""
     striped = rng.uniform() < 0.6
     color = any_tone(rng) if not striped else tone(rng, (0, 1), (0, 0.5), (0.8, 1.0))
-    return ellipsoid(radius, radius, radius, Material("ball:%d" % rng.integers(4) if striped else "fabric", color, tile=0 if striped else 0.3))
+    return ellipsoid(
+        radius,
+        radius,
+        radius,
+        Material("ball:%d" % rng.integers(4) if striped else "fabric", color, tile=0 if striped else 0.3),
+    )
 
 
 def monitor(rng: Rng) -> Shape:

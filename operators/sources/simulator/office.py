@@ -66,7 +66,9 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     path = Trajectory(_loop(rng, a, b), speed=speed, hold=hold)
     _island(builder, rng, min(a, b) - 0.42)
     lights = tuple(
-        Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(1.7, 2.2)) for sx in (-1, 1) for sy in (-1, 1)
+        Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(1.7, 2.2))
+        for sx in (-1, 1)
+        for sy in (-1, 1)
     )
     landmarks = _landmarks(rng, walls)
     pitch = math.radians(rng.uniform(7, 11))

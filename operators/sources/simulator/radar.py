@@ -68,4 +68,3 @@ def _relative_velocity(stage: Stage, radar: Radar, t: float, points: Array, thin
             ends = [transform_points(mover.frame(t + dt), own) for dt in (-_STEP, _STEP)]
             velocity[things == k] += (ends[1] - ends[0]) / (2 * _STEP)
     return velocity
-

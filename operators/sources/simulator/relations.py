@@ -93,4 +93,3 @@ def spatial(pairs: list[tuple[int, int]], middles: dict[int, Array], T_world_bas
         else:
             relations.append(Relation(a, "in_front_of", b) if x < 0 else Relation(b, "in_front_of", a))
     return relations
-

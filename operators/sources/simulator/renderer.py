@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert, transform_points
 from operators.sources.simulator.classes import CLASS_IDS
 from operators.sources.simulator.native import open3d
-from operators.sources.simulator.scene import Light, Thing, World
+from operators.sources.simulator.scene import Light, World
 from operators.sources.simulator.shapes import Array, Patch
 from operators.sources.simulator.textures import LEVELS, SIZE, Atlas, make_atlas
 
@@ -265,7 +265,9 @@ class Renderer:
             )
             rays = np.empty((u.size, 6), np.float32)
             rays[:, :3] = T_world_camera[:3, 3]
-            local = np.stack([(u.ravel() - optics.cx) / optics.fx, (v.ravel() - optics.cy) / optics.fy, np.ones(u.size)])
+            local = np.stack(
+                [(u.ravel() - optics.cx) / optics.fx, (v.ravel() - optics.cy) / optics.fy, np.ones(u.size)]
+            )
             rays[:, 3:] = (R @ local.astype(np.float32)).T
             rays[:, :2] += _shift(np.array([k]))[0, :2].astype(np.float32)
             (still if self.world.things[k].still else moving).append((slot, rays, stride))
@@ -340,9 +342,7 @@ class Renderer:
             part = slice(start, start + _CHUNK)
             i = flat[part]
             b1, b2 = np.ascontiguousarray(w[part, 0]), np.ascontiguousarray(w[part, 1])
-            u, v = (
-                self._uv[k].take(i) + b1 * self._uv[k + 1].take(i) + b2 * self._uv[k + 2].take(i) for k in (0, 3)
-            )
+            u, v = (self._uv[k].take(i) + b1 * self._uv[k + 1].take(i) + b2 * self._uv[k + 2].take(i) for k in (0, 3))
             light = self._lights[0].take(i) + b1 * self._lights[1].take(i) + b2 * self._lights[2].take(i)
             footprint = np.minimum(z[part], 100) * focal * self._density.take(i) / np.sqrt(np.maximum(c[part], 0.08))
             level = np.clip(np.log2(np.maximum(footprint, 1)), 0, LEVELS - 1).astype(np.int32)

@@ -35,7 +35,9 @@ def ticks(sensor: str, rate: float, first_stamp: int, end_stamp: int) -> Iterato
 def merged(streams: Mapping[str, Iterator[Tick]]) -> Iterator[tuple[int, list[Tick]]]:
     """(stamp, the ticks at it): stamps strictly increase, ticks of one stamp keep the order of the mapping."""
     order = {name: k for k, name in enumerate(streams)}
-    ahead = [(tick.stamp, order[name], tick) for name, stream in streams.items() for tick in [next(stream, None)] if tick]
+    ahead = [
+        (tick.stamp, order[name], tick) for name, stream in streams.items() for tick in [next(stream, None)] if tick
+    ]
     heapq.heapify(ahead)
     while ahead:
         stamp, together = ahead[0][0], []

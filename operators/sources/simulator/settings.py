@@ -33,14 +33,20 @@ class ColorCamera(Sensor):
     width: int = Field(320, ge=16, le=4096, description="columns")
     height: int = Field(240, ge=16, le=4096, description="rows")
     focal: float = Field(0.85, gt=0.1, le=10, description="focal length as a share of the width")
-    mount: Mount | None = Field(None, description="place on the robot; the world's own (it looks where it should) if none")
+    mount: Mount | None = Field(
+        None, description="place on the robot; the world's own (it looks where it should) if none"
+    )
     output: Literal["raw", "jpeg", "both"] = Field("raw", description="ports that it feeds: image, image_jpeg or both")
     jpeg_quality: int = Field(88, ge=1, le=100, description="of image_jpeg")
     exposure: float = Field(1.0, gt=0, description="brightness")
     exposure_change: float = Field(0.06, ge=0, lt=1, description="how far brightness swings about its mean, slowly")
     read_noise: float = Field(1.2, ge=0, description="standard deviation in the dark, of 255")
-    shot_noise: float = Field(0.08, ge=0, description="standard deviation at brightness b is this times sqrt(b), of 255")
-    shutter: Duration = Field(0, description="how long the shutter is open: motion blur by the robot's turning; 0 for none")
+    shot_noise: float = Field(
+        0.08, ge=0, description="standard deviation at brightness b is this times sqrt(b), of 255"
+    )
+    shutter: Duration = Field(
+        0, description="how long the shutter is open: motion blur by the robot's turning; 0 for none"
+    )
     black: float = Field(0.0, ge=0, le=1, description="probability of a black frame")
 
 
@@ -77,7 +83,9 @@ class StereoRig(Sensor):
     color: bool = Field(False, description="RGB instead of grey")
     exposure: float = Field(1.0, gt=0, description="brightness")
     read_noise: float = Field(1.5, ge=0, description="standard deviation in the dark, of 255")
-    shot_noise: float = Field(0.08, ge=0, description="standard deviation at brightness b is this times sqrt(b), of 255")
+    shot_noise: float = Field(
+        0.08, ge=0, description="standard deviation at brightness b is this times sqrt(b), of 255"
+    )
     black: float = Field(0.0, ge=0, le=1, description="probability of black frames")
 
 
@@ -97,7 +105,9 @@ class Lidar(Sensor):
         0.00390625, ge=0, description="coordinates are rounded to this, metres (1/256 packs well); 0 for not at all"
     )
     missing: float = Field(0.01, ge=0, le=1, description="probability that a beam has no return")
-    motion: bool = Field(False, description="the robot moves on during the sweep; the points say when each was measured")
+    motion: bool = Field(
+        False, description="the robot moves on during the sweep; the points say when each was measured"
+    )
 
 
 class Inertial(Sensor):
@@ -119,8 +129,12 @@ class Wheels(Sensor):
     radius: float = Field(0.08, gt=0, description="of a wheel, metres")
     track: float = Field(0.4, gt=0, description="distance between the wheels, metres")
     ticks_per_turn: int = Field(2048, ge=1, description="encoder counts a turn of the wheel")
-    scale_error: float = Field(0.01, ge=0, lt=0.5, description="standard deviation of each wheel's constant scale error")
-    slip: float = Field(0.006, ge=0, description="standard deviation of a wheel's error after 1 m; grows with √distance")
+    scale_error: float = Field(
+        0.01, ge=0, lt=0.5, description="standard deviation of each wheel's constant scale error"
+    )
+    slip: float = Field(
+        0.006, ge=0, description="standard deviation of a wheel's error after 1 m; grows with √distance"
+    )
 
 
 class Radar(Sensor):
@@ -175,4 +189,6 @@ class Truth(BaseModel):
     activities: float = Field(5.0, ge=0, le=100, description="true activities a second")
     min_pixels: int = Field(12, ge=1, description="objects with fewer visible pixels have no box")
     visible_share: bool = Field(True, description="work out how much of each object is hidden; costs a few ms an image")
-    spatial: bool = Field(True, description="add near, left_of and in_front_of to the relations of placement and contact")
+    spatial: bool = Field(
+        True, description="add near, left_of and in_front_of to the relations of placement and contact"
+    )

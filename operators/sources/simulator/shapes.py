@@ -76,7 +76,9 @@ def bounds(shape: Shape) -> tuple[Array, Array]:
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def sheet(corner: Sequence[float], along: Sequence[float], up: Sequence[float], material: Material, cell: float) -> Patch:
+def sheet(
+    corner: Sequence[float], along: Sequence[float], up: Sequence[float], material: Material, cell: float
+) -> Patch:
     """A rectangle from `corner` along two perpendicular edge vectors, divided into cells of at most `cell`.
 
     Its normal is along × up.
@@ -190,7 +192,9 @@ def ellipsoid(rx: float, ry: float, rz: float, material: Material, *, segments: 
         largest = max(rx, ry, rz)
         uvs = np.stack(
             [
-                ball.uvs[:, 0] * max(1.0, round(2 * math.pi * largest / material.tile)) / max(ball.uvs[:, 0].max(), 1e-9),
+                ball.uvs[:, 0]
+                * max(1.0, round(2 * math.pi * largest / material.tile))
+                / max(ball.uvs[:, 0].max(), 1e-9),
                 np.arcsin(np.clip(unit[:, 2], -1, 1)) * largest / material.tile,
             ],
             axis=1,

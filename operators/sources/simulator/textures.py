@@ -50,7 +50,9 @@ def make_atlas(names: Sequence[str], seed: int) -> Atlas:
     origins = np.zeros((len(names), 2), np.float32)
     for k, name in enumerate(names):
         x, y = (k % _PER_ROW) * _CELL, (k // _PER_ROW) * _CELL
-        padded = np.pad(np.rint(draw(name, seed)).astype(np.uint8), ((BORDER, BORDER), (BORDER, BORDER), (0, 0)), mode="wrap")
+        padded = np.pad(
+            np.rint(draw(name, seed)).astype(np.uint8), ((BORDER, BORDER), (BORDER, BORDER), (0, 0)), mode="wrap"
+        )
         base[y : y + _CELL, x : x + _CELL] = padded
         origins[k] = x + BORDER, y + BORDER
     height, width = base.shape[:2]
@@ -110,7 +112,9 @@ def _bright(rng: Rng) -> NDArray[np.float64]:
     return np.asarray((0.25 + 0.7 * rgb * rng.uniform(0.6, 1)) * rng.uniform(150, 255))
 
 
-def _lines(rng: Rng, canvas: Pixels, x: float, y: float, w: float, h: float, pitch: int, color: Sequence[float]) -> None:
+def _lines(
+    rng: Rng, canvas: Pixels, x: float, y: float, w: float, h: float, pitch: int, color: Sequence[float]
+) -> None:
     """Rows of words."""
     row = y
     while row + pitch * 0.6 < y + h:

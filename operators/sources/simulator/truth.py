@@ -105,7 +105,9 @@ def velocity(thing: Thing, t: float) -> Array:
 
 def masks(view: View, stamp: int, frame: str) -> SegmentationMap:
     """Class and instance of every pixel; surfaces (floor, walls, ceiling) have classes but no instances."""
-    return SegmentationMap(stamp=stamp, frame=frame, class_names=CLASSES, classes=view.classes, instances=view.instances)
+    return SegmentationMap(
+        stamp=stamp, frame=frame, class_names=CLASSES, classes=view.classes, instances=view.instances
+    )
 
 
 def base_state(path: Trajectory, t: float, stamp: int, world_frame: str, base_frame: str) -> Odometry:

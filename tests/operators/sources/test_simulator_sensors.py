@@ -204,7 +204,11 @@ def test_geodetic_coordinates_return_to_the_same_place(
         lat, lon = math.radians(lat), math.radians(lon)
         n = a / math.sqrt(1 - e2 * math.sin(lat) ** 2)
         return np.array(
-            [(n + h) * math.cos(lat) * math.cos(lon), (n + h) * math.cos(lat) * math.sin(lon), (n * (1 - e2) + h) * math.sin(lat)]
+            [
+                (n + h) * math.cos(lat) * math.cos(lon),
+                (n + h) * math.cos(lat) * math.sin(lon),
+                (n * (1 - e2) + h) * math.sin(lat),
+            ]
         )
 
     found = ecef(*geodetic(np.array(enu), latitude, longitude, altitude))

@@ -130,9 +130,7 @@ def simple_world(*places: tuple[float, float]) -> World:
         builder.put("box", box((0.4, 0.4, 0.4), stuff, center=(0, 0, 0)), pose(x, y, 1.0), on=FLOOR)
     angle = np.arange(8) * np.pi / 4
     path = Trajectory(np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    return World(
-        "test", tuple(builder.things), (Light((0, 0, 2), 1.0),), 0.5, path, np.zeros((0, 3)), (0,) * 6, ()
-    )
+    return World("test", tuple(builder.things), (Light((0, 0, 2), 1.0),), 0.5, path, np.zeros((0, 3)), (0,) * 6, ())
 
 
 LOOKING = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.0], [0, 0, 0, 1.0]])
@@ -220,7 +218,9 @@ def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
             assert ("sitting_on" in words) != ("on" in words)
             assert ("sitting_on" in words) == (doing.activity in ("sitting", "reaching", "drinking"))
             assert ("holding" in words) == (doing.activity == "drinking")
-            mug = next((r.subject for r in world.relations(t) if r.predicate == "on" and r.subject == doing.object), None)
+            mug = next(
+                (r.subject for r in world.relations(t) if r.predicate == "on" and r.subject == doing.object), None
+            )
             if "holding" in words:
                 (held,) = (o for word, o in here if word == "holding")
                 assert mug is None
