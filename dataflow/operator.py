@@ -135,8 +135,13 @@ def Param(
     max_length: int | None = None,
     pattern: str | None = None,
     unit: str = "",
+    live: bool = False,
 ) -> Any:
-    """Declares a parameter with its default, bounds and documentation. Without a default it must be given."""
+    """Declares a parameter with its default, bounds and documentation. Without a default it must be given.
+
+    `live`: it may be changed while the graph runs (`dataflow param set`): `process()` reads `self.<name>` anew each
+    time, or `on_parameter` does what else is needed.
+    """
     info = pydantic.Field(
         default,
         description=doc,
@@ -147,7 +152,7 @@ def Param(
         min_length=min_length,
         max_length=max_length,
         pattern=pattern,
-        json_schema_extra={"unit": unit} if unit else None,
+        json_schema_extra={**({"unit": unit} if unit else {}), **({"live": True} if live else {})} or None,
     )
     assert isinstance(info, FieldInfo)
     return info
@@ -235,6 +240,8 @@ class Operator:
     """
 
     spec: ClassVar[OperatorSpec]
+    stateless: ClassVar[bool] = False
+    """What `process()` gives depends on its inputs alone, so re-execution may begin anywhere."""
     external: ClassVar[bool] = False
     """Touches the world (an actuator, a network service): always recorded, never re-executed."""
 
@@ -288,7 +295,37 @@ class Operator:
         """Releases resources. Always called, also after a failure."""
 
     def on_reset(self, input: str) -> None:
-        """A stream of `input` began a new incarnation: its clock jumped back or its source was restarted."""
+        """The clock behind `input` jumped back: the stamps to come are earlier than those before."""
+
+    def on_parameter(self, name: str) -> None:
+        """A `live` parameter was changed between two firings; `self.<name>` holds the new value."""
+
+    def snapshot(self) -> Mapping[str, Any] | None:
+        """The state, such that `restore` of it in a fresh operator goes on alike; None where there is no such thing.
+
+        Values: numbers, strings, bytes, None, numpy arrays, and lists and mappings (with string keys) of these. Called
+        between firings of a recorded run whose graph asks for snapshots.
+        """
+        return None
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Takes over a state that `snapshot` gave. Called once, after `setup()`."""
+        raise NotImplementedError(f"{type(self).__name__} gives snapshots but cannot restore them")
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        """Changes a `live` parameter; returns the value as validated. Raises `ParameterError`."""
+        cls = type(self)
+        fields = cls.spec.parameters.model_fields
+        able = [n for n, field in fields.items() if is_live(field)]
+        which = f"; those that can: {', '.join(able)}" if able else "; none of its parameters can"
+        if name in fields and name not in able:
+            raise ParameterError(f"{cls.__name__}.{name} cannot change while the graph runs{which}")
+        if name not in fields:
+            raise ParameterError(f"{cls.__name__} has no parameter {name!r}{which.replace('can', 'can change', 1)}")
+        self.params = validate_parameters(cls, {**self.params.model_dump(), name: value})
+        setattr(self, name, getattr(self.params, name))
+        self.on_parameter(name)
+        return getattr(self, name)
 
     def summary(self) -> Mapping[str, float | int | str]:
         """Figures to show at the end of a run (metrics sinks); read after `finish()`."""
@@ -323,6 +360,11 @@ class Source(Operator, abstract=True):
     def length(self) -> int | None:
         """How many times `stream()` will yield, if known: for progress bars."""
         return None
+
+
+def is_live(field: FieldInfo) -> bool:
+    """Whether a parameter may be changed while the graph runs."""
+    return isinstance(field.json_schema_extra, dict) and bool(field.json_schema_extra.get("live"))
 
 
 def is_source(cls: type[Operator]) -> bool:

@@ -21,7 +21,7 @@ from dataflow.cli.arguments import (
     span,
     window,
 )
-from dataflow.cli.output import INTERRUPTED, err, fail, friendly_errors, out, print_json, say, size
+from dataflow.cli.output import DIFFERENT, INTERRUPTED, err, fail, friendly_errors, out, print_json, say, size
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
@@ -117,6 +117,13 @@ def run(
     rate: Rate = None,
     live: Live = False,
     paranoid: Paranoid = False,
+    chaos: Annotated[
+        Path | None,
+        typer.Option("--chaos", metavar="PLAN.yaml", help="Let the faults of a plan happen; implies --live."),
+    ] = None,
+    chaos_seed: Annotated[
+        int | None, typer.Option("--chaos-seed", metavar="N", help="Another seed than the plan's own.")
+    ] = None,
     quiet: Quiet = False,
     one_host: OneHost = False,
     host_each: HostEach = False,
@@ -140,14 +147,21 @@ def run(
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
+      dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml --chaos-seed 7 --record chaos.mcap
     """
     from dataflow.graph import load_graph
+    from dataflow.runtime.chaos import load_plan
     from dataflow.runtime.execute import run as run_graph
 
     with friendly_errors():
+        if chaos_seed is not None and chaos is None:
+            raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+        live = live or chaos is not None
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
         outputs = _outputs(record, view, open_view, overwrite)
         options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid) | {"live": live}
+        if chaos is not None:
+            options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
         _execute(lambda watch: run_graph(loaded, watch=watch, **options), loaded, outputs, None, json=json, quiet=quiet)
 
 
@@ -169,6 +183,15 @@ def replay(
     record: Record = None,
     view: View = None,
     open_view: Open = False,
+    complete: Annotated[
+        Path | None,
+        typer.Option(
+            "--complete",
+            metavar="FILE.mcap",
+            rich_help_panel=_OUTPUT,
+            help="Compute what a thin recording leaves out, by its firing records, and write the complete recording.",
+        ),
+    ] = None,
     overwrite: Replace = False,
     json: Json = False,
 ) -> None:
@@ -177,12 +200,25 @@ def replay(
     Recorded streams replace the sources; everything else runs again, with identical results. Compare two recordings of
     it with `dataflow diff`.
 
+    With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
+    nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded
+    digest. Where one comes out otherwise, nothing is written and the exit code is 1; also 1 where firings could not be
+    repeated, and what they made is missing.
+
+    Exit codes:
+
+      0    it ran to its end
+      1    an operator failed; or --complete: not as recorded, or not wholly
+      2    could not run: a wrong option, a recording that lacks what is needed
+      130  interrupted with Ctrl-C
+
     Examples:
 
       dataflow replay run.mcap
       dataflow replay run.mcap --start 5 --end 10 --rate 1 --view spawn
       dataflow replay run.mcap --graph other.yaml --set cloud.stride=8
       dataflow replay run.mcap --record again.mcap --view again.rrd --open
+      dataflow replay thin.mcap --complete full.mcap
     """
     from dataflow.graph import load_graph
     from dataflow.recording import Recording
@@ -200,6 +236,15 @@ def replay(
                 loaded = recorded_graph(opened)
             else:
                 loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+            if complete is not None:
+                alone = (start, end, rate, record, view, place) == (None,) * 6
+                if not alone or open_view or one_host or host_each or paranoid:
+                    raise fail(
+                        "--complete repeats a run as it was, in one process: of the other options only --graph, "
+                        "--set, --overwrite, --quiet and --json go with it"
+                    )
+                _complete(recording, loaded, complete, overwrite=overwrite, json=json, quiet=quiet)
+                return
             whole = span(opened, plan_replay(opened, loaded).streams)
             begin, finish = window(whole, start, end, recording)
         outputs = _outputs(record, view, open_view, overwrite)
@@ -215,6 +260,24 @@ def replay(
             json=json,
             quiet=quiet,
         )
+
+
+def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:
+    from dataflow.cli.progress import RunDisplay, shown
+    from dataflow.cli.verdicts import print_completion
+    from dataflow.runtime.completion import complete
+
+    if file.exists() and file.samefile(recording):
+        raise fail(f"--complete {file} is the recording that is to be completed; name another file")
+    output_file(file, ".mcap", overwrite=overwrite, option="--complete")
+    with shown(err, RunDisplay(err), quiet=quiet) as watch:
+        made = complete(recording, file, graph=graph, overwrite=overwrite, watch=watch)
+    if json:
+        print_json(made.as_json())
+    else:
+        print_completion(out, made)
+    if not made.whole:
+        raise typer.Exit(DIFFERENT)
 
 
 def _outputs(record: Path | None, view: str | None, open_view: bool, overwrite: bool) -> _Outputs:

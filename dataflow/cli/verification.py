@@ -1,4 +1,4 @@
-"""`dataflow verify`: is this recording what the code makes of it?"""
+"""`dataflow verify`: are these recordings what the code makes of them?"""
 
 from __future__ import annotations
 
@@ -6,32 +6,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.text import Text
 
-from dataflow.cli.arguments import Json, RecordingFile, Settings, existing
+from dataflow.cli.arguments import FLAG, Json, Settings, existing, output_file
 from dataflow.cli.execution import HostEach, OneHost, Quiet
-from dataflow.cli.output import (
-    DIFFERENT,
-    count,
-    err,
-    fail,
-    friendly_errors,
-    out,
-    plural,
-    print_json,
-    seconds,
-    table,
-)
+from dataflow.cli.output import COULD_NOT_RUN, DIFFERENT, err, fail, friendly_errors, out, print_json, say
 
 if TYPE_CHECKING:
-    from dataflow.runtime.reexecute import Verification
+    from collections.abc import Callable
+
+    from dataflow.runtime.gate import Baseline, Checked
     from dataflow.runtime.verify import VerifyReport
 
-_STYLE = {"identical": "green", "culprit": "bold red", "downstream": "yellow", "unverifiable": "yellow"}
+_GATE = "Regression gate"
 
 
 def verify(
-    recording: RecordingFile,
+    recordings: Annotated[
+        list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (.mcap), or folders of them.")
+    ],
     graph: Annotated[
         Path | None,
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
@@ -41,81 +33,176 @@ def verify(
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
     ] = None,
     only: Annotated[str | None, typer.Option("--only", metavar="OPERATOR", help="Only this operator.")] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            "--tolerance",
+            metavar="T",
+            help="Let floating-point values differ by up to T, absolutely, when operators are given the recorded "
+            "inputs. Reported as within tolerance, never as identical.",
+        ),
+    ] = None,
+    baseline: Annotated[
+        Path | None,
+        typer.Option(
+            "--baseline",
+            metavar="FILE.json",
+            rich_help_panel=_GATE,
+            help="Outcomes that are accepted although they are not what was recorded.",
+        ),
+    ] = None,
+    accept: Annotated[
+        bool,
+        typer.Option(
+            "--accept", metavar=FLAG, rich_help_panel=_GATE, help="Write what differs now into the --baseline file."
+        ),
+    ] = False,
+    junit: Annotated[
+        Path | None,
+        typer.Option(
+            "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
+        ),
+    ] = None,
     quiet: Quiet = False,
     one_host: OneHost = False,
     host_each: HostEach = False,
     json: Json = False,
 ) -> None:
-    """Re-execute a recorded run by its firing records, and compare every output.
+    """Re-execute recorded runs by their firing records, and compare every output.
 
     Outputs are compared digest by digest. Where they differ, the culprit (same inputs, other output) is told from what
-    only follows from it. Exit code 0: identical; 1: different, or not wholly verifiable; 2: could not run.
+    only follows from it, and run once more: to say which field differs, and whether it differs alike each time.
+
+    Of a folder, every .mcap in it is verified, at any depth; one that cannot be read does not keep the others from it.
+
+    Exit codes:
+
+      0    identical; or all differences lie within --tolerance, or are those that --baseline accepts
+      1    different, or not wholly verifiable
+      2    could not run: no recording, a faulty one (even if others passed), an operator that fails to start
+      130  interrupted with Ctrl-C
 
     Examples:
 
       dataflow verify run.mcap
       dataflow verify run.mcap --only odometry --json
       dataflow verify run.mcap --from odometry --graph changed.yaml
+      dataflow verify run.mcap --tolerance 1e-5
+      dataflow verify recordings --junit verify.xml
+      dataflow verify recordings --baseline recordings/accepted.json --accept
     """
-    from dataflow.cli.progress import RunDisplay, shown
     from dataflow.graph import load_graph
-    from dataflow.runtime.verify import verify as verify_recording
+    from dataflow.runtime.gate import Baseline, BaselineError, recordings_in
 
     with friendly_errors():
-        existing(recording, "a recording")
         if one_host and host_each:
             raise fail("--one-host and --host-each exclude each other")
         if first is not None and only is not None:
             raise fail("--from and --only exclude each other")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
+        if tolerance is not None and not 0 <= tolerance < float("inf"):
+            raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
+        if accept and baseline is None:
+            raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
+        if accept and (first is not None or only is not None):
+            raise fail("--accept takes whole recordings: leave --from and --only out")
+        for target in recordings:
+            if not target.is_dir():
+                existing(target, "a recording")
+        if junit is not None:
+            output_file(junit, ".xml", overwrite=True, option="--junit")
+        if baseline is not None:
+            output_file(baseline, ".json", overwrite=True, option="--baseline")
+        try:
+            known = None if baseline is None else Baseline.load(baseline)
+        except BaselineError as error:
+            raise fail(str(error)) from None
         loaded = None if graph is None else load_graph(existing(graph, "a graph file"), settings=settings or ())
-        placement: Any = "one_host" if one_host else "host_each" if host_each else "graph"
+        options: dict[str, Any] = {
+            "graph": loaded,
+            "first": first,
+            "only": only,
+            "tolerance": tolerance,
+            "placement": "one_host" if one_host else "host_each" if host_each else "graph",
+        }
+        single = len(recordings) == 1 and not recordings[0].is_dir()
+        checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)
+        _report(checked, single=single, json=json, junit=junit)
+        if known is not None:
+            _mind_baseline(known, checked, accept=accept, whole=not single)
+    raise typer.Exit(_exit_code(checked, known if accept else None))
+
+
+def _check(
+    targets: list[tuple[Path, str]], known: Baseline | None, options: dict[str, Any], *, quiet: bool, single: bool
+) -> list[Checked]:
+    from dataflow.runtime.gate import check
+
+    checked = []
+    for number, (path, name) in enumerate(targets, start=1):
+        if not quiet and not single:
+            say(f"[dim]{number} of {len(targets)}: {name}[/]")
+        accepted = {} if known is None else known.of(path)
+        checked.append(check(path, name, _verifier(options, quiet=quiet), accepted))
+    return checked
+
+
+def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], VerifyReport]:
+    from dataflow.cli.progress import RunDisplay, shown
+    from dataflow.runtime.verify import verify as verify_recording
+
+    def verifier(path: Path) -> VerifyReport:
         with shown(err, RunDisplay(err), quiet=quiet) as watch:
-            report = verify_recording(recording, graph=loaded, first=first, only=only, watch=watch, placement=placement)
-    if json:
-        print_json(report.as_json())
+            return verify_recording(path, watch=watch, **options)
+
+    return verifier
+
+
+def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | None) -> None:
+    from dataflow.cli.verdicts import explain, print_many, print_one
+
+    if junit is not None:
+        from dataflow.cli.junit import write_junit
+
+        write_junit(junit, checked, explain)
+    if single and checked[0].report is None:
+        fail(checked[0].error, details=checked[0].details)
+    elif single and json:
+        print_json(checked[0].as_json())
+    elif single:
+        print_one(out, checked[0])
+    elif json:
+        print_json({"passed": all(c.passed for c in checked), "recordings": [c.as_json() for c in checked]})
     else:
-        _print(report)
-    if not report.identical:
-        raise typer.Exit(DIFFERENT)
+        print_many(out, checked)
 
 
-def _print(report: VerifyReport) -> None:
-    numbers = ("firings", "repeated", "outputs", "differing")
-    verdicts = table("operator", *numbers, "verdict", right=numbers)
-    for v in report.operators:
-        cells = (count(n) for n in (v.firings, v.verified, v.outputs, v.differing))
-        verdicts.add_row(Text(v.operator), *cells, Text(v.verdict, style=_STYLE[v.verdict]))
-    out.print(verdicts)
-    for v in report.operators:
-        for line in _remarks(v):
-            out.print(Text(line), soft_wrap=True)
-    if not report.identical:
-        for fact, then, now in report.facts:
-            out.print(Text(f"{fact}: {then} when recorded, {now} here", style="dim"), soft_wrap=True)
-    pace = f", {seconds(report.span)} of event time in {seconds(report.wall)}" if report.wall and report.span else ""
-    if report.identical:
-        what = f"{plural(report.messages, 'message')} of {plural(report.streams, 'stream')}"
-        out.print(Text.assemble(("identical", "green"), f": {what}{pace}"))
-    elif report.culprits:
-        out.print(Text.assemble(("different", "bold red"), f": look at {', '.join(report.culprits)}{pace}"))
-    else:
-        out.print(Text.assemble(("not wholly verified", "yellow"), pace))
+def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, whole: bool) -> None:
+    """Says what the baseline names in vain; with `accept`, takes over what differs and says what that is."""
+    if not accept:
+        if whole and (unused := known.unused(checked)):
+            say(f"[yellow]note:[/] {known.file} names recordings that were not verified: {', '.join(unused)}")
+        return
+    news = []
+    for one in checked:
+        if one.report is None:
+            continue
+        changed, refused = known.accept(one)
+        news += [f"{one.name}: {name}" for name in changed]
+        for name in refused:
+            say(
+                f"[yellow]not accepted:[/] {one.name}: {name} (not wholly verifiable, or other each time: "
+                "it could not be recognised again)"
+            )
+    known.save()
+    say(f"accepted into {known.file}: " + ("; ".join(news) if news else "nothing new"))
 
 
-def _remarks(v: Verification) -> list[str]:
-    """What there is to say about one operator, besides its row."""
-    lines = []
-    if v.first is not None:
-        d = v.first
-        port = f" port {d.port}" if d.port else ""
-        lines.append(f"{v.operator}: first difference in firing {d.index} ({d.kind}) at stamp {d.stamp}{port}")
-        lines += [f"  recorded  {d.expected}", f"  here      {d.got}"]
-    if v.unverifiable:
-        what = plural(v.unverifiable, "firing")
-        lines.append(f"{v.operator}: {what} could not be repeated (missing {v.missing or 'input'})")
-    if v.after_cut:
-        lines.append(f"{v.operator}: {plural(v.after_cut, 'message')} after its last record")
-    lines += [f"{v.operator}: file {file} is not the one that was read then" for file in v.files_changed]
-    return lines
+def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
+    if any(c.report is None for c in checked):
+        return COULD_NOT_RUN
+    if accepted is None:
+        return 0 if all(c.passed for c in checked) else DIFFERENT
+    left = [j for c in checked for j in c.judged if not j.passed and accepted.of(c.path).get(j.operator) != j.outcome]
+    return DIFFERENT if left else 0

@@ -105,7 +105,7 @@ def _modules(root: str, failures: list[Failure]) -> Iterator[Any]:
 def _import(name: str, failures: list[Failure]) -> Any:
     try:
         return importlib.import_module(name)
-    except Exception as error:  # a module may fail in any way when it runs
+    except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
         failures.append(Failure(name, f"{type(error).__name__}: {error}"))
         return None
 

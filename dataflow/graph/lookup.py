@@ -70,7 +70,7 @@ def import_module(name: str) -> ModuleType | NotFound:
             return NotFound(f"no module {name!r}: {parent!r} is a single module", "")
         unknown_place = "is its package installed, or its folder on the path?"
         return NotFound(f"no module {name!r}", _nearest_module(last, parent) or unknown_place)
-    except Exception as error:  # the module's own code may fail in any way
+    except (Exception, SystemExit) as error:  # the module's own code may fail in any way
         return NotFound(f"module {name!r} fails to import: {type(error).__name__}: {error}", _where(error, name))
 
 

@@ -29,7 +29,7 @@ def import_operator(use: str) -> type[Operator]:
     module_name, _, name = use.partition(":")
     try:
         module = sys.modules.get(module_name) or importlib.import_module(module_name)
-    except Exception as error:  # a module may fail in any way when it runs
+    except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
         raise OperatorImportError(f"cannot import {module_name!r}: {type(error).__name__}: {error}") from error
     found = getattr(module, name, None)
     if not (isinstance(found, type) and issubclass(found, Operator)):
@@ -139,10 +139,14 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Which streams a recording holds. `thin`: not all of them; firing records are always written."""
+    """Which streams a recording holds. `thin`: not all of them; firing records are always written.
+
+    `snapshots`: nanoseconds of event time between two snapshots of an operator's state; None for none.
+    """
 
     streams: tuple[str, ...]
     thin: bool = False
+    snapshots: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,7 +259,7 @@ class Graph:
             nodes={node.name: node for node in nodes},
             streams={stream.name: stream for stream in streams},
             aliases=dict(data["aliases"]),
-            record=Record(tuple(data["record"]["streams"]), data["record"]["thin"]),
+            record=Record(**{**data["record"], "streams": tuple(data["record"]["streams"])}),
             view=View(tuple(data["view"]["hide"])),
             network=Network(
                 **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},

@@ -359,7 +359,7 @@ class Resolver:
                 )
 
     def fed_by_devices(self, wired: Iterable[_Wired]) -> set[str]:
-        """Names of the operators that have a source that cannot wait (`Source.live`, or all in a live run) somewhere upstream."""
+        """Names of the operators that have a source upstream that cannot wait (`Source.live`; in a live run, any)."""
         downstream: dict[str, list[str]] = {}
         reached: list[str] = []
         for w in wired:
@@ -431,14 +431,17 @@ class Resolver:
         if isinstance(tree, Leaf):
             self.fields.wrong(tree, "record", "'all' or a mapping with 'topics' or 'exclude'")
             return Record(everything)
-        table = self.fields.table(tree, "record", ("topics", "exclude"))
+        table = self.fields.table(tree, "record", ("topics", "exclude", "snapshots"))
         if table is None:
             return Record(everything)
         kept = set(everything if table.get("topics") is None else self.topics(table.get("topics"), "record"))
         kept -= set(self.topics(table.get("exclude"), "exclude"))
         external = {d.name for d in drafts if d.cls.external}
         kept |= {name for name, stream in self.streams.items() if stream.node in external}
-        return Record(tuple(sorted(kept)), thin=len(kept) < len(everything))
+        snapshots = self.fields.duration(table.get("snapshots"), "snapshots")
+        if snapshots == 0:
+            self.problems.add(table.get("snapshots").place, "snapshots must be further apart than 0")  # type: ignore[union-attr]
+        return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots)
 
     def view(self, tree: Tree | None) -> View:
         table = self.fields.table(tree, "view", ("hide",))

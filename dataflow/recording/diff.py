@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from rich.table import Table
 from rich.text import Text
 
@@ -23,13 +24,27 @@ class FieldDifference:
     """One field that differs in the messages of one stamp.
 
     `detail` says how, for people; `max_difference` is the largest absolute difference where both sides are numbers of
-    one shape (infinite where one is NaN or infinite and the other is not the same), else None.
+    one shape (infinite where one is NaN or infinite and the other is not the same), else None. In arrays of one shape
+    `index` is the first element that differs, `count` how many of `size` do. `a` and `b` are the two values there, as
+    JSON values: text where JSON has no word for them.
     """
 
     stamp: int
     field: str
     detail: str
     max_difference: float | None
+    index: tuple[int, ...] | None = None
+    count: int = 1
+    size: int = 1
+    a: str | int | float | bool | None = None
+    b: str | int | float | bool | None = None
+
+    def as_json(self) -> dict[str, Any]:
+        """JSON values; an infinite difference is the string "Infinity"."""
+        value = asdict(self)
+        value["max_difference"] = _plain(self.max_difference)
+        value["index"] = None if self.index is None else list(self.index)
+        return value
 
 
 @dataclass(slots=True)
@@ -67,12 +82,15 @@ class DiffReport:
 
     def as_json(self) -> dict[str, Any]:
         """The report as JSON values; an infinite difference is the string "Infinity"."""
-        value = {"same": self.same} | asdict(self)
-        for stream in value["streams"]:
-            for holder in (stream, stream["first"] or {}):
-                if holder.get("max_difference") == np.inf:
-                    holder["max_difference"] = "Infinity"
-        return value
+        streams = [
+            asdict(s)
+            | {
+                "max_difference": _plain(s.max_difference),
+                "first": None if s.first is None else s.first.as_json(),
+            }
+            for s in self.streams
+        ]
+        return {"same": self.same, "a": self.a, "b": self.b, "tolerance": self.tolerance, "streams": streams}
 
     def table(self) -> Table:
         """One line a stream."""
@@ -95,7 +113,8 @@ class DiffReport:
 def diff(
     a: Recording, b: Recording, *, streams: Sequence[str] | None = None, tolerance: float | None = None
 ) -> DiffReport:
-    """Compares the decoded messages of two recordings; `streams` limits it to those named.
+    """Compares the decoded messages of two recordings; `streams` limits it to those named, else the runtime's own
+    streams (diagnostics: facts of one run) are left out.
 
     Without `tolerance` messages are the same when their digests are. With it, numbers may differ by at most that much,
     absolutely, element by element, and NaN equals NaN; integers, strings and shapes must still be equal. Messages are
@@ -105,7 +124,10 @@ def diff(
     """
     if tolerance is not None and not 0 <= tolerance < np.inf:
         raise RecordingError(f"tolerance must be a finite number ≥ 0, got {tolerance}")
-    names = sorted({*a.streams, *b.streams}) if streams is None else list(dict.fromkeys(streams))
+    if streams is None:
+        names = sorted(name for name in {*a.streams, *b.streams} if "/@/" not in name)
+    else:
+        names = list(dict.fromkeys(streams))
     report = DiffReport(str(a.path), str(b.path), tolerance)
     for name in names:
         in_a, in_b = a.streams.get(name), b.streams.get(name)
@@ -134,12 +156,11 @@ def _compare_messages(result: StreamDiff, a: Recording, b: Recording, tolerance:
         if in_a is None or in_b is None:
             _count_missing(result, in_a, in_b)
         elif in_a.message.digest() != in_b.message.digest():
-            first: FieldDifference | None = None
-            for found in _differences(in_a.message, in_b.message, tolerance, result):
-                first = first or found
-            if first is not None:
+            found, largest = differences(in_a.message, in_b.message, tolerance)
+            result.max_difference = max(result.max_difference, largest)
+            if found:
                 result.differing += 1
-                result.first = result.first or first
+                result.first = result.first or found[0]
 
 
 def _paired(a: Iterator[Recorded], b: Iterator[Recorded]) -> Iterator[tuple[Recorded | None, Recorded | None]]:
@@ -170,23 +191,28 @@ def _count_missing(result: StreamDiff, in_a: Recorded | None, in_b: Recorded | N
     )
 
 
-def _differences(a: Message, b: Message, tolerance: float | None, result: StreamDiff) -> Iterator[FieldDifference]:
-    """The fields that differ beyond the tolerance; raises the stream's largest difference on the way."""
+def differences(a: Message, b: Message, tolerance: float | None = None) -> tuple[list[FieldDifference], float]:
+    """The fields that differ beyond the tolerance, the stamp among them, and the largest difference of any field.
+
+    Without `tolerance`, fields differ when their bits do. With it, floating-point numbers may differ by at most that
+    much, absolutely, and NaN equals NaN; everything else must be equal.
+    """
     if type(a) is not type(b):
-        yield FieldDifference(a.stamp, "(message)", f"{a.SCHEMA} against {b.SCHEMA}", None)
-        return
+        return [
+            FieldDifference(a.stamp, "(message)", f"{a.SCHEMA} against {b.SCHEMA}", None, a=a.SCHEMA, b=b.SCHEMA)
+        ], 0
+    found: list[FieldDifference] = []
+    largest = 0.0
     for (name, left), (_, right) in zip(a.items(), b.items(), strict=True):
         distance = _distance(left, right)
-        if distance is not None:
-            result.max_difference = max(result.max_difference, distance)
-        if tolerance is None:
-            equal = _bits(left) == _bits(right)
-        elif distance is not None and _is_float(left):
+        largest = max(largest, distance or 0.0)
+        if tolerance is not None and distance is not None and _is_float(left):
             equal = distance <= tolerance
         else:
             equal = _bits(left) == _bits(right)
         if not equal:
-            yield FieldDifference(a.stamp, name, _describe(left, right, distance), distance)
+            found.append(_field_difference(a.stamp, name, left, right, distance, tolerance))
+    return found, largest
 
 
 def _distance(left: Any, right: Any) -> float | None:
@@ -217,18 +243,46 @@ def _bits(value: Any) -> Any:
     return (type(value), np.float64(value).tobytes()) if isinstance(value, float) else (type(value), value)
 
 
-def _describe(left: Any, right: Any, distance: float | None) -> str:
-    if isinstance(left, np.ndarray) and isinstance(right, np.ndarray):
-        if left.shape != right.shape or left.dtype != right.dtype:
-            return f"{left.dtype}{list(left.shape)} against {right.dtype}{list(right.shape)}"
-        unequal = left.reshape(-1).view(np.uint8).reshape(left.size, -1) != right.reshape(-1).view(np.uint8).reshape(
-            right.size, -1
-        )
-        flat = np.flatnonzero(unequal.any(axis=1))
-        index = tuple(int(i) for i in np.unravel_index(int(flat[0]), left.shape))
-        where = ", ".join(map(str, index))
-        return f"[{where}] is {left[index]!s} against {right[index]!s}, {len(flat)} of {left.size} differ"
-    return f"{_short(left)} against {_short(right)}"
+def _field_difference(
+    stamp: int, name: str, left: Any, right: Any, distance: float | None, tolerance: float | None
+) -> FieldDifference:
+    if not (isinstance(left, np.ndarray) and isinstance(right, np.ndarray)):
+        detail = f"{_short(left)} against {_short(right)}"
+        return FieldDifference(stamp, name, detail, distance, a=_plain(left), b=_plain(right))
+    if left.shape != right.shape or left.dtype != right.dtype:
+        detail = f"{left.dtype}{list(left.shape)} against {right.dtype}{list(right.shape)}"
+        return FieldDifference(stamp, name, detail, distance, a=_plain(left), b=_plain(right))
+    flat = np.flatnonzero(_unequal(left, right, tolerance))
+    index = tuple(int(i) for i in np.unravel_index(int(flat[0]), left.shape))
+    where = ", ".join(map(str, index))
+    detail = f"[{where}] is {left[index]!s} against {right[index]!s}, {len(flat)} of {left.size} differ"
+    a, b = _plain(left[index]), _plain(right[index])
+    return FieldDifference(stamp, name, detail, distance, index, len(flat), left.size, a, b)
+
+
+def _unequal(left: npt.NDArray[Any], right: npt.NDArray[Any], tolerance: float | None) -> npt.NDArray[np.bool_]:
+    """Which elements of two arrays of one shape and type differ, flat: beyond the tolerance, or in any bit."""
+    if tolerance is not None and left.dtype.kind == "f":
+        x, y = left.reshape(-1).astype(np.float64), right.reshape(-1).astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            near = np.abs(x - y) <= tolerance
+        alike: npt.NDArray[np.bool_] = near | (x == y) | (np.isnan(x) & np.isnan(y))
+        return ~alike
+    bytes_of_left, bytes_of_right = (
+        array.reshape(-1).view(np.uint8).reshape(array.size, -1) for array in (left, right)
+    )
+    return np.asarray((bytes_of_left != bytes_of_right).any(axis=1))
+
+
+def _plain(value: Any) -> str | int | float | bool | None:
+    """A JSON value; text for arrays, lists and numbers that JSON has no word for."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float) and not np.isfinite(value):
+        return "NaN" if np.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    if isinstance(value, str) and len(value) <= 60:
+        return value
+    return value if value is None or isinstance(value, (bool, int, float)) else _short(value)
 
 
 def _short(value: Any) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -12,11 +13,13 @@ PACKAGES = (
     "eclipse-zenoh",
     "foxglove-schemas-protobuf",
     "gtsam",
+    "kiss-icp",
     "lz4",
     "mcap",
     "msgpack",
     "numpy",
     "onnxruntime",
+    "onnxruntime-gpu",
     "open3d",
     "opencv-python",
     "opencv-python-headless",
@@ -32,21 +35,44 @@ PACKAGES = (
 """Packages whose version can change what is computed or how it is stored."""
 
 THREAD_VARIABLES = (
+    "BLIS_NUM_THREADS",
     "MKL_NUM_THREADS",
     "NUMEXPR_NUM_THREADS",
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
     "PYTHONHASHSEED",
+    "TBB_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
 """Variables that fix thread counts and hash order."""
 
-CPU_FEATURES = frozenset({"avx", "avx2", "avx512f", "avx512_vnni", "fma", "sse4_2", "asimd", "sve", "amx_tile", "f16c"})
+KERNEL_VARIABLES = (
+    "CUBLAS_WORKSPACE_CONFIG",
+    "CUDA_VISIBLE_DEVICES",
+    "MKL_CBWR",
+    "MKL_ENABLE_INSTRUCTIONS",
+    "NPY_DISABLE_CPU_FEATURES",
+    "NVIDIA_TF32_OVERRIDE",
+    "OPENBLAS_CORETYPE",
+    "OPENCV_CPU_DISABLE",
+)
+"""Variables by which the numerical libraries choose other code for the same computation."""
+
+_FEATURES = (
+    "amx_bf16 amx_int8 amx_tile asimd asimddp avx avx2 avx512_bf16 avx512_fp16 avx512_vnni avx512bw avx512dq avx512f "
+    "avx512vl avx_vnni bf16 f16c fma fphp i8mm sse4_1 sse4_2 sve sve2"
+)
+CPU_FEATURES = frozenset(_FEATURES.split())
 """Instruction sets that numeric libraries choose their kernels by."""
 
 
-def machine_facts() -> dict[str, dict[str, str]]:
-    """Metadata records `machine`, `packages` and `threads`, keys sorted; equal on an equal machine."""
+def machine_facts(environment: Mapping[str, str] | None = None) -> dict[str, dict[str, str]]:
+    """Metadata records `machine`, `packages`, `threads` and `device`, keys sorted; equal on an equal machine.
+
+    `environment`: that of the processes which compute, this process's own by default. What cannot be found out is left
+    out or empty. Nothing is imported or started for it.
+    """
+    variables = os.environ if environment is None else environment
     model, features = _cpu()
     machine = {
         "architecture": platform.machine(),
@@ -59,7 +85,13 @@ def machine_facts() -> dict[str, dict[str, str]]:
         "python": platform.python_version(),
         "usable_cores": str(_usable_cores()),
     }
-    return {"machine": dict(sorted(machine.items())), "packages": _packages(), "threads": _threads()}
+    return {
+        "machine": dict(sorted(machine.items())),
+        "packages": _packages(),
+        "threads": {name: variables[name] for name in THREAD_VARIABLES if name in variables},
+        "device": _devices(Path("/proc/driver/nvidia"))
+        | {name: variables[name] for name in KERNEL_VARIABLES if name in variables},
+    }
 
 
 def _cpu() -> tuple[str, frozenset[str]]:
@@ -94,5 +126,18 @@ def _packages() -> dict[str, str]:
     return found
 
 
-def _threads() -> dict[str, str]:
-    return {name: os.environ[name] for name in THREAD_VARIABLES if name in os.environ}
+def _devices(driver: Path) -> dict[str, str]:
+    """The GPUs that the NVIDIA driver names, and its version. Whether an operator uses one is its own parameter."""
+    found = {}
+    for number, file in enumerate(sorted(driver.glob("gpus/*/information"))):
+        try:
+            lines = file.read_text().splitlines()
+        except OSError:
+            continue
+        model = next((line.partition(":")[2].strip() for line in lines if line.startswith("Model:")), "unknown")
+        found[f"gpu {number}"] = model
+    try:
+        version_line = (driver / "version").read_text().splitlines()[0]
+    except (OSError, IndexError):
+        return found
+    return found | {"gpu driver": version_line.partition(":")[2].strip()}

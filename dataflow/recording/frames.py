@@ -1,8 +1,8 @@
 """The frame tree for other people's viewers: where odometry has put each frame, and one root above all frames.
 
 Foxglove's pose messages name the frame they are given in, but not the frame that they place; and Rerun's importer draws
-only what is connected to its root frame. So a recording carries, besides its streams, a channel of FrameTransforms that is
-derived from them. Our own reader leaves it out: it holds nothing that the streams do not.
+only what is connected to its root frame. So a recording carries, besides its streams, a channel of FrameTransforms that
+is derived from them. Our own reader leaves it out: it holds nothing that the streams do not.
 """
 
 from __future__ import annotations

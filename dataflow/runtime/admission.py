@@ -7,22 +7,29 @@ messages reach which firing; the firing records say which, so a live run can be 
 
 from __future__ import annotations
 
+import os
+import sys
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
 from dataflow.runtime.firings import DropRecord
-from dataflow.runtime.runner import Emitter, OperatorRunner
-from dataflow.sync import NEVER, Entry
+from dataflow.runtime.restarts import Restarts
+from dataflow.runtime.runner import Emitter, OperatorFailure, OperatorRunner, Recorder, set_up_again
+from dataflow.sync import NEVER, Aligner, Entry, Firing, InputValue
 
 Clock = Callable[[], float]
 """Seconds, never going back."""
 
 EventClock = Callable[[], int]
 """The event time that a device's message would be stamped with now, ns since the epoch."""
+
+
+HANG = 3600.0
+"""Seconds that a planned hang lasts, unless somebody ends it."""
 
 
 class _Arrival(NamedTuple):
@@ -71,6 +78,17 @@ class AdmissionQueue:
         self._messages[stream] -= arrival.kind == "message"
         return stream, arrival
 
+    def clear(self, reason: str) -> None:
+        """Drops every message that waits."""
+        for stream, queue in self._queues.items():
+            for arrival in queue:
+                if arrival.kind == "message":
+                    self._drop(stream, arrival, reason)
+            ends = [arrival for arrival in queue if arrival.kind == "end"]
+            queue.clear()
+            queue.extend(ends)
+        self._messages.clear()
+
     def _drop_oldest(self, stream: str) -> None:
         queue = self._queues[stream]
         for place, arrival in enumerate(queue):
@@ -80,11 +98,11 @@ class AdmissionQueue:
                 self._drop(stream, arrival)
                 return
 
-    def _drop(self, stream: str, arrival: _Arrival) -> None:
+    def _drop(self, stream: str, arrival: _Arrival, reason: str = "overflow") -> None:
         entry = arrival.entry
         assert entry is not None
         self.dropped.append(
-            DropRecord(self.triggers[stream], stream, entry.incarnation, entry.seq, entry.stamp, "overflow")
+            DropRecord(self.triggers[stream], stream, entry.incarnation, entry.seq, entry.stamp, reason)
         )
 
 
@@ -122,7 +140,11 @@ class Patience:
 
 
 class LiveRunner(OperatorRunner):
-    """One operator in a live run."""
+    """One operator in a live run. It outlives its failures as its restart policy allows.
+
+    A failed operator is made anew after the back-off and goes on with what is then in its queues; its streams begin a
+    new incarnation. `on_failure` is told of every failure that is outlived.
+    """
 
     def __init__(
         self,
@@ -133,10 +155,21 @@ class LiveRunner(OperatorRunner):
         seed: int = 0,
         paranoid: bool = False,
         operator: Operator | None = None,
+        snapshots: int | None = None,
         clock: Clock = time.monotonic,
         event_clock: EventClock = time.time_ns,
+        on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
     ) -> None:
-        super().__init__(node, emitter, static=static, seed=seed, paranoid=paranoid, operator=operator)
+        super().__init__(
+            node,
+            emitter,
+            static=static,
+            seed=seed,
+            paranoid=paranoid,
+            operator=operator,
+            lossy=True,
+            snapshots=snapshots,
+        )
         triggers = {
             stream: port.name
             for port in self.spec.triggers
@@ -144,14 +177,41 @@ class LiveRunner(OperatorRunner):
             if stream not in static
         }
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers)
-        self.patience = Patience(node.live.wait, clock, event_clock)
+        self._event_clock = event_clock
+        self._newest, self._shift = NEVER, 0
+        self.patience = Patience(node.live.wait, clock, self._event_time)
+        self.restarts = Restarts(node.live.restart, clock)
         self.forced: Counter[tuple[str, str]] = Counter()
+        self.absent: set[str] = set()
+        """Streams whose operator is gone at the moment."""
+        self._static = static
+        self._statics: dict[str, Entry] = {}
+        self._on_failure = on_failure
+        self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp
+        self._changed: dict[str, Any] = {}
+        self._injected: str | None = None
+        self._delay: tuple[float, float] = (0.0, 0.0)  # seconds before each firing, until when
+        self._leaked: list[bytearray] = []
+        self._clock = clock
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
-        return {**self.aligner.drops, **self.forced}
+        withheld = {(f"→ {port}", "non_monotonic"): n for port, n in self.ports.withheld.items()}
+        return {**self.aligner.drops, **self.forced, **withheld}
+
+    # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:
+        if stream in self._static:
+            self._statics[stream] = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
+        else:
+            incarnation, last = self._seen.get(stream, (entry.incarnation, NEVER))
+            if entry.incarnation > incarnation and entry.stamp <= last and not self.ended:
+                self._reset(stream, entry.stamp)
+            self._seen[stream] = (entry.incarnation, entry.stamp)
+            self._newest = max(self._newest, entry.stamp)
+        if self.restarts.pending:
+            self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away
         if stream in self.queue.triggers:
             self.queue.put(stream, _Arrival("message", entry.stamp, entry))
         else:
@@ -169,8 +229,14 @@ class LiveRunner(OperatorRunner):
         else:
             self.aligner.end(stream, final_stamp, reason)
 
+    # Work
+
     def step(self) -> bool:
         """One firing: of what is decided; else of what the queues hold; else of what has waited long enough."""
+        if self.restarts.pending:
+            if self.restarts.due_in() > 0:
+                return False
+            self._start_again()
         if super().step():
             return True
         while not self.ended:
@@ -185,6 +251,8 @@ class LiveRunner(OperatorRunner):
 
     def next_due(self) -> float | None:
         """Seconds until a decision need not wait any longer; None when nothing waits for the clock."""
+        if self.restarts.pending:
+            return self.restarts.due_in()
         held = None if self.ended else self.aligner.waiting()
         return None if held is None else self.patience.due_in(held.stamp, held.needs)
 
@@ -193,6 +261,121 @@ class LiveRunner(OperatorRunner):
         for drop in mine:
             self.forced[drop.input, drop.reason] += 1
         return [*mine, *super().take_drops()]
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        changed = super().set_parameter(name, value)
+        self._changed[name] = value
+        return changed
+
+    def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
+        """Takes the place of an operator whose process died; to be called before `setup()`."""
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.resume(incarnation, last)
+        self._changed = dict(changed)
+        for name, value in changed.items():
+            self.operator.set_parameter(name, value)
+
+    def begin_fault(self, kind: str, fields: Mapping[str, Any]) -> None:
+        """A planned fault: `raise` fails the next firing without calling the operator, `hang` never ends it, `slow`
+        begins every firing late for a while, `leak` takes memory that is not given back."""
+        match kind:
+            case "raise":
+                self._injected = "planned"
+            case "hang":
+                self._delay = (HANG, self._clock() + HANG)
+            case "slow":
+                self._delay = (fields["by"], self._clock() + fields["span"])
+            case "leak":
+                self._leaked.append(bytearray(os.urandom(1 << 20) * fields["megabytes"]))
+
+    def _fire(self, firing: Firing) -> None:
+        if self.absent:
+            firing = self._without_the_absent(firing)
+        pause, until = self._delay
+        try:
+            if pause and self._clock() < until:
+                time.sleep(pause)
+            if self._injected is not None:
+                self._fail_injected(firing)
+            super()._fire(firing)
+        except OperatorFailure as failure:
+            if firing.kind == "finish" or not self.restarts.failed():
+                raise
+            self._on_failure(failure, self.restarts.due_in())
+
+    def _fail_injected(self, firing: Firing) -> None:
+        reason, self._injected = self._injected, None
+        failure = OperatorFailure(self.node.name, f"{firing.kind} at stamp {firing.stamp}", InjectedFault(reason))
+        self._record(firing.kind, firing, time.time_ns(), (), failure.summary, injected=True)
+        raise failure
+
+    def _without_the_absent(self, firing: Firing) -> Firing:
+        """Marks inputs stale whose producer is gone; drops what they still hold where the policy says so."""
+        gone = frozenset(
+            name
+            for name, port in self.spec.inputs.items()
+            if port.kind == "sampled" and not self.absent.isdisjoint(self.node.inputs.get(name, ()))
+        )
+        if not gone:
+            return firing
+        inputs = dict(firing.inputs)
+        if self.node.live.on_stale == "drop":
+            inputs |= {
+                name: None for name in gone if not self.spec.inputs[name].required and not _is_many(inputs, name)
+            }
+        return Firing(firing.stamp, firing.kind, firing.tick, inputs, firing.stale | gone, firing.late)
+
+    def _start_again(self) -> None:
+        """A fresh operator in the place of the failed one, with the parameters as they were last set."""
+        self.restarts.begun()
+        old, self.operator = self.operator, self.node.make()
+        self._begin_incarnation()
+        try:
+            _close_quietly(old)
+            for name, value in self._changed.items():
+                self.operator.set_parameter(name, value)
+            set_up_again(self.operator, self.ports, self.records, self.node, self.seed)
+        except OperatorFailure as failure:
+            if not self.restarts.failed():
+                raise
+            self._on_failure(failure, self.restarts.due_in())
+
+    def _reset(self, stream: str, stamp: int) -> None:
+        """The clock behind a stream jumped back: alignment begins anew, and so do the operator's own streams."""
+        started = time.time_ns()
+        name = next(n for n, streams in self.node.inputs.items() if stream in streams)
+        self.queue.clear("reset")
+        drops = self.take_drops()
+        self.forced += Counter(dict(self.aligner.drops))
+        for held, count in self.aligner.buffered().items():
+            if count and self.spec.inputs[held].kind != "sampled":
+                self.forced[held, "reset"] += count
+        ends = {s: e for s, e in self.aligner.ends.items() if s != stream and s not in self._static}
+        self.aligner = Aligner(self.aligner.spec)
+        for static in self._statics.values():
+            self.aligner.push(static.stream, static)
+        for ended, end in ends.items():
+            self.aligner.end(ended, None, end.reason)
+        self._newest, self._shift = NEVER, stamp - self._event_clock()
+        self._begin_incarnation(stamps_go_back=True)
+        self.done = NEVER
+        try:
+            self.operator.on_reset(name)
+        except Exception as error:
+            failure = OperatorFailure(self.node.name, "on_reset()", error)
+            detail = {"input": name, "error": failure.summary}
+            self.records.add("reset", NEVER + 1, started, outcome="error", drops=tuple(drops), detail=detail)
+            raise failure from error
+        self.records.add("reset", NEVER + 1, started, drops=tuple(drops), detail={"input": name})
+
+    def _begin_incarnation(self, *, stamps_go_back: bool = False) -> None:
+        incarnation = self.records.incarnation + 1
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation, stamps_go_back=stamps_go_back)
+
+    def _event_time(self) -> int:
+        """Event time now: by the clock, and not before what has been seen."""
+        return max(self._event_clock() + self._shift, self._newest)
 
     def _admit(self, stream: str, arrival: _Arrival) -> None:
         match arrival.kind:
@@ -214,3 +397,19 @@ class LiveRunner(OperatorRunner):
             self.forced[name, "timeout"] += 1
             self.aligner.force(name, frontier)
         return bool(exhausted)
+
+
+class InjectedFault(RuntimeError):
+    """A failure that was asked for, to see what follows from it."""
+
+
+def _is_many(inputs: Mapping[str, InputValue], name: str) -> bool:
+    return isinstance(inputs.get(name), Mapping)
+
+
+def _close_quietly(operator: Operator) -> None:
+    """Closes an operator that has failed; what else goes wrong in it is printed, since the first failure is known."""
+    try:
+        operator.close()
+    except Exception as error:
+        print(f"{type(operator).__name__}.close() after a failure: {type(error).__name__}: {error}", file=sys.stderr)

@@ -18,6 +18,7 @@ from dataflow.recording.facts import machine_facts
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.replay import graph_metadata, plan_replay, recorded_graph
 from dataflow.runtime.supervisor import RunReport, Status, Supervisor
+from dataflow.runtime.threads import environment
 
 Watch = Callable[[Status], None]
 
@@ -69,7 +70,8 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         "threads": str(plan.graph.threads),
         **{f"host of {node}": label for node, label in placed.items()},
     }
-    return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **machine_facts()}
+    facts = machine_facts(environment(plan.graph.threads))
+    return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}
 
 
 @contextmanager
@@ -82,7 +84,7 @@ def _interrupts(stop: Callable[[], None]) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
         stop()
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     try:
         yield
     finally:

@@ -58,6 +58,11 @@ class Window:
             self.count -= messages
             self.size -= nbytes
 
+    def clear(self) -> None:
+        """Forgets what is outstanding: the stamps to come are earlier."""
+        self._outstanding.clear()
+        self.count = self.size = 0
+
     def grow(self) -> None:
         """Doubles the window: for graphs that must look further ahead than it allows."""
         self.messages *= 2

@@ -1,7 +1,8 @@
 """Firing records: what every operator did, complete enough to drive it again and to compare what it made.
 
 A record is one call of an operator: its stamp, the exact messages given to each input, what came out of each port and
-how it ended. Records are gathered in batches of one operator and written to its stream `<namespace>/@/firings/<operator>`.
+how it ended. Records are gathered in batches of one operator and written to its stream
+`<namespace>/@/firings/<operator>`.
 """
 
 from __future__ import annotations
@@ -15,10 +16,14 @@ import msgpack
 from dataflow.sync import FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
-Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore"]
+Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot"]
 Outcome = Literal["ok", "error", "torn"]
-KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore")
+KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
 OUTCOMES: tuple[Outcome, ...] = ("ok", "error", "torn")
+
+
+WITHHELD = -1
+"""The place in its stream of a message that was not sent, since its stamp did not increase (live runs only)."""
 
 
 class FiringRecordError(ValueError):
@@ -27,7 +32,7 @@ class FiringRecordError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Emission:
-    """What came out of one port: its place in the stream, its stamp and its digest (16 bytes)."""
+    """What came out of one port: its place in the stream (or `WITHHELD`), its stamp and its digest (16 bytes)."""
 
     seq: int
     stamp: int
@@ -51,9 +56,11 @@ class DropRecord:
 class FiringRecord:
     """One call of an operator.
 
-    `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were given,
-    by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those decided since the previous record. `detail` holds what is particular to the kind:
-    parameters and file hashes for `setup`, the name and value for `param`, the error's text for the outcome `error`.
+    `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
+    given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
+    decided since the previous record. `detail` holds what is particular to the kind: parameters and file hashes for
+    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, the error's text for the
+    outcome `error` (with `injected` where no call was made at all).
     `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
     """
 
@@ -85,6 +92,8 @@ def encode_batch(records: list[FiringRecord], *, last: bool = False) -> bytes:
     """A batch of consecutive records of one operator as msgpack. `last` marks the operator's final batch."""
     if not records:
         raise FiringRecordError("a batch holds at least one firing record")
+    if len({(r.operator, r.incarnation, r.index - k) for k, r in enumerate(records)}) > 1:
+        raise FiringRecordError("a batch holds consecutive records of one incarnation of one operator")
     names = list(dict.fromkeys(name for record in records for name in record.inputs))
     streams: dict[str, int] = {}
 

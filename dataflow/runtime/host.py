@@ -11,23 +11,29 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
+
+import msgpack
 
 from dataflow.graph.model import Graph, Node
 from dataflow.messages.base import Message
+from dataflow.operator import ParameterError
 from dataflow.recording import Recording
 from dataflow.runtime.admission import LiveRunner
+from dataflow.runtime.chaos import TO_SOURCES, SourceFaults
 from dataflow.runtime.control import Channel, ChannelClosed
 from dataflow.runtime.feed import Feed, LogFeed, Window
 from dataflow.runtime.firings import FiringRecord, encode_batch
 from dataflow.runtime.keys import firings_key
 from dataflow.runtime.network import network_config
 from dataflow.runtime.reexecute import RecordedRunner, recorded_digests, recorded_firings
-from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner, step_stamp
+from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner, step_stamp, summary_of
 from dataflow.runtime.threads import limit_threads
+from dataflow.runtime.watchdog import Watchdog
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode, encode
+from dataflow.transport.keys import runtime_key
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.004
@@ -35,6 +41,8 @@ PROBE_EVERY = 0.01
 BATCH_RECORDS = 64
 BATCH_SECONDS = 0.25
 PROMISE_EVERY = 8
+STATICS_WITHIN = 5.0
+MISSED_AFTER = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +50,11 @@ class HostConfig:
     """What the supervisor tells a host to be. Travels as plain values.
 
     `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
-    are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`: whether a recorder
-    takes the firing records. `verify` names a recording by whose firing records the operators are driven.
-    `live`: sources do not wait for the graph, and operators not for their inputs.
+    are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is
+    (messages, bytes). `firings`: whether a recorder takes the firing records. `verify` names a recording by whose
+    firing records the operators are driven. `live`: sources do not wait for the graph, and operators not for their
+    inputs. `resume` is given to a host that takes the place of one that died: for each operator, where it had got to
+    (`Resumed`, as plain values). `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
     label: str
@@ -61,6 +71,22 @@ class HostConfig:
     firings: bool = False
     verify: str | None = None
     live: bool = False
+    resume: dict[str, Any] | None = None
+    snapshots: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Resumed:
+    """Where an operator had got to when its process died: the next incarnation, the last stamp of each port, the
+    parameters that were changed, the last stamp of a source and how often it has been started again."""
+
+    incarnation: int = 0
+    last: Mapping[str, int] = field(default_factory=dict)
+    changed: Mapping[str, Any] = field(default_factory=dict)
+
+    def apply(self, runner: SourceRunner | LiveRunner) -> None:
+        if self.incarnation:
+            runner.resume(self.incarnation, self.last, self.changed)
 
 
 class HostFailure(RuntimeError):
@@ -118,12 +144,18 @@ class Outlet:
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         for runner in self.host.consumers.get(stream, ()):
             runner.end(stream, final_stamp, reason)
+        if self.host.config.live and stream not in self.host.static:
+            self.host.channel.send("stream_ended", stream=stream, reason=reason)
         final = NEVER if final_stamp is None else final_stamp
         self._send(stream, Envelope(Kind.END, stream, 0, 0, final, reason=reason))
 
     def record(self, record: FiringRecord) -> None:
+        if self.host.config.live:  # ahead of its messages, to where it survives this process
+            self.host.channel.send("record", operator=record.operator, data=encode_batch([record]))
         if self.host.config.firings:
             log = self._logs.setdefault(record.operator, [])
+            if log and log[-1].incarnation != record.incarnation:
+                self.flush(record.operator)
             log.append(record)
             if len(log) >= BATCH_RECORDS or record.kind == "finish":
                 self.flush(record.operator, last=record.kind == "finish")
@@ -161,14 +193,18 @@ class Host:
         self.sources: list[SourceRunner] = []
         self.feeds: list[Feed] = []
         self.live: list[SourceRunner] = []
+        self.faults: dict[str, SourceFaults] = {}
+        self._static_seen: set[str] = set()
         self.window = Window(*config.window)
         self._expected: dict[str, tuple[int, int]] = {}
         self._probed: set[str] = set()
         self._probing = False
         self._released = False
         self._start: tuple[int, float] | None = None
+        self._counted: dict[str, list[int]] = {}
         self._reported: dict[str, int] = {}
         self._report_due = 0.0
+        self._watch: Watchdog | None = None
         self._ended = False
         self._stopping = threading.Event()
         self._left = False
@@ -193,12 +229,16 @@ class Host:
         self.channel.send("joined")
         for name in self.config.nodes:
             self._make(self.graph.nodes[name])
+            self.bus.serve(runtime_key(self.graph.namespace, "param", name), self._parameter_asked(name))
+        self.bus.serve(runtime_key(self.graph.namespace, "status", self.config.label), self._status_asked)
         if self.config.replay is not None:
             self._make_log(self.config.replay)
         limit_threads(self.graph.threads)
         for maker in self.makers:
             self.bus.alive(self.graph.namespace, maker.node.name)
             maker.setup()
+        if self.config.resume is not None:
+            self._fetch_statics()
         for feed in self.feeds:
             if isinstance(feed, LogFeed):
                 feed.setup()
@@ -215,16 +255,36 @@ class Host:
 
         return receive
 
+    def _fetch_statics(self) -> None:
+        """The static streams that were given before this host came to be."""
+        wanted = {s for s in self.config.subscribe if s in self.static}
+        deadline = time.monotonic() + STATICS_WITHIN
+        while missing := wanted - self._static_seen:
+            for stream, payload in self.bus.query_static(self.graph.namespace, timeout=1.0).items():
+                if stream in missing:
+                    self._receive(stream, payload)
+            if time.monotonic() > deadline:
+                raise HostFailure(
+                    f"host {self.config.label!r} was started again and did not get the static streams "
+                    f"{', '.join(sorted(wanted - self._static_seen))} within {STATICS_WITHIN:g} s"
+                )
+            time.sleep(0.01)
+
     def _make(self, node: Node) -> None:
+        resumed = Resumed(**(self.config.resume or {}).get(node.name, {}))
         if node.source:
-            source = SourceRunner(node, self.outlet, seed=self.graph.seed)
+            source = SourceRunner(node, self.outlet, seed=self.graph.seed, live=self.config.live)
+            resumed.apply(source)
             self.sources.append(source)
             if self.config.live:
                 self.live.append(source)
+                self.faults[node.name] = SourceFaults()
             else:
                 self.feeds.append(source)
             return
         runner = self._recorded_runner(node) if self.config.verify is not None else self._runner(node)
+        if isinstance(runner, LiveRunner):
+            resumed.apply(runner)
         self.runners.append(runner)
         for stream in {s for streams in node.inputs.values() for s in streams}:
             self.consumers.setdefault(stream, []).append(runner)
@@ -234,10 +294,18 @@ class Host:
             "static": self.static,
             "seed": self.graph.seed,
             "paranoid": self.config.paranoid,
+            "snapshots": self.config.snapshots,
         }
         if self.config.live:
-            return LiveRunner(node, self.outlet, **common, event_clock=self._event_clock)
+            return LiveRunner(
+                node, self.outlet, **common, event_clock=self._event_clock, on_failure=self._on_outlived_failure
+            )
         return OperatorRunner(node, self.outlet, **common)
+
+    def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
+        self.channel.send(
+            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
+        )
 
     def _event_clock(self) -> int:
         """Event time now: the clock's own, or, where sources are held to the clock, as far as they have been let."""
@@ -282,6 +350,8 @@ class Host:
             if self._probing:
                 self._probe()
             self._take(self._wait_time())
+            if self._left:
+                return
             worked = self._work()
             self.outlet.flush_due()
             self._report(idle=not worked)
@@ -310,6 +380,8 @@ class Host:
                 self._control(kind, fields)
             case ("source", runner, step):
                 self._from_live(runner, step)
+            case ("param", name, query):
+                self._set_parameter(name, query)
             case ("source_failed", failure):
                 raise failure
 
@@ -328,6 +400,10 @@ class Host:
                 self.channel.send("seen", stream=stream)
             return
         self.received += 1
+        if stream in self.static and envelope.kind is Kind.MESSAGE:
+            if stream in self._static_seen:
+                return  # its operator was started again
+            self._static_seen.add(stream)
         runners = self.consumers.get(stream, ())
         match envelope.kind:
             case Kind.MESSAGE:
@@ -348,7 +424,11 @@ class Host:
         if self.config.verify is not None:
             return  # an operator that makes less than it did is what verification is there to report
         incarnation, expected = self._expected.get(stream, (envelope.incarnation, envelope.seq))
-        if (envelope.incarnation, envelope.seq) != (incarnation, expected) and incarnation == envelope.incarnation:
+        if envelope.seq != expected and incarnation == envelope.incarnation:
+            if self.config.live:  # what a host that was started again missed, or a link that broke
+                self.channel.send("gap", stream=stream, first=expected, following=envelope.seq)
+                self._expected[stream] = (envelope.incarnation, envelope.seq + 1)
+                return
             raise HostFailure(
                 f"stream {stream!r} lost messages on its way to host {self.config.label!r}: "
                 f"number {expected} was due, {envelope.seq} came"
@@ -360,16 +440,23 @@ class Host:
     def _work(self) -> bool:
         """Runs what is decided; then, when nothing is, admits from the feeds. True when anything was done."""
         worked = False
-        while self.inbox.empty():
-            if any([runner.step() for runner in reversed(self.runners)]) or self._admit():
+        while self.inbox.empty() and not self._left:
+            if self._step_all() or self._admit():
                 worked = True
             else:
                 self._keep_promises()
-                if not any([runner.step() for runner in reversed(self.runners)]):
+                if not self._step_all():
                     break
             self._report(idle=False)
         if not self._ended and self._released:
             self._end_if_done()
+        return worked
+
+    def _step_all(self) -> bool:
+        """One step of every operator, last ones first, so that what is under way is done before more is begun."""
+        worked = False
+        for runner in reversed(self.runners):
+            worked = runner.step() or worked
         return worked
 
     def _admit(self) -> bool:
@@ -430,15 +517,26 @@ class Host:
     # Live sources
 
     def _start_live(self, runner: SourceRunner) -> None:
+        faults = self.faults[runner.node.name]
+        behind = self.config.resume is not None
+
         def read() -> None:
+            nonlocal behind
             try:
                 while not self._stopping.is_set():
                     step = runner.take()
-                    if step is not None and not runner.source.live:
-                        self._pace(step_stamp(step))
-                    self.inbox.put(("source", runner, step))
                     if step is None:
+                        self.inbox.put(("source", runner, None))
                         return
+                    if not runner.source.live:
+                        stamp = step_stamp(step)
+                        if behind and self._start is not None and self._due_in(stamp) < -MISSED_AFTER:
+                            continue  # what a device would have seen while it was away
+                        behind = False
+                        self._pace(stamp)
+                    for given in faults.apply(step, time.monotonic()):
+                        self.inbox.put(("source", runner, given))
+                runner.close_stream()
             except OperatorFailure as failure:
                 self.inbox.put(("source_failed", failure))
 
@@ -458,9 +556,15 @@ class Host:
         if self.window.full:
             runner.overflow += 1
             return
-        messages, nbytes = runner.emit(step)
+        incarnation = runner.records.incarnation
+        admitted = runner.emit_live(step)
+        if admitted is None:
+            return
+        if runner.records.incarnation != incarnation:
+            self.window.clear()
+            self.channel.send("jumped", operator=runner.node.name, stamp=runner.last)
         runner.promise()
-        self.window.add(runner.last, messages, nbytes)
+        self.window.add(runner.last, *admitted)
 
     # Progress
 
@@ -475,7 +579,8 @@ class Host:
         self._report_due = now + REPORT_EVERY
         self._reported.update(done)
         self._step_done = firings
-        self.channel.send("progress", done=done, counts=self._counts())
+        self._counted = self._counts()
+        self.channel.send("progress", done=done, counts=self._counted)
 
     def _counts(self) -> dict[str, list[int]]:
         """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
@@ -515,8 +620,9 @@ class Host:
         return {
             "streams": streams,
             "counts": self._counts(),
-            "drops": {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners},
-            "summaries": {r.node.name: dict(s) for r in self.runners if (s := r.operator.summary())},
+            "drops": {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners}
+            | {s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self.live if s.refused},
+            "summaries": {r.node.name: s for r in self.runners if (s := summary_of(r.operator, r.node.name))},
             "transport": {**self.bus.counters(), "malformed": self.malformed},
             "verifications": [r.result.to_wire() for r in self.runners if isinstance(r, RecordedRunner)],
         }
@@ -535,6 +641,21 @@ class Host:
                     self._start = (fields["first"], fields["at"])
                 for runner in self.live:
                     self._start_live(runner)
+                runners = [r for r in self.runners if isinstance(r, OperatorRunner)]
+                self._watch = Watchdog(self.channel, runners, deadlines=self.config.live)
+            case "absent":
+                for stream in fields["streams"]:
+                    for consumer in self.consumers.get(stream, ()):
+                        if isinstance(consumer, LiveRunner):
+                            (consumer.absent.add if fields["absent"] else consumer.absent.discard)(stream)
+                    if not fields["absent"]:
+                        self._probed.discard(stream)
+            case "ended_elsewhere":
+                for stream in fields["streams"]:
+                    for consumer in self.consumers.get(stream, ()):
+                        consumer.end(stream, None, fields["reason"])
+            case "fault":
+                self._fault(fields["fault"], fields["operator"], fields["fields"])
             case "covered":
                 self.window.cover(fields["frontier"])
             case "grow":
@@ -563,8 +684,61 @@ class Host:
             case "lost":
                 raise ChannelClosed("the supervisor is gone")
 
+    def _fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> None:
+        """Does a planned fault to an operator or source of this host."""
+        print(f"planned fault: {kind} {operator} {dict(fields)}", file=sys.stderr)
+        if operator in self.faults and kind in TO_SOURCES:
+            self.faults[operator].begin(kind, fields, time.monotonic())
+            return
+        maker = next(m for m in self.makers if m.node.name == operator)
+        match kind:
+            case "param":
+                self._set_parameter_quietly(maker, fields["name"], fields["value"])
+            case "malformed":
+                for stream in maker.node.outputs.values():
+                    self.bus.session.put(stream, b"\x00malformed\xff" * 8)
+            case "raise" | "hang" | "slow" | "leak":
+                if isinstance(maker, LiveRunner):
+                    maker.begin_fault(kind, fields)
+
+    def _parameter_asked(self, name: str) -> Callable[[Any], None]:
+        put = self.inbox.put
+
+        def asked(query: Any) -> None:
+            put(("param", name, query))
+
+        return asked
+
+    def _set_parameter(self, name: str, query: Any) -> None:
+        """Answers a request to change a parameter: between two firings, with the value as validated or an error."""
+        maker = next(m for m in self.makers if m.node.name == name)
+        with query:
+            try:
+                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
+                if isinstance(maker, RecordedRunner):
+                    raise ParameterError("the parameters of a re-execution are the recorded ones")
+                value = maker.set_parameter(asked["name"], asked["value"])
+                answer = {"ok": True, "value": value}
+            except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
+                answer = {"ok": False, "error": str(error)}
+            query.reply(query.key_expr, msgpack.packb(answer))
+
+    def _set_parameter_quietly(
+        self, maker: SourceRunner | OperatorRunner | RecordedRunner, name: str, value: Any
+    ) -> None:
+        assert not isinstance(maker, RecordedRunner)
+        try:
+            maker.set_parameter(name, value)
+        except ParameterError as error:
+            print(f"planned fault: {error}", file=sys.stderr)
+
+    def _status_asked(self, query: Any) -> None:
+        """Answers with the counts of the last report; on Zenoh's thread, so an operator at work holds up nothing."""
+        with query:
+            query.reply(query.key_expr, msgpack.packb({"host": self.config.label, "counts": self._counted}))
+
     def _waiting(self) -> dict[str, list[Any]]:
-        """Per operator that is not done: the stamp it cannot decide, and the inputs (with frontiers) that hold it up."""
+        """Per operator that is not done: the stamp it cannot decide, and the inputs (with frontiers) that hold it."""
         waiting: dict[str, list[Any]] = {}
         for runner in self.runners:
             if not runner.ended:
@@ -583,9 +757,13 @@ class Host:
     def close(self) -> None:
         """Closes every operator and the network; the first error is raised when all are closed."""
         self._stopping.set()
+        if self._watch is not None:
+            self._watch.stop()
         first: Exception | None = None
         for maker in self.makers:
             try:
+                if isinstance(maker, SourceRunner) and maker not in self.live:
+                    maker.close_stream()
                 maker.operator.close()
             except Exception as error:
                 first = first or OperatorFailure(maker.node.name, "close()", error)

@@ -6,3 +6,8 @@ from __future__ import annotations
 def firings_key(namespace: str, operator: str) -> str:
     """Where an operator's firing records travel and are recorded."""
     return f"{namespace}/@/firings/{operator}"
+
+
+def diagnostics_key(namespace: str) -> str:
+    """The stream of `Diagnostics` about the run itself, in its recording."""
+    return f"{namespace}/@/diagnostics"

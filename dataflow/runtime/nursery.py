@@ -15,14 +15,16 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
-from typing import IO
+from collections.abc import Iterator
 
 import msgpack
 
 from dataflow.runtime.control import Channel
 
 START_WITHIN = 60.0
+WORDS_PERIOD = 0.1
 LEAVE_WITHIN = 15.0
 PRELOAD = ("dataflow.runtime.host", "dataflow.runtime.sink", "dataflow.runtime.recorder", "dataflow.runtime.process")
 
@@ -34,8 +36,28 @@ class NurseryFailed(RuntimeError):
 class Child:
     """A forked host process, as the supervisor sees it."""
 
-    def __init__(self, nursery: Nursery, pid: int, channel: Channel, words: IO[bytes]) -> None:
-        self.nursery, self.pid, self.channel, self.words = nursery, pid, channel, words
+    def __init__(self, nursery: Nursery, pid: int, channel: Channel, words: int) -> None:
+        self.nursery, self.pid, self.channel, self._words = nursery, pid, channel, words
+
+    def lines(self, over: threading.Event) -> Iterator[str]:
+        """What it prints, line by line, until it has closed its output or, soon after `over` is set, falls silent.
+
+        A process that the child has left behind may hold its output open, so the end of it is not waited for.
+        """
+        rest = b""
+        try:
+            while True:
+                readable, _, _ = select.select([self._words], [], [], WORDS_PERIOD)
+                data = os.read(self._words, 65536) if readable else b""
+                *whole, rest = (rest + data).split(b"\n")
+                for line in whole:
+                    yield line.decode(errors="backslashreplace").rstrip()
+                if (readable and not data) or (not readable and over.is_set()):
+                    break
+            if rest:
+                yield rest.decode(errors="backslashreplace").rstrip()
+        finally:
+            os.close(self._words)
 
     def poll(self) -> int | None:
         """The exit code (negative: the signal that killed it), None while it runs."""
@@ -46,9 +68,13 @@ class Child:
         return self.nursery.exit_code(self.pid, timeout=timeout)
 
     def kill(self) -> None:
+        self.signal(signal.SIGKILL)
+
+    def signal(self, number: signal.Signals) -> None:
+        """Sends a signal, if it still runs."""
         if self.poll() is None:
             with contextlib.suppress(ProcessLookupError):  # it ended just now
-                os.kill(self.pid, signal.SIGKILL)
+                os.kill(self.pid, number)
 
 
 class Nursery:
@@ -87,7 +113,7 @@ class Nursery:
         finally:
             os.close(descriptor)
             os.close(writing)
-        return Child(self, self._spawned.pop(), channel, os.fdopen(reading, "rb"))
+        return Child(self, self._spawned.pop(), channel, reading)
 
     def exit_code(self, pid: int, timeout: float) -> int | None:
         """How a child ended; waits up to `timeout` seconds. None: it runs, or nobody is left who knows."""
@@ -172,6 +198,7 @@ def serve(connection: socket.socket) -> None:
                 continue
             pid = children.pop(pidfd)
             os.close(pidfd)
+            _end_group(pid)
             _, status = os.waitpid(pid, 0)
             _tell(connection, "ended", pid, os.waitstatus_to_exitcode(status))
         if connection.fileno() in readable:
@@ -187,6 +214,15 @@ def serve(connection: socket.socket) -> None:
     _outlive(children)
 
 
+def _end_group(pid: int) -> None:
+    """Ends a host and what its operators have started. To be called before the host is waited for: until then nobody
+    else can have its group's number."""
+    with contextlib.suppress(
+        ProcessLookupError, PermissionError
+    ):  # it has not become a group of its own yet, or no more
+        os.killpg(pid, signal.SIGKILL)
+
+
 def _tell(connection: socket.socket, what: str, pid: int, code: int) -> None:
     with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the supervisor is gone; serve() sees that next
         connection.sendall(msgpack.packb([what, pid, code]))
@@ -198,9 +234,11 @@ def _outlive(children: dict[int, int]) -> None:
     while children and (left := deadline - time.monotonic()) > 0:
         readable, _, _ = select.select(list(children), [], [], left)
         for pidfd in readable:
-            os.waitpid(children.pop(pidfd), 0)
+            pid = children.pop(pidfd)
+            _end_group(pid)
+            os.waitpid(pid, 0)
     for pid in children.values():
-        os.kill(pid, signal.SIGKILL)
+        _end_group(pid)
         os.waitpid(pid, 0)
 
 

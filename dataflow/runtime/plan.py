@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph, Placement
+from dataflow.runtime.chaos import Fault
 from dataflow.runtime.keys import firings_key
 
 LOG_HOST = "@log"
@@ -33,9 +34,11 @@ class RunPlan:
     - `placement`: see `Graph.hosts`.
     - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
     - `verify`: the operators that are driven by the firing records of `log`; the others do not run.
-    - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes into the recording.
+    - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes
+      into the recording.
     - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
       `live:` policies apply.
+    - `faults`: what is to go wrong on purpose, by time (live runs only).
     - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
     - `window`: messages and bytes that feeds may be ahead of the graph.
     - `paranoid`: re-digest inputs after each firing to catch operators that write into them.
@@ -50,6 +53,7 @@ class RunPlan:
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     verify: frozenset[str] | None = None
     live: bool = False
+    faults: Iterator[Fault] | None = None
     rate: float | None = None
     window: tuple[int, int] = (256, 64 << 20)
     paranoid: bool = False

@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
+from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.recording import RecordingWriter
+from dataflow.runtime.keys import diagnostics_key
 from dataflow.runtime.sink import stream_types
 
 ENDS = "dataflow:ends"
@@ -32,6 +34,7 @@ class RecorderSink:
         self._added: set[str] = set()
         self._ends: dict[str, dict[str, Any]] = {}
         self.messages = 0
+        self._diagnosed = 0
         for stream in streams:
             types = stream_types(graph, stream)
             if len(types) == 1:
@@ -55,10 +58,22 @@ class RecorderSink:
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._ends[stream] = {"final": final_stamp, "reason": reason}
 
+    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
+        self.writer.write_event(name, stamp, data)
+
+    def diagnostics(self, message: Diagnostics) -> None:
+        stream = diagnostics_key(self.graph.namespace)
+        if stream not in self._added:
+            self.writer.add_stream(stream, Diagnostics, static=False, extra={})
+            self._added.add(stream)
+        self.writer.write(stream, message, seq=self._diagnosed, incarnation=0)
+        self._diagnosed += 1
+
     def flush(self) -> None:
         self.writer.flush()
 
     def close(self, outcome: str) -> Mapping[str, Any]:
+        self.writer.flush()  # an outcome is said of what is there already
         self.writer.add_metadata(ENDS, {stream: json.dumps(end) for stream, end in sorted(self._ends.items())})
         self.writer.add_metadata(OUTCOME, {"outcome": outcome})
         self.writer.close()

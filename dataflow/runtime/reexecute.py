@@ -1,14 +1,14 @@
 """Drives an operator by its recorded firings and compares what it makes, digest by digest.
 
-The recorded firings say which messages each call was given, so nothing is decided again: drops, timeouts and lateness of
-a live run are repeated exactly. A difference is the operator's own when everything it had been given until then was as
-recorded (*culprit*); otherwise it follows from another's (*downstream*).
+The recorded firings say which messages each call was given, so nothing is decided again: drops, timeouts, lateness and
+restarts of a live run are repeated exactly. A difference is the operator's own when everything it had been given
+until then was as recorded (*culprit*); otherwise it follows from another's (*downstream*).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
@@ -17,10 +17,14 @@ from dataflow.messages.base import Message
 from dataflow.operator import Operator, OperatorSpec, outputs_of
 from dataflow.recording import Recording
 from dataflow.runtime.align import align_spec
-from dataflow.runtime.firings import Emission, FiringRecord, decode_batch
+from dataflow.runtime.firings import WITHHELD, Emission, FiringRecord, decode_batch
 from dataflow.runtime.runner import Emitter, OperatorFailure, OutputPorts, call_operator, changed_input, entries_of
 from dataflow.runtime.seeding import firing_seed, seed_generators
+from dataflow.runtime.states import pack_state
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
+
+CALLS = ("fire", "tick", "finish")
+"""The kinds of records that stand for a call with messages."""
 
 Verdict = Literal["identical", "culprit", "downstream", "unverifiable"]
 Digests = Mapping[str, Mapping[tuple[int, int], bytes]]
@@ -37,6 +41,7 @@ class Difference:
     port: str
     expected: str
     got: str
+    incarnation: int = 0
 
 
 @dataclass(slots=True)
@@ -44,8 +49,9 @@ class Verification:
     """What re-executing one operator came to.
 
     `verified` firings were repeated and compared; `unverifiable` ones could not be, because a message they were given
-    is not to be had; `after_cut` messages lie after the operator's last record. `tainted` is the index of the first
-    firing that was given anything other than recorded.
+    is not to be had; `lost_records` are missing between others, so the firings that follow them in their incarnation
+    cannot be repeated either; `after_cut` messages lie after the operator's last record. `tainted` is the index of the
+    first firing that was given anything other than recorded, `own_fault` says that the first difference came before.
     """
 
     operator: str
@@ -55,7 +61,9 @@ class Verification:
     differing: int = 0
     unverifiable: int = 0
     after_cut: int = 0
+    lost_records: int = 0
     complete: bool = False
+    own_fault: bool = False
     tainted: int | None = None
     first: Difference | None = None
     missing: str = ""
@@ -64,9 +72,8 @@ class Verification:
     @property
     def verdict(self) -> Verdict:
         if self.first is not None:
-            by_itself = self.tainted is None or self.first.index < self.tainted
-            return "culprit" if by_itself else "downstream"
-        return "unverifiable" if self.unverifiable else "identical"
+            return "culprit" if self.own_fault else "downstream"
+        return "unverifiable" if self.unverifiable or self.lost_records else "identical"
 
     def to_wire(self) -> dict[str, Any]:
         return asdict(self)
@@ -90,10 +97,37 @@ def recorded_digests(recording: Recording, nodes: Iterable[Node], streams: froze
         outputs = list(node.outputs.values())
         if not streams.isdisjoint(outputs):
             for record in recorded_firings(recording, node.name):
-                for stream, emission in zip(outputs, record.outputs, strict=True):
+                for stream, emission in zip(outputs, record.outputs, strict=False):  # a failed call has none
                     if emission is not None and stream in found:
                         found[stream][record.incarnation, emission.seq] = emission.digest
     return found
+
+
+def whole(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
+    """The records by (incarnation, index), each once, and how many calls had to be left out.
+
+    Where records are missing, those after them in the same incarnation cannot be repeated: the operator's state there
+    is not known. The next incarnation begins from `setup()` again (or, after a jump of the clock, does not).
+    """
+    kept: list[FiringRecord] = []
+    lost = 0
+    following = (0, 0)
+    known = True
+    for record in sorted(records, key=lambda r: (r.incarnation, r.index)):
+        place = (record.incarnation, record.index)
+        if place < following:
+            continue  # handed over twice, when its process died
+        begins = record.incarnation > following[0] or not following[1]
+        if begins:
+            known = record.index == 0 and (record.kind != "reset" or known)
+        else:
+            known = known and place == following
+        following = (record.incarnation, record.index + 1)
+        if known:
+            kept.append(record)
+        else:
+            lost += record.kind in CALLS
+    return kept, lost
 
 
 class RecordedRunner:
@@ -117,13 +151,14 @@ class RecordedRunner:
         self.emitter = emitter
         self.result = Verification(node.name)
         self._inputs = inputs
-        all_records = list(records)
-        self._setup = next((r for r in all_records if r.kind == "setup"), None)
-        self._records = [r for r in all_records if r.kind in ("fire", "tick", "finish")]
-        self.result.firings = len(self._records)
-        self.result.complete = any(r.kind == "finish" for r in self._records)
-        self.aligner = RecordedAligner(align_spec(node, self.spec, static), (r.firing() for r in self._records))
+        self._records, lost = whole(records)
+        calls = [r for r in self._records if r.kind in CALLS]
+        self.result.firings = len(calls) + lost
+        self.result.lost_records = lost
+        self.result.complete = any(r.kind == "finish" for r in calls)
+        self.aligner = RecordedAligner(align_spec(node, self.spec, static), (r.firing() for r in calls))
         self._position = 0
+        self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
         self._open = {s for streams in node.inputs.values() for s in streams}
         self._static = static
@@ -134,22 +169,27 @@ class RecordedRunner:
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
-        try:
-            self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, NEVER))
-            self.operator.setup()
-            statics = dict(self.operator.static_outputs())
-        except Exception as error:
-            raise OperatorFailure(self.node.name, "setup()", error) from error
-        if self._setup is not None:
-            before = self._setup.detail.get("files", {})
+        statics = self._set_up()
+        first = next(iter(self._records), None)
+        if first is not None and first.kind == "setup":
+            before = first.detail.get("files", {})
             self.result.files_changed = sorted(
                 f for f, digest in self.operator.files.items() if before.get(f) != digest
             )
-            self._compare(self._setup, statics)
+            self._compare(first, statics)
+            self._position = 1
         for state in self.ports.states.values():
             if state.port.static:
                 state.promised = FOREVER
                 self.emitter.end(state.stream, None, "static")
+
+    def _set_up(self) -> dict[str, Message]:
+        try:
+            self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, NEVER))
+            self.operator.setup()
+            return dict(self.operator.static_outputs())
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "setup()", error) from error
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
@@ -168,6 +208,7 @@ class RecordedRunner:
         """Makes the next recorded firing once its messages are there; ends when it cannot come any more."""
         if self.ended:
             return False
+        self._repeat_changes()
         firing = self.aligner.poll()
         if firing is None:
             if self._position >= len(self._records) or self._is_lost(self.aligner.missing()):
@@ -179,6 +220,50 @@ class RecordedRunner:
         self._fire(firing, record)
         self._position += 1
         return True
+
+    def _repeat_changes(self) -> None:
+        """What happened to the operator between the last firing and the next, in its recorded order."""
+        while self._position < len(self._records) and self._records[self._position].kind not in CALLS:
+            record = self._records[self._position]
+            self._position += 1
+            self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, NEVER))
+            match record.kind:
+                case "setup":
+                    self._start_again(record)
+                case "param":
+                    self._changed[record.detail["name"]] = record.detail["value"]
+                    self._attempt(record, lambda d: self.operator.set_parameter(d["name"], d["value"]))
+                case "reset":
+                    self._attempt(record, lambda d: self.operator.on_reset(d["input"]))
+                case "snapshot":
+                    self._compare_state(record)
+
+    def _start_again(self, record: FiringRecord) -> None:
+        """A new incarnation: a fresh operator, with the parameters as they were last set."""
+        self.operator.close()
+        self.operator = self.node.make()
+        for name, value in self._changed.items():
+            self.operator.set_parameter(name, value)
+        statics = self._set_up()
+        for (name, _), expected in zip(self.ports.states.items(), record.outputs, strict=True):
+            if expected is not None and (name not in statics or statics[name].digest() != expected.digest):
+                self._differ(record, name, expected.digest.hex(), "another static message")
+
+    def _attempt(self, record: FiringRecord, change: Callable[[Mapping[str, Any]], object]) -> None:
+        try:
+            change(record.detail)
+        except Exception as error:
+            if record.outcome != "error":
+                self._differ(record, "", "no error", f"{type(error).__name__}: {error}")
+        else:
+            if record.outcome == "error":
+                self._differ(record, "", f"error: {record.detail.get('error', '')}", "no error")
+
+    def _compare_state(self, record: FiringRecord) -> None:
+        state = self.operator.snapshot()
+        packed = b"" if state is None else pack_state(state)
+        if packed != record.detail["state"]:
+            self._differ(record, "", "the recorded state", "another state")
 
     def _is_lost(self, missing: MessageRef | None) -> bool:
         """Whether a message that the next firing needs can no longer come."""
@@ -202,11 +287,15 @@ class RecordedRunner:
         started = time.time_ns()
         if self.result.tainted is None and not self._as_recorded(firing):
             self.result.tainted = record.index
+        if record.detail.get("injected"):  # a fault that was tried out: the operator was not called
+            self.result.verified += 1
+            return
         self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, firing.stamp))
         try:
             messages = outputs_of(self.operator, call_operator(self.operator, firing))
         except Exception as error:
-            self._differ(record, "", record.outcome, f"{type(error).__name__}: {error}")
+            if record.outcome != "error":
+                self._differ(record, "", record.outcome, f"{type(error).__name__}: {error}")
             messages = {}
         else:
             if record.outcome == "error":
@@ -227,7 +316,8 @@ class RecordedRunner:
 
     def _compare(self, record: FiringRecord, messages: Mapping[str, Message]) -> None:
         """Compares with the record, and emits under the recorded numbers what the record says was emitted."""
-        for (name, state), expected in zip(self.ports.states.items(), record.outputs, strict=True):
+        recorded = record.outputs or (None,) * len(self.ports.states)
+        for (name, state), expected in zip(self.ports.states.items(), recorded, strict=True):
             got = messages.get(name)
             if expected is None and got is None:
                 continue
@@ -236,7 +326,7 @@ class RecordedRunner:
                 self._differ(record, name, *(_word(expected), _word(got)))
             elif got.digest() != expected.digest:
                 self._differ(record, name, expected.digest.hex(), got.digest().hex())
-            if expected is not None and got is not None:
+            if expected is not None and got is not None and expected.seq != WITHHELD:
                 assert state.digest is not None
                 state.digest.update(got.digest())
                 self.ports.emitted += 1
@@ -247,11 +337,14 @@ class RecordedRunner:
     def _differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
         self.result.differing += 1
         if self.result.first is None:
-            self.result.first = Difference(record.index, record.kind, record.stamp, port, expected, got)
+            self.result.own_fault = self.result.tainted is None
+            self.result.first = Difference(
+                record.index, record.kind, record.stamp, port, expected, got, record.incarnation
+            )
 
     def _end(self) -> None:
         self.ended, self.done = True, FOREVER
-        self.result.unverifiable = len(self._records) - self._position
+        self.result.unverifiable = sum(r.kind in CALLS for r in self._records[self._position :])
         if self.result.unverifiable and (lost := self.aligner.missing()) is not None:
             self.result.missing = f"{lost.stream} #{lost.seq}"
         self.ports.end(None, "end of records")

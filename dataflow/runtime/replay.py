@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable
 from pathlib import Path
 
 from dataflow.graph import load_bundle
@@ -60,13 +60,7 @@ def plan_replay(
                 f"but {graph.consumers(missing[0])[0][0].name!r} takes it; record it, or leave that operator out"
             )
         for stream in recorded:
-            info = recording.streams[stream]
-            wanted = graph.streams[stream].types
-            if info.message_type is None or info.message_type.SCHEMA not in wanted:
-                raise ReplayError(
-                    f"{recording.path}: stream {stream!r} holds {info.schema}, the graph's {node.name!r} emits "
-                    f"{' | '.join(wanted)}"
-                )
+            check_type(recording, graph, stream)
         streams += recorded
     if not streams:
         raise ReplayError(f"graph {graph.name!r} has no sources to replace")
@@ -74,12 +68,25 @@ def plan_replay(
     return LogPlan(
         Path(recording.path),
         tuple(sorted(streams)),
-        finals=_finals(recording.metadata.get(ENDS, {}), streams),
+        finals=final_stamps(recording, streams),
         start=None if start is None else first + round(start * 1e9),
         end=None if end is None else first + round(end * 1e9),
     )
 
 
-def _finals(ends: Mapping[str, str], streams: list[str]) -> dict[str, int]:
+def check_type(recording: Recording, graph: Graph, stream: str) -> None:
+    """Raises `ReplayError` unless a recorded stream holds what the graph's stream of that name carries."""
+    info = recording.streams[stream]
+    wanted = graph.streams[stream].types
+    if info.message_type is None or info.message_type.SCHEMA not in wanted:
+        raise ReplayError(
+            f"{recording.path}: stream {stream!r} holds {info.schema}, "
+            f"the graph's {graph.streams[stream].node!r} emits {' | '.join(wanted)}"
+        )
+
+
+def final_stamps(recording: Recording, streams: Iterable[str]) -> dict[str, int]:
+    """The stamps that streams ended with in the recorded run, where the recording says so."""
+    ends = recording.metadata.get(ENDS, {})
     known = {s: json.loads(ends[s]) for s in streams if s in ends}
     return {s: end["final"] for s, end in known.items() if end["final"] is not None}

@@ -8,18 +8,25 @@ from __future__ import annotations
 
 import time
 import traceback
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
+
+import numpy as np
 
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
 from dataflow.operator import Context, Operator, OperatorSpec, OutputError, OutputPort, Outputs, Source, outputs_of
 from dataflow.runtime.align import align_spec
-from dataflow.runtime.firings import DropRecord, Emission, FiringRecord, Kind
+from dataflow.runtime.firings import WITHHELD, DropRecord, Emission, FiringRecord, Kind
 from dataflow.runtime.seeding import firing_seed, seed_generators
+from dataflow.runtime.states import pack_state
 from dataflow.sync import FOREVER, NEVER, Aligner, Entry, Firing, InputValue, refs_of
+
+JUMP_AFTER = 3
+"""So many steps in a row with stamps in the past are a clock that has jumped back; fewer are stray messages."""
 
 
 class OperatorFailure(RuntimeError):
@@ -27,9 +34,34 @@ class OperatorFailure(RuntimeError):
 
     def __init__(self, operator: str, when: str, error: BaseException) -> None:
         self.operator, self.when = operator, when
-        self.summary = f"{type(error).__name__}: {error}"
-        self.traceback = "".join(traceback.format_exception(error))
+        self.summary = readable(error)
+        try:
+            self.traceback = _printable("".join(traceback.format_exception(error)))
+        except Exception:  # its own text cannot be made
+            self.traceback = "".join(traceback.format_tb(error.__traceback__)) + self.summary
         super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
+
+
+def readable(error: BaseException) -> str:
+    """The type and text of an error, whatever it is made of."""
+    try:
+        text = str(error)
+    except Exception as problem:
+        text = f"(its text cannot be made: {type(problem).__name__})"
+    return _printable(f"{type(error).__name__}: {text}" if text else type(error).__name__)
+
+
+def _printable(text: str) -> str:
+    return text.encode(errors="backslashreplace").decode()
+
+
+def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
+    """What an operator sums up, as plain values. Raises `OperatorFailure`."""
+    try:
+        found = dict(operator.summary())
+        return {str(key): item if isinstance(item, str) else np.asarray(item).item() for key, item in found.items()}
+    except Exception as error:
+        raise OperatorFailure(name, "summary()", error) from error
 
 
 class InputMutated(RuntimeError):
@@ -49,7 +81,7 @@ class Emitter(Protocol):
         """The stream has ended."""
 
     def record(self, record: FiringRecord) -> None:
-        """A firing was made; called after its messages were emitted."""
+        """A firing was made; called before its messages are sent, so no message is known that no record explains."""
 
 
 @dataclass(slots=True)
@@ -71,13 +103,20 @@ class PortState:
 class OutputPorts:
     """The output ports of one operator: rule 5 of the time model, sequence numbers and frontiers."""
 
-    def __init__(self, node: Node, spec: OperatorSpec, emitter: Emitter) -> None:
-        self.node, self.emitter = node, emitter
+    def __init__(self, node: Node, spec: OperatorSpec, emitter: Emitter, *, lossy: bool = False) -> None:
+        self.node, self.emitter, self.lossy = node, emitter, lossy
         self.states = {name: PortState(port, node.outputs[name]) for name, port in spec.outputs.items()}
         self.emitted = 0
+        self.withheld: Counter[str] = Counter()
+        """Messages that were not sent because their stamps did not increase, by port."""
+        self._prepared: list[tuple[str, Entry]] = []
 
-    def emit(self, messages: Mapping[str, Message], firing: int) -> tuple[Emission | None, ...]:
-        """Publishes what one firing emitted. Raises `OutputError` for a stamp that the port may not carry."""
+    def prepare(self, messages: Mapping[str, Message], firing: int) -> tuple[Emission | None, ...]:
+        """Checks and numbers what one firing emitted; `publish` sends it, after the firing was recorded.
+
+        Raises `OutputError` for a stamp that the port may not carry. With `lossy`, a stamp that does not increase is
+        no error: the message is not sent, and its emission is marked `withheld`.
+        """
         for name, message in messages.items():
             state = self.states[name]
             earliest = firing - state.port.lag
@@ -86,7 +125,7 @@ class OutputPorts:
                     f" less its lag of {state.port.lag} ns" if state.port.lag else ""
                 )
                 raise OutputError(f"{self.node.name}.{name} emitted stamp {message.stamp}; it must lie {allowed}")
-            if message.stamp <= state.last:
+            if message.stamp <= state.last and not self.lossy:
                 raise OutputError(
                     f"{self.node.name}.{name} emitted stamp {message.stamp} after {state.last}: "
                     "the stamps of a stream strictly increase"
@@ -98,15 +137,40 @@ class OutputPorts:
                 emissions.append(None)
                 continue
             digest = emitted.digest()
+            if emitted.stamp <= state.last:
+                self.withheld[name] += 1
+                emissions.append(Emission(WITHHELD, emitted.stamp, digest))
+                continue
             assert state.digest is not None
             state.digest.update(digest)
             entry = Entry(emitted.stamp, emitted, state.seq, state.incarnation, digest, state.stream)
+            self._prepared.append((state.stream, entry))
             state.last = state.promised = emitted.stamp
             emissions.append(Emission(state.seq, emitted.stamp, digest))
             state.seq += 1
             self.emitted += 1
-            self.emitter.message(state.stream, entry)
         return tuple(emissions)
+
+    def publish(self) -> None:
+        """Sends what was prepared, in order."""
+        prepared, self._prepared = self._prepared, []
+        for stream, entry in prepared:
+            self.emitter.message(stream, entry)
+
+    def begin(self, incarnation: int, *, stamps_go_back: bool = False) -> None:
+        """Begins a new incarnation of every dynamic port: numbers from 0 again, and stamps too if they may go back."""
+        for state in self.states.values():
+            if state.port.static:
+                continue
+            state.incarnation, state.seq = incarnation, 0
+            if stamps_go_back:
+                state.last = state.promised = NEVER
+
+    def resume(self, incarnation: int, last: Mapping[str, int]) -> None:
+        """Goes on where an earlier process of this operator ended: its last stamps, by port."""
+        self.begin(incarnation)
+        for name, stamp in last.items():
+            self.states[name].last = self.states[name].promised = stamp
 
     def promise(self, frontier: int) -> None:
         """Raises the frontier of every dynamic port to `frontier` less its lag, where that is news."""
@@ -156,22 +220,41 @@ def set_up(operator: Operator, ports: OutputPorts, records: Recorder, node: Node
     try:
         operator.rng = seed_generators(firing_seed(seed, node.name, NEVER))
         operator.setup()
-        statics = dict(operator.static_outputs())
-        for name, message in statics.items():
-            port = operator.spec.outputs.get(name)
-            if port is None or not port.static:
-                raise OutputError(f"{node.name}: static_outputs() gave {name!r}, which is no static output port")
-            if not isinstance(message, port.types):
-                raise OutputError(f"{node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
-        emissions = ports.emit(statics, NEVER)
-        for state in ports.states.values():
-            if state.port.static:
-                ports.emitter.end(state.stream, None, "static")
-                state.promised = FOREVER
-    except Exception as error:
+        emissions = ports.prepare(checked_statics(operator, node), NEVER)
+    except (Exception, SystemExit, KeyboardInterrupt) as error:
         raise OperatorFailure(node.name, "setup()", error) from error
-    detail = {"params": dict(node.params), "files": dict(operator.files)}
+    detail = {"params": operator.params.model_dump(mode="json"), "files": dict(operator.files)}
     records.add("setup", NEVER + 1, started, outputs=emissions, detail=detail)
+    ports.publish()
+    for state in ports.states.values():
+        if state.port.static:
+            ports.emitter.end(state.stream, None, "static")
+            state.promised = FOREVER
+
+
+def set_up_again(operator: Operator, ports: OutputPorts, records: Recorder, node: Node, seed: int) -> None:
+    """`setup()` of an operator that takes the place of a failed one; its static streams go on as they are."""
+    started = time.time_ns()
+    try:
+        operator.rng = seed_generators(firing_seed(seed, node.name, NEVER))
+        operator.setup()
+        checked_statics(operator, node)
+    except (Exception, SystemExit, KeyboardInterrupt) as error:
+        raise OperatorFailure(node.name, "setup()", error) from error
+    detail = {"params": operator.params.model_dump(mode="json"), "files": dict(operator.files)}
+    records.add("setup", NEVER + 1, started, outputs=(None,) * len(ports.states), detail=detail)
+
+
+def checked_statics(operator: Operator, node: Node) -> dict[str, Message]:
+    """What `static_outputs()` gives, by port. Raises `OutputError` for what is not declared so."""
+    statics = dict(operator.static_outputs())
+    for name, message in statics.items():
+        port = operator.spec.outputs.get(name)
+        if port is None or not port.static:
+            raise OutputError(f"{node.name}: static_outputs() gave {name!r}, which is no static output port")
+        if not isinstance(message, port.types):
+            raise OutputError(f"{node.name}.{name} is a {port.type_text()}, got {type(message).__name__}")
+    return statics
 
 
 class OperatorRunner:
@@ -186,17 +269,23 @@ class OperatorRunner:
         seed: int = 0,
         paranoid: bool = False,
         operator: Operator | None = None,
+        lossy: bool = False,
+        snapshots: int | None = None,
     ) -> None:
-        self.node, self.seed, self.paranoid = node, seed, paranoid
+        self.node, self.seed, self.paranoid, self.snapshots = node, seed, paranoid, snapshots
+        self._next_snapshot: int | None = None
         self.operator = node.make() if operator is None else operator
         self.spec = self.operator.spec
-        self.ports = OutputPorts(node, self.spec, emitter)
+        self.ports = OutputPorts(node, self.spec, emitter, lossy=lossy)
         self.records = Recorder(node.name, emitter)
         self.aligner = Aligner(align_spec(node, self.spec, static))
         self.firings = 0
         self.done = NEVER
         self.ended = False
         self.busy_ns = 0
+        self.working_since: float | None = None
+        """When the call that is under way began (monotonic seconds), for whoever watches over it."""
+        self.working_stamp = NEVER
 
     def setup(self) -> None:
         set_up(self.operator, self.ports, self.records, self.node, self.seed)
@@ -218,6 +307,13 @@ class OperatorRunner:
         held = self.aligner.waiting()
         return (None, {}) if held is None else (held.stamp, dict(held.needs))
 
+    def set_parameter(self, name: str, value: Any) -> Any:
+        """Changes a parameter between two firings; recorded. Returns the value as validated.
+
+        Raises `ParameterError` for one that does not exist, cannot change while running, or is out of bounds.
+        """
+        return change_parameter(self.operator, self.records, name, value, max(self.done, NEVER + 1))
+
     def push(self, stream: str, entry: Entry) -> None:
         self.aligner.push(stream, entry)
 
@@ -238,7 +334,11 @@ class OperatorRunner:
             self.done = max(self.done, frontier)
             return False
         self.ports.promise(firing.stamp - 1)
-        self._fire(firing)
+        self.working_stamp, self.working_since = firing.stamp, time.monotonic()
+        try:
+            self._fire(firing)
+        finally:
+            self.working_since = None
         if firing.kind == "finish":
             self.ended, self.done = True, FOREVER
             self.ports.end(self.aligner.final_stamp(), "end of input")
@@ -252,17 +352,44 @@ class OperatorRunner:
             messages = outputs_of(self.operator, call_operator(self.operator, firing))
             if self.paranoid and (problem := changed_input(self.node, firing)) is not None:
                 raise problem
-            emissions = self.ports.emit(messages, firing.stamp)
-        except Exception as error:
+            emissions = self.ports.prepare(messages, firing.stamp)
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
             failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
             self._record(kind, firing, started, (), failure.summary)
             raise failure from error
         self.firings += kind != "finish"
         self._record(kind, firing, started, emissions, None)
+        self.ports.publish()
         self.busy_ns += time.time_ns() - started
+        if self.snapshots is not None and kind != "finish":
+            self._snapshot_if_due(firing.stamp)
+
+    def _snapshot_if_due(self, stamp: int) -> None:
+        """Records the operator's state, about every `snapshots` ns of event time; at the same firings in every run."""
+        assert self.snapshots is not None
+        if self._next_snapshot is None:
+            self._next_snapshot = stamp + self.snapshots
+        if stamp < self._next_snapshot:
+            return
+        self._next_snapshot = stamp + self.snapshots
+        started = time.time_ns()
+        try:
+            state = self.operator.snapshot()
+            packed = None if state is None else pack_state(state)
+        except Exception as error:
+            raise OperatorFailure(self.node.name, f"snapshot() after stamp {stamp}", error) from error
+        if packed is not None:
+            self.records.add("snapshot", stamp, started, detail={"state": packed})
 
     def _record(
-        self, kind: Kind, firing: Firing, started: int, outputs: tuple[Emission | None, ...], error: str | None
+        self,
+        kind: Kind,
+        firing: Firing,
+        started: int,
+        outputs: tuple[Emission | None, ...],
+        error: str | None,
+        *,
+        injected: bool = False,
     ) -> None:
         self.records.add(
             kind,
@@ -275,8 +402,17 @@ class OperatorRunner:
             outputs=outputs,
             outcome="ok" if error is None else "error",
             drops=tuple(self.take_drops()),
-            detail={} if error is None else {"error": error},
+            detail={} if error is None else {"error": error, **({"injected": True} if injected else {})},
         )
+
+
+def change_parameter(operator: Operator, records: Recorder, name: str, value: Any, stamp: int) -> Any:
+    """Sets a parameter of an operator that runs, and records it; the value as validated, in plain form."""
+    started = time.time_ns()
+    operator.set_parameter(name, value)
+    plain = operator.params.model_dump(mode="json")[name]
+    records.add("param", stamp, started, detail={"name": name, "value": plain})
+    return plain
 
 
 def call_operator(operator: Operator, firing: Firing) -> Outputs:
@@ -308,12 +444,18 @@ def changed_input(node: Node, firing: Firing) -> InputMutated | None:
 class SourceRunner:
     """One source: `stream()` is read one step at a time, with one step of look-ahead."""
 
-    def __init__(self, node: Node, emitter: Emitter, *, seed: int = 0, operator: Source | None = None) -> None:
+    def __init__(
+        self, node: Node, emitter: Emitter, *, seed: int = 0, operator: Source | None = None, live: bool = False
+    ) -> None:
         self.node, self.seed = node, seed
         self.operator = node.make() if operator is None else operator
         assert isinstance(self.operator, Source)
         self.source: Source = self.operator
-        self.ports = OutputPorts(node, self.operator.spec, emitter)
+        self.ports = OutputPorts(node, self.operator.spec, emitter, lossy=live)
+        self.refused: Counter[str] = Counter()
+        """Steps of a live run that were not sent, by reason."""
+        self._backwards: list[int] = []
+        self._resumed = False
         self.records = Recorder(node.name, emitter)
         self.firings = 0
         self.ended = False
@@ -353,10 +495,11 @@ class SourceRunner:
                     stamps = {m.stamp for m in messages.values()}
                     if len(stamps) != 1:
                         raise OutputError(
-                            f"{self.node.name} yielded stamps {sorted(stamps)} together; one step of stream() has one stamp"
+                            f"{self.node.name} yielded stamps {sorted(stamps)} together; "
+                            "one step of stream() has one stamp"
                         )
                     return messages
-        except Exception as error:
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
             raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
         return None
 
@@ -378,20 +521,76 @@ class SourceRunner:
             raise OperatorFailure(self.node.name, "stream()", error)
         self.last = stamp
         try:
-            emissions = self.ports.emit(step, stamp)
+            emissions = self.ports.prepare(step, stamp)
         except OutputError as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
         self.firings += 1
         lost, self._told = self.overflow - self._told, self.overflow
         self.records.add("fire", stamp, started, outputs=emissions, detail={"overflow": lost} if lost else {})
+        self.ports.publish()
         return len(step), sum(m.nbytes() for m in step.values())
+
+    def emit_live(self, step: Mapping[str, Message]) -> tuple[int, int] | None:
+        """As `emit`, for a source whose stamps may go back: returns None for a step that is not sent.
+
+        One step with a stamp in the past is dropped as `past`. Where the next ones lie there too, and go on from it,
+        the clock has jumped back: the streams begin a new incarnation. A source that was started again and gives what
+        it gave before is not listened to until it is past that (`repeated`).
+        """
+        stamp = step_stamp(step)
+        if stamp > self.last:
+            self._backwards.clear()
+            self._resumed = False
+            return self.emit(step)
+        if self._resumed:
+            self.refused["repeated"] += 1
+            return None
+        if self._backwards and stamp <= self._backwards[-1]:
+            self._backwards.clear()
+        self._backwards.append(stamp)
+        if len(self._backwards) < JUMP_AFTER:
+            self.refused["past"] += 1
+            return None
+        self._backwards.clear()
+        self._begin_after_jump(stamp)
+        return self.emit(step)
+
+    def _begin_after_jump(self, stamp: int) -> None:
+        incarnation = self.records.incarnation + 1
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation, stamps_go_back=True)
+        self.records.add("reset", stamp, time.time_ns(), detail={"last": self.last})
+        self.last = NEVER
+
+    def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
+        """Takes the place of a source whose process died; to be called before `setup()`."""
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.resume(incarnation, last)
+        self.last = max(last.values(), default=NEVER)
+        self._resumed = not self.source.live
+        for name, value in changed.items():
+            self.operator.set_parameter(name, value)
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`."""
+        return change_parameter(self.operator, self.records, name, value, max(self.last, NEVER + 1))
 
     def finish(self, reason: str = "end of source") -> None:
         """Ends the streams; the source is done."""
         if not self.ended:
             self.ended = True
+            self._next = None
             self.records.add("finish", self.last, time.time_ns(), outputs=(None,) * len(self.ports.states))
             self.ports.end(None if self.last == NEVER else self.last, reason)
+
+    def close_stream(self) -> None:
+        """Ends `stream()` where it stands, so that its `finally` runs; on the thread that reads it."""
+        close = getattr(self._steps, "close", None)
+        if close is not None:
+            try:
+                close()
+            except Exception as error:
+                raise OperatorFailure(self.node.name, "the end of stream()", error) from error
 
 
 def step_stamp(step: Mapping[str, Message]) -> int:

@@ -14,10 +14,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+import numpy as np
+
 from dataflow.graph.model import Graph
+from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message, message_type
 from dataflow.runtime.control import Channel, ChannelClosed
-from dataflow.runtime.firings import decode_batch
+from dataflow.runtime.firings import decode_batch, encode_batch
 from dataflow.runtime.keys import firings_key
 from dataflow.runtime.network import network_config
 from dataflow.sync import FOREVER, NEVER
@@ -42,6 +45,7 @@ class SinkConfig:
     firings: list[str]
     connect: list[str]
     options: dict[str, Any]
+    live: bool = False
 
 
 class StreamSink(Protocol):
@@ -53,10 +57,16 @@ class StreamSink(Protocol):
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
 
+    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
+        """Something happened to the run: an operator was started again, a fault was planned."""
+
+    def diagnostics(self, message: Diagnostics) -> None:
+        """How every operator fares."""
+
     def flush(self) -> None: ...
 
     def close(self, outcome: str) -> Mapping[str, Any]:
-        """Completes the output; `outcome` is "complete" or says why the run ended. Returns facts about what was written."""
+        """Completes the output; `outcome` is "complete" or says why the run ended. Returns what it wrote."""
 
 
 class SinkFailure(RuntimeError):
@@ -82,6 +92,7 @@ class SinkHost:
         self.received = 0
         self.written = 0
         self._expected: dict[str, tuple[int, int]] = {}
+        self._recorded: dict[str, tuple[int, int]] = {}  # operator → the record that follows those stored
         self._probed: set[str] = set()
         self._done = NEVER
         self._report_due = 0.0
@@ -137,10 +148,7 @@ class SinkHost:
         assert self.sink is not None
         if key in self.firings_open and bytes(payload[: len(MAGIC)]) != MAGIC:
             self.received += 1
-            data = bytes(payload)
-            batch = decode_batch(data)
-            self.sink.firings(batch.operator, batch.records[-1].stamp, data)
-            if batch.last:
+            if self._take_records(bytes(payload)):
                 self.firings_open.pop(key)
             return
         try:
@@ -154,10 +162,16 @@ class SinkHost:
                     self._probed.add(key)
                     self.channel.send("seen", stream=key)
                 return
+            case Kind.MESSAGE if self.graph.streams[key].static and key in self._expected:
+                self.received += 1  # its operator was started again; the stream goes on as it is
+                return
             case Kind.MESSAGE:
                 incarnation, expected = self._expected.get(key, (envelope.incarnation, envelope.seq))
                 if incarnation == envelope.incarnation and expected != envelope.seq:
-                    raise SinkFailure(f"stream {key!r} lost messages: number {expected} was due, {envelope.seq} came")
+                    if self.config.live:
+                        self.channel.send("gap", stream=key, first=expected, following=envelope.seq)
+                    else:
+                        self._lost(key, expected, envelope.seq)
                 self._expected[key] = (envelope.incarnation, envelope.seq + 1)
                 assert envelope.message is not None
                 self.sink.message(key, envelope.message, envelope.seq, envelope.incarnation)
@@ -169,6 +183,27 @@ class SinkHost:
                 self.frontiers[key] = FOREVER
                 self.sink.end(key, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
         self.received += 1
+
+    def _lost(self, stream: str, due: int, came: int) -> None:
+        raise SinkFailure(f"stream {stream!r} lost messages: number {due} was due, {came} came")
+
+    def _take_records(self, data: bytes) -> bool:
+        """Stores a batch of firing records, those of it that are not stored yet; True for an operator's last batch.
+
+        Records of an operator come twice when its process has died: once from itself and once from the supervisor.
+        """
+        assert self.sink is not None
+        batch = decode_batch(data)
+        following = self._recorded.get(batch.operator, (-1, 0))
+        first, last = batch.records[0], batch.records[-1]
+        if (batch.incarnation, first.index) < following:
+            fresh = [r for r in batch.records if (r.incarnation, r.index) >= following]
+            if not fresh:
+                return batch.last
+            data = encode_batch(fresh, last=batch.last)
+        self._recorded[batch.operator] = (batch.incarnation, last.index + 1)
+        self.sink.firings(batch.operator, last.stamp, data)
+        return batch.last
 
     def _report(self, now: float) -> None:
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
@@ -196,6 +231,18 @@ class SinkHost:
                     full=False,
                     waiting={},
                 )
+            case "records":
+                assert self.sink is not None
+                for data in fields["batches"]:
+                    self._take_records(data)
+            case "expect":
+                self._probed.difference_update(fields["streams"])
+            case "event":
+                assert self.sink is not None
+                self.sink.event(fields["name"], fields["stamp"], fields["data"])
+            case "diagnostics":
+                assert self.sink is not None
+                self.sink.diagnostics(_diagnostics(fields))
             case "leave":
                 self._outcome = fields["outcome"]
                 self._left = True
@@ -224,6 +271,19 @@ class SinkHost:
             facts = self.sink.close(self._outcome)
         self.bus.close()
         return facts
+
+
+def _diagnostics(fields: Mapping[str, Any]) -> Diagnostics:
+    pairs = [(k, name, str(value)) for k, values in enumerate(fields["values"]) for name, value in values.items()]
+    return Diagnostics(
+        stamp=fields["stamp"],
+        names=tuple(fields["names"]),
+        messages=tuple(fields["messages"]),
+        keys=tuple(name for _, name, _ in pairs),
+        values=tuple(value for _, _, value in pairs),
+        levels=np.array(fields["levels"], np.uint8),
+        owners=np.array([k for k, _, _ in pairs], np.int32) if pairs else None,
+    )
 
 
 def recorder(config: SinkConfig, graph: Graph) -> StreamSink:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.runtime.execute import Watch, execute
+from dataflow.runtime.outputs import OutputComparison, compare_outputs
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import Verification, recorded_firings
 from dataflow.runtime.replay import ReplayError, plan_replay, recorded_graph
+from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.threads import environment
+
+Verdict = Literal["identical", "within tolerance", "culprit", "downstream", "unverifiable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +28,9 @@ class VerifyReport:
 
     `stood_in` are the operators whose recorded streams were used instead; `facts` what differs between the machine that
     recorded and this one: (fact, then, now); `wall` is in seconds, `span` seconds of event time.
+    `comparisons` hold, for culprits (with a `tolerance`: for all that differ), how their messages compare with the
+    recorded ones. `digests` are (messages, stream digest) of what was made here, by stream; `outputs` the streams of
+    each operator, `producers` those that it takes from.
     """
 
     operators: tuple[Verification, ...]
@@ -31,25 +40,61 @@ class VerifyReport:
     streams: int
     wall: float
     span: float
+    tolerance: float | None = None
+    comparisons: Mapping[str, OutputComparison] = field(default_factory=dict)
+    digests: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:
-        """True only when every recorded firing was repeated and every output was the same."""
+        """True only when every recorded firing was repeated and every output was the same, bit for bit."""
         return all(v.verdict == "identical" for v in self.operators)
 
     @property
+    def within_tolerance(self) -> bool:
+        """Every operator is identical or, given the recorded inputs, stays within the tolerance."""
+        return all(self.verdict(v) in ("identical", "within tolerance") for v in self.operators)
+
+    @property
     def culprits(self) -> tuple[str, ...]:
-        return tuple(v.operator for v in self.operators if v.verdict == "culprit")
+        return tuple(v.operator for v in self.operators if self.verdict(v) == "culprit")
+
+    def verdict(self, verification: Verification) -> Verdict:
+        """The verdict on an operator: its own, or what the tolerance makes of it."""
+        compared = self.comparisons.get(verification.operator)
+        if self.tolerance is None or verification.first is None or compared is None or compared.note:
+            return verification.verdict
+        return "within tolerance" if compared.tolerated else "culprit"
+
+    def repeats(self, operator: str) -> bool | None:
+        """Whether an operator that differs did so twice alike; None where it was not run twice."""
+        compared = self.comparisons.get(operator)
+        first = next((v.first for v in self.operators if v.operator == operator), None)
+        verdict = next((v.verdict for v in self.operators if v.operator == operator), None)
+        if compared is None or compared.note or first is None or verdict != "culprit":
+            return None
+        return (compared.index, compared.got) == (first.index, first.got)
 
     def as_json(self) -> dict[str, Any]:
+        operators = []
+        for v in self.operators:
+            compared = self.comparisons.get(v.operator)
+            operators.append(
+                v.to_wire()
+                | {"verdict": self.verdict(v), "repeats": self.repeats(v.operator)}
+                | {"comparison": None if compared is None else compared.as_json()}
+            )
         return {
             "identical": self.identical,
+            "tolerance": self.tolerance,
+            "within_tolerance": None if self.tolerance is None else self.within_tolerance,
             "culprits": list(self.culprits),
             "messages": self.messages,
             "streams": self.streams,
             "wall_s": self.wall,
             "real_time_factor": self.span / self.wall if self.wall else None,
-            "operators": [v.to_wire() | {"verdict": v.verdict} for v in self.operators],
+            "operators": operators,
             "stood_in": list(self.stood_in),
             "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
         }
@@ -61,33 +106,35 @@ def verify(
     graph: Graph | None = None,
     first: str | None = None,
     only: str | None = None,
+    tolerance: float | None = None,
     watch: Watch | None = None,
     **options: Any,
 ) -> VerifyReport:
     """Re-executes a recording by its firing records and compares.
 
     `first`: verify that operator and what follows from it; `only`: that one alone. What feeds them is then taken from
-    the recording. Operators marked `external` always are. Further options are the fields of `RunPlan`.
+    the recording. Operators marked `external` always are. Operators that differ are run once more, alone and given the
+    recorded inputs, and their messages compared field by field: the culprits as far as the first difference, with a
+    `tolerance` (absolute, in the unit of each floating-point field) all of them to the end.
+    Further options are the fields of `RunPlan`.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
+    if tolerance is not None and not 0 <= tolerance < math.inf:
+        raise ReplayError(f"tolerance {tolerance}: expected a finite number, 0 or more")
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
         chosen = _chosen(played, first, only)
-        unrecorded = [name for name in sorted(chosen) if next(recorded_firings(recording, name), None) is None]
-        if unrecorded:
-            raise ReplayError(
-                f"{path}: operator {unrecorded[0]!r} left no firing records there; "
-                "name the graph that made the recording with --graph, or record with --record"
-            )
+        require_records(recording, sorted(chosen))
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
         log = plan_replay(recording, played, replaced=feeding)
-        facts = _differing_facts(recording.metadata)
+        facts = _differing_facts(recording.metadata, played)
     report = execute(RunPlan(played, log=log, verify=frozenset(chosen), **options), mode="verify", watch=watch)
     found = {v["operator"]: Verification.from_wire(v) for v in report.verifications}
     compared = [found[name] for name in played.nodes if name in found]
     span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
+    differing = [v.operator for v in compared if v.first and (tolerance is not None or v.verdict == "culprit")]
     return VerifyReport(
         operators=tuple(compared),
         stood_in=tuple(name for name in played.nodes if name in feeding),
@@ -96,7 +143,39 @@ def verify(
         streams=sum(len(played.nodes[v.operator].outputs) for v in compared),
         wall=report.wall,
         span=span,
+        tolerance=tolerance,
+        comparisons=_compare(path, played, differing, tolerance),
+        digests=report.streams,
+        outputs={v.operator: tuple(played.nodes[v.operator].outputs.values()) for v in compared},
+        producers={
+            v.operator: frozenset(
+                played.streams[s].node for taken in played.nodes[v.operator].inputs.values() for s in taken
+            )
+            for v in compared
+        },
     )
+
+
+def require_records(recording: Recording, operators: Iterable[str]) -> None:
+    """Raises `ReplayError` for the first operator without firing records."""
+    for name in operators:
+        if next(recorded_firings(recording, name), None) is None:
+            raise ReplayError(
+                f"{recording.path}: operator {name!r} left no firing records there; "
+                "name the graph that made the recording with --graph, or record with --record"
+            )
+
+
+def _compare(
+    path: Path, graph: Graph, operators: Collection[str], tolerance: float | None
+) -> Mapping[str, OutputComparison]:
+    """The messages of operators that differ against the recorded ones; what prevents that is said in their `note`."""
+    if not operators:
+        return {}
+    try:
+        return compare_outputs(path, graph, operators, tolerance=tolerance)
+    except RunFailed as failure:
+        return {name: OutputComparison(name, note=f"not compared field by field: {failure}") for name in operators}
 
 
 def _chosen(graph: Graph, first: str | None, only: str | None) -> set[str]:
@@ -119,13 +198,17 @@ def _chosen(graph: Graph, first: str | None, only: str | None) -> set[str]:
     return following & able
 
 
-def _differing_facts(metadata: Mapping[str, Mapping[str, str]]) -> tuple[tuple[str, str, str], ...]:
-    """Facts of the machine, packages and threads that are not as when the recording was made."""
-    here = machine_facts()
-    return tuple(
+def _differing_facts(metadata: Mapping[str, Mapping[str, str]], graph: Graph) -> tuple[tuple[str, str, str], ...]:
+    """Facts of the machine, packages, threads and devices that are not as when the recording was made."""
+    here = machine_facts(environment(graph.threads))
+    here["threads"] = {name: value for name, value in here["threads"].items() if name in metadata.get("threads", {})}
+    facts = [
         (f"{group} {name}", metadata[group].get(name, "–"), here[group].get(name, "–"))
         for group in sorted(here.keys() & metadata.keys())
-        if group != "threads"
         for name in sorted(here[group].keys() | metadata[group].keys())
         if metadata[group].get(name) != here[group].get(name)
-    )
+    ]
+    threads = metadata.get("dataflow:run", {}).get("threads", str(graph.threads))
+    if threads != str(graph.threads):
+        facts.append(("graph threads", threads, str(graph.threads)))
+    return tuple(facts)

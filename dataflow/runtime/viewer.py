@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
+from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.runtime.sink import SinkFailure, stream_types
 from dataflow.view import Save, ViewerSink
@@ -30,6 +31,12 @@ class ViewerFileSink:
 
     def firings(self, operator: str, stamp: int, payload: bytes) -> None:
         """Firing records are not shown."""
+
+    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
+        """Events of the run are told by the recording."""
+
+    def diagnostics(self, message: Diagnostics) -> None:
+        """Diagnostics of the run are told by the recording and by `dataflow top`."""
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         """A stream that ended stays as it is."""

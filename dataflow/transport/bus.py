@@ -343,6 +343,25 @@ class Bus:
                 found[stream] = bytes(sample.payload)
         return found
 
+    # Requests
+
+    def serve(self, key: str, answer: Callable[[zenoh.Query], object]) -> Token:
+        """Hands every request for `key` to `answer`, on Zenoh's thread; it (or who it hands it on to) replies once."""
+        return self._keep(
+            Token(self.session.declare_queryable(key, zenoh.handlers.Callback(answer, indirect=False), complete=True))
+        )
+
+    def ask(self, key: str, payload: bytes = b"", timeout: float = 5.0) -> list[bytes]:
+        """The answers to a request; waits at most `timeout` seconds for all of them."""
+        replies = self.session.get(
+            key,
+            payload=payload,
+            target=zenoh.QueryTarget.ALL,
+            consolidation=zenoh.ConsolidationMode.NONE,
+            timeout=timeout,
+        )
+        return [bytes(reply.ok.payload) for reply in replies if reply.ok is not None]
+
     # Presence
 
     def alive(self, namespace: str, name: str) -> Token:

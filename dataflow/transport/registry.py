@@ -72,6 +72,7 @@ def register(
     name: str, namespace: str, endpoints: Sequence[str], graph: Mapping[str, Any] | None = None
 ) -> Iterator[RunningGraph]:
     """Makes this process's graph known to tools for as long as the block runs. `graph` must be JSON values."""
+    running()  # clears away what others have left
     pid = os.getpid()
     entry = RunningGraph(
         name,

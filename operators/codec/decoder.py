@@ -20,9 +20,11 @@ class ImageDecoder(Operator):
 
     def process(self, compressed: CompressedImage) -> Image:
         """Raises ValueError where the bytes are not a whole image."""
-        pixels = _decoded(compressed, cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION, self.max_pixels)
+        # Without IMREAD_ANYDEPTH OpenCV answers with bytes, whatever the file holds.
+        flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        pixels = _decoded(compressed, flags, self.max_pixels).astype(np.uint8, copy=False)
         if pixels.ndim == 3:
-            pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+            pixels = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), np.uint8)
         return Image(stamp=compressed.stamp, frame=compressed.frame, data=pixels)
 
 

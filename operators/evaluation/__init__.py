@@ -1,5 +1,7 @@
 """Sinks that score streams against ground truth."""
 
+from operators.evaluation.detection_metrics import DetectionMetrics
+from operators.evaluation.segmentation_metrics import SegmentationMetrics
 from operators.evaluation.trajectory_metrics import TrajectoryMetrics
 
-__all__ = ["TrajectoryMetrics"]
+__all__ = ["DetectionMetrics", "SegmentationMetrics", "TrajectoryMetrics"]

@@ -1,43 +1,43 @@
-"""The segmenter: MobileNetV2 and a light decoder that climbs back to half the input's resolution."""
+"""The segmenter: a backbone and a light decoder that climbs back to half the input's resolution."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.training.backbone import ConvNorm, MobileNetV2, SeparableConv
+from operators.training.backbone import Backbone, ConvNorm, MobileNetV2, SeparableConv
 
-_LEVELS = ((16, 64), (8, 48), (4, 32), (2, 24))
-"""(stride, channels) on the way back."""
+_LEVELS = ((16, 64, 64), (8, 48, 48), (4, 32, 24), (2, 16, 24))
+"""(stride, channels taken from the backbone, channels after merging) on the way back."""
 
 
-class SegmentationNetwork(nn.Module):
-    """Images (N, 3, H, W) in [0, 1] → class scores (N, C, ⌈H / 2⌉, ⌈W / 2⌉) before the softmax.
+class ClassDecoder(nn.Module):
+    """Feature maps by stride → class scores (N, C, H, W) at stride 2, before the softmax.
 
     The deepest map is weighed by the scene as a whole, as in LR-ASPP (Howard et al. 2019), then enlarged and merged
     with finer maps step by step, since a mug is a few pixels wide.
     """
 
-    def __init__(self, classes: int, width: float = 1.0) -> None:
+    def __init__(self, classes: int, inputs: Mapping[int, int]) -> None:
         super().__init__()
-        self.backbone = MobileNetV2(width)
-        deepest = self.backbone.channels[32]
+        deepest = inputs[32]
         self.context = ConvNorm(deepest, 96, 1)
         self.gate = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Conv2d(deepest, 96, 1), nn.Sigmoid())
-        self.lateral = nn.ModuleList(ConvNorm(self.backbone.channels[s], c, 1) for s, c in _LEVELS)
-        inputs = [96, *(c for _, c in _LEVELS)]
+        self.lateral = nn.ModuleList(ConvNorm(inputs[s], c, 1) for s, c, _ in _LEVELS)
+        coarser = [96, *(c for _, _, c in _LEVELS)]
         self.merge = nn.ModuleList(
-            nn.Sequential(SeparableConv(inputs[i] + c, c), SeparableConv(c, c)) for i, (_, c) in enumerate(_LEVELS)
+            # At half the resolution, reading and writing cost more than arithmetic: one full convolution.
+            nn.Sequential(SeparableConv(above + fine, c), SeparableConv(c, c)) if s > 2 else ConvNorm(above + fine, c)
+            for above, (s, fine, c) in zip(coarser, _LEVELS, strict=False)
         )
-        self.head = nn.Conv2d(_LEVELS[-1][1], classes, 1)
+        self.head = nn.Conv2d(coarser[-1], classes, 1)
 
-    def forward(self, images: Tensor) -> Tensor:
-        maps = self.backbone(images)
+    def forward(self, maps: Mapping[int, Tensor]) -> Tensor:
         x = self.context(maps[32]) * self.gate(maps[32])
-        for (stride, _), lateral, merge in zip(_LEVELS, self.lateral, self.merge, strict=True):
+        for (stride, _, _), lateral, merge in zip(_LEVELS, self.lateral, self.merge, strict=True):
             fine = lateral(maps[stride])
             x = functional.interpolate(x, size=fine.shape[2:], mode="bilinear", align_corners=False)
             x = merge(torch.cat([x, fine], dim=1))
@@ -45,10 +45,26 @@ class SegmentationNetwork(nn.Module):
         return scores
 
 
+class SegmentationNetwork(nn.Module):
+    """Images (N, 3, H, W) in [0, 1] → class scores (N, C, ⌈H / 2⌉, ⌈W / 2⌉) before the softmax.
+
+    Without a `backbone` it is MobileNetV2 of this `width`.
+    """
+
+    def __init__(self, classes: int, width: float = 1.0, *, backbone: Backbone | None = None) -> None:
+        super().__init__()
+        self.backbone = MobileNetV2(width) if backbone is None else backbone
+        self.decoder = ClassDecoder(classes, self.backbone.channels)
+
+    def forward(self, images: Tensor) -> Tensor:
+        scores: Tensor = self.decoder(self.backbone(images))
+        return scores
+
+
 class DeployedSegmenter(nn.Module):
     """Images (1, 3, H, W) → class (1, H, W) int32 and its probability (1, H, W): what the network file computes."""
 
-    def __init__(self, network: SegmentationNetwork, size: Sequence[int]) -> None:
+    def __init__(self, network: nn.Module, size: Sequence[int]) -> None:
         super().__init__()
         self.network, self.size = network, tuple(size)
 

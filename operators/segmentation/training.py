@@ -16,7 +16,7 @@ from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork
 from operators.segmentation.score import confusion, mean_iou
 from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
-from operators.training.backbone import MobileNetV2, load_backbone
+from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
 
 KIND = "segmenter"
@@ -36,14 +36,15 @@ class SegmenterTask:
         seed: int = 0,
         width: float = 1.0,
         variation: Variation | None = None,
+        architecture: str = "mobilenetv2",
         backbone: Path | None = None,
     ) -> None:
         if any(extent % STEP or extent <= 0 for extent in size):
             raise ValueError(f"the input's width and height must be multiples of {STEP}, got {size[0]}x{size[1]}")
         torch.manual_seed(seed)
-        self.data, self.size, self.width = data, size, width
+        self.data, self.size, self.width, self.architecture = data, size, width, architecture
         self.variation = Variation() if variation is None else variation
-        self.segmenter = SegmentationNetwork(len(data.classes), width)
+        self.segmenter = SegmentationNetwork(len(data.classes), backbone=BACKBONES[architecture](width))
         self.class_weights = class_weights(data)
         if backbone is not None:
             load_backbone(self.segmenter.backbone, backbone)
@@ -53,7 +54,7 @@ class SegmenterTask:
         return self.segmenter
 
     @property
-    def backbone(self) -> MobileNetV2:
+    def backbone(self) -> Backbone:
         return self.segmenter.backbone
 
     @property
@@ -65,6 +66,7 @@ class SegmenterTask:
             "classes": list(self.data.classes),
             "size": list(self.size),
             "width": self.width,
+            "architecture": self.architecture,
             "images": self.samples,
         }
 
@@ -74,8 +76,12 @@ class SegmenterTask:
         return torch.from_numpy(images), torch.from_numpy(np.stack([mask for _, mask in views]).astype(np.int64))
 
     def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
-        images, masks = (t.to(device) for t in batch)
-        scores = self.segmenter(images.contiguous(memory_format=torch.channels_last))
+        images, masks = batch
+        return self.loss_of(self.segmenter(images.to(device).contiguous(memory_format=torch.channels_last)), masks)
+
+    def loss_of(self, scores: Tensor, masks: Tensor) -> dict[str, Tensor]:
+        """The parts of the loss of what the network answered to images with these `masks` (N, H, W)."""
+        device, scores, masks = scores.device, scores.float(), masks.to(scores.device)
         # Compared at half the resolution, in which the network answers; every second pixel of the truth.
         masks = masks[:, ::2, ::2]
         entropy = functional.cross_entropy(scores, masks, self.class_weights.to(device), ignore_index=VOID)
@@ -95,10 +101,9 @@ class SegmenterTask:
         return {"score": score, "miou": score}
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
-        assert isinstance(network, SegmentationNetwork)
         described = {
             "kind": KIND,
-            "architecture": f"mobilenetv2-{self.width:g} decoder",
+            "architecture": f"{self.architecture}-{self.width:g} decoder",
             "classes": list(self.data.classes),
             "width": self.size[0],
             "height": self.size[1],
@@ -133,11 +138,13 @@ def class_weights(data: SegmentationData, most: int = 200) -> Tensor:
 
 def dice_loss(scores: Tensor, masks: Tensor) -> Tensor:
     """1 - Dice of the classes in the batch (Milletari 2016): it counts a small class as much as a large one."""
-    known = (masks != VOID)[:, None]
-    probability = scores.softmax(dim=1) * known
-    truth = functional.one_hot(masks.where(known[:, 0], 0), scores.shape[1]).permute(0, 3, 1, 2) * known
-    overlap = (probability * truth).sum(dim=(0, 2, 3))
-    total = probability.sum(dim=(0, 2, 3)) + truth.sum(dim=(0, 2, 3))
-    present = truth.sum(dim=(0, 2, 3)) > 0
-    dice = (2 * overlap + 1) / (total + 1)
+    classes = scores.shape[1]
+    known = masks != VOID
+    label = masks.where(known, 0)
+    probability = scores.softmax(dim=1) * known[:, None]
+    counts = torch.bincount(label[known], minlength=classes).to(scores.dtype)
+    hit = probability.gather(1, label[:, None])[:, 0]
+    overlap = torch.zeros_like(counts).index_add(0, label.flatten(), hit.flatten())
+    dice = (2 * overlap + 1) / (probability.sum(dim=(0, 2, 3)) + counts + 1)
+    present = counts > 0
     return (1 - dice[present]).mean() if bool(present.any()) else scores.sum() * 0

@@ -124,17 +124,23 @@ class SimulatedRobot(Source):
     depth_frame: str = Param("camera_depth_optical", min_length=1, doc="optical frame of the depth camera")
 
     def setup(self) -> None:
-        """Builds the world. Raises ImportError without Open3D, ValueError for parameters that contradict each other."""
-        from operators.sources.simulator.renderer import Optics, Renderer
+        """Builds the world.
+
+        Raises ImportError where a sensor casts rays and Open3D is missing, ValueError for parameters that contradict
+        each other.
+        """
+        from operators.sources.simulator.renderer import Optics
         from operators.sources.simulator.stage import Stage
         from operators.sources.simulator.truth import TrueGraph
 
         if self.image_frame == self.depth_frame:
             raise ValueError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
         world = make_world(self.world, self.seed, speed=self.speed, hold=self.hold, movers=self.movers)
-        self._stage = Stage(world, Renderer(world, self.seed, threads=self.threads))
+        self._stage = Stage(world, self.seed, threads=self.threads)
         self._pool = NoisePool(self.seed)
         camera, other, rig = self.color_camera, self.depth_camera, self.stereo
+        if any(sensor.rate for sensor in (camera, other, rig, self.lidar, self.radar, self.landmarks)):
+            self._stage.at(0.0)  # what is slow or fails does so now
 
         def optics(width: int, height: int, focal: float) -> Optics:
             return Optics(width, height, focal * width, focal * width, (width - 1) / 2, (height - 1) / 2)
@@ -361,8 +367,8 @@ class SimulatedRobot(Source):
         ]
         return Transforms(
             stamp=self.first_stamp,
-            frames=[parent for parent, _, _ in placed],
-            child_frames=[child for _, child, _ in placed],
+            frames=tuple(parent for parent, _, _ in placed),
+            child_frames=tuple(child for _, child, _ in placed),
             translations=np.array([t.translations[0] for t in single]).reshape(-1, 3),
             rotations=np.array([t.rotations[0] for t in single]).reshape(-1, 4),
         )

@@ -93,8 +93,9 @@ def recolored(pixels: Pixels, variation: Variation, rng: np.random.Generator) ->
         pixels = cv2.GaussianBlur(pixels, (0, 0), float(rng.uniform(0.4, 1.3))).astype(np.uint8, copy=False)
     if variation.noise and rng.random() < 0.5:
         sigma = float(rng.uniform(0, variation.noise))
-        noise = rng.standard_normal(pixels.shape, np.float32) * sigma
-        pixels = np.clip(pixels + noise, 0, 255).astype(np.uint8)
+        cv2.setRNGSeed(int(rng.integers(1 << 31)))  # of this thread alone; many times faster than NumPy's
+        noise = cv2.randn(np.empty(pixels.shape, np.int16), np.zeros(3), np.full(3, sigma))
+        pixels = cv2.add(pixels, noise, dtype=cv2.CV_8U).astype(np.uint8, copy=False)
     return pixels
 
 

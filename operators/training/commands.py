@@ -17,7 +17,7 @@ from rich.table import Table
 if TYPE_CHECKING:
     from torch import nn
 
-    from operators.training.backbone import MobileNetV2
+    from operators.training.backbone import Backbone as Extractor
     from operators.training.loop import Outcome, Settings, Task
 
 FAILED = 1
@@ -62,6 +62,10 @@ Every = Annotated[int, typer.Option(min=1, help="Score after every so many epoch
 Workers = Annotated[int, typer.Option(min=1, help="Threads that prepare images.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads that compute. Default: one a core.")]
 Device = Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1 ... Default: a GPU where there is one.")]
+Bfloat16 = Annotated[
+    bool,
+    typer.Option(help="Compute convolutions in bfloat16: twice as fast on processors that have it, slower on others."),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")]
 Weights = Annotated[Path, typer.Option("--weights", help="The network file (.onnx).", show_default=False)]
 
@@ -89,6 +93,7 @@ def train_detector(
     workers: Workers = 2,
     threads: Threads = None,
     device: Device = None,
+    bfloat16: Bfloat16 = False,
     json: Json = False,
 ) -> None:
     """Train a grid detector on a folder in COCO or YOLO format.
@@ -117,7 +122,7 @@ def train_detector(
         _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device,
+            device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = _run(task, settings, out, resume, json)
     _finish(outcome, "operators.detection:CustomDetector", json)
@@ -143,6 +148,7 @@ def train_segmenter(
     workers: Workers = 2,
     threads: Threads = None,
     device: Device = None,
+    bfloat16: Bfloat16 = False,
     json: Json = False,
 ) -> None:
     """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt."""
@@ -166,10 +172,64 @@ def train_segmenter(
         _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
-            device=device,
+            device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = _run(task, settings, out, resume, json)
     _finish(outcome, "operators.segmentation:Segmenter", json)
+
+
+@train.command("pair")
+def train_pair(
+    data: Data,
+    epochs: Epochs = 100,
+    out: Annotated[Path, typer.Option(help="The folder to write to.")] = Path("networks"),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    size: Size = None,
+    batch: Batch = 16,
+    learning_rate: Rate = 1e-3,
+    seed: Seed = 0,
+    width: Width = 1.0,
+    initial: Initial = None,
+    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    evaluate_every: Every = 1,
+    workers: Workers = 2,
+    threads: Threads = None,
+    device: Device = None,
+    bfloat16: Bfloat16 = False,
+    json: Json = False,
+) -> None:
+    """Train a detector and a segmenter that learn together, on a folder with both boxes (COCO) and masks.
+
+    Writes detector.onnx and segmenter.onnx of the best epoch, and a checkpoint (pair.pt) to resume from.
+    `python -m operators.training.simulated_worlds DATA` renders such a folder.
+    """
+    with _friendly():
+        file = out / "pair.onnx"
+        _free(file, resume, overwrite)
+        from operators.detection.custom.dataset import read_detection_data
+        from operators.segmentation.dataset import read_segmentation_data
+        from operators.training.augmentation import Variation
+        from operators.training.loop import Settings
+        from operators.training.pair import PairTask
+
+        boxes, masks = read_detection_data(data, seed), read_segmentation_data(data, seed)
+        task = PairTask(
+            boxes,
+            masks,
+            _size(size, [image.file for image in boxes.training[:20]]),
+            seed=seed,
+            width=width,
+            variation=Variation() if flip else replace(Variation(), flip=0.0),
+        )
+        _prepare(task.network, task.backbone, None, 0, initial)
+        _tell(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
+            device=device, bfloat16=bfloat16,
+        )  # fmt: skip
+        outcome = _run(task, settings, file, resume, json)
+    _finish(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json)
 
 
 @evaluate.command("detector")
@@ -243,7 +303,7 @@ def _run(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -
 
 
 def _prepare(
-    network: nn.Module, backbone: MobileNetV2, weights: Path | None, frozen_stride: int | None, initial: Path | None
+    network: nn.Module, backbone: Extractor, weights: Path | None, frozen_stride: int | None, initial: Path | None
 ) -> None:
     from operators.training.backbone import start_from
 

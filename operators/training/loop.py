@@ -52,7 +52,11 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class Settings:
-    """How to train. `threads` None means as torch chooses; `device` None means a GPU where there is one."""
+    """How to train. `threads` None means as torch chooses; `device` None means a GPU where there is one.
+
+    `bfloat16` computes convolutions in half the bits: about twice as fast on processors that have it (avx512_bf16, amx,
+    most GPUs), and much slower on others.
+    """
 
     epochs: int = 100
     batch: int = 16
@@ -65,6 +69,7 @@ class Settings:
     workers: int = 2
     threads: int | None = None
     device: str | None = None
+    bfloat16: bool = False
 
 
 class Progress(Protocol):
@@ -146,7 +151,8 @@ class _Run:
             rate = self.settings.learning_rate * schedule(done, self.settings.epochs * self.steps, self.settings.warmup)
             for group in self.optimizer.param_groups:
                 group["lr"] = rate
-            parts = self.task.loss(batch, self.device)
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
+                parts = self.task.loss(batch, self.device)
             total = torch.stack(list(parts.values())).sum()
             values = {name: float(part.detach()) for name, part in parts.items()}
             if not math.isfinite(sum(values.values())):
@@ -225,7 +231,7 @@ class _Run:
             if state.get(key) != mine:
                 raise TrainingFileError(f"{file} cannot be resumed: {_difference(key, state.get(key), mine)}")
         mine, saved = asdict(self.settings), dict(state["settings"])
-        decisive = ("epochs", "batch", "learning_rate", "weight_decay", "warmup", "ema_decay", "seed")
+        decisive = ("epochs", "batch", "learning_rate", "weight_decay", "warmup", "ema_decay", "seed", "bfloat16")
         different = [f"{k} was {saved.get(k)} and is {mine[k]}" for k in decisive if saved.get(k) != mine[k]]
         if different:
             raise TrainingFileError(f"{file} cannot be resumed with other settings: {', '.join(different)}")

@@ -1,18 +1,25 @@
 """A data folder rendered from simulated worlds: images, class masks and COCO boxes, for both networks.
 
 Each world is drawn from a seed of its own; a few images are taken from each, far apart in time, with varied cameras.
+
+python -m operators.training.simulated_worlds DATA [--worlds 150] [--validation 10] [--frames 16] [--processes 1]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import multiprocessing
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from rich.console import Console
+from rich.progress import track
 
 from dataflow.messages import Detections2D, Image, SegmentationMap
 from operators.sources.simulated_robot import SimulatedRobot
@@ -24,6 +31,10 @@ STORED = (320, 240)
 VGA = (640, 480)
 LEAST_VISIBLE, LEAST_PIXELS = 0.3, 30
 """Objects shown less, or smaller in the stored image, are to be ignored in training."""
+TRAINING, VALIDATION, HELD_OUT = 10_000, 20_000, 30_000
+"""First seeds; every world has the next one. Networks are judged on worlds that nothing was chosen by."""
+KINDS = ("office", "table_top", "corridor", "office", "table_top")
+"""Corridors show few objects, so fewer of them are rendered."""
 _SECONDS = 60
 
 
@@ -73,31 +84,45 @@ def worlds(first_seed: int, count: int, names: Sequence[str] = NAMES) -> list[tu
 
 
 def write_data(
-    folder: Path, training: Sequence[tuple[str, int]], validation: Sequence[tuple[str, int]], frames: int
+    folder: Path,
+    training: Sequence[tuple[str, int]],
+    validation: Sequence[tuple[str, int]],
+    frames: int,
+    processes: int = 1,
 ) -> Iterator[tuple[int, int]]:
     """Renders worlds into a data folder; yields (worlds done, images written) after each.
 
     Worlds of even seeds are rendered at VGA and stored at half the size, as the operators shrink a VGA image; the
-    others at the stored size. Worlds that are already there are kept, so an interrupted rendering goes on.
+    others at the stored size. Worlds that are already there are kept, so an interrupted rendering goes on. The files
+    are the same for any number of processes.
     """
     for name in ("images", "masks", "boxes", "annotations"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     (folder / "classes.txt").write_text("\n".join(CLASSES) + "\n", encoding="utf-8")
-    written = 0
-    for k, (world, seed) in enumerate([*training, *validation]):
-        rows = folder / "boxes" / f"{world}_{seed}.json"
-        if not rows.is_file():
-            images = [
-                _store(folder, f"{world}_{seed}_{i:02d}", taken)
-                for i, taken in enumerate(render(world, seed, frames, STORED if seed % 2 else VGA, varied=True))
-            ]
-            rows.write_text(json.dumps(images), encoding="utf-8")
-        written += len(json.loads(rows.read_text(encoding="utf-8")))
-        yield k + 1, written
+    every, written = [*training, *validation], 0
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for k, count in enumerate(pool.imap(partial(_write_world, folder, frames), every)):
+            written += count
+            yield k + 1, written
     for split, chosen in (("train", training), ("val", validation)):
         _write_annotations(folder, split, chosen)
     held_out = [image["file_name"] for world, seed in validation for image in _images(folder, world, seed)]
     (folder / "val.txt").write_text("\n".join(held_out) + "\n", encoding="utf-8")
+
+
+def _write_world(folder: Path, frames: int, chosen: tuple[str, int]) -> int:
+    """Renders a world unless it is there; the number of its images."""
+    world, seed = chosen
+    rows = folder / "boxes" / f"{world}_{seed}.json"
+    if not rows.is_file():
+        images = [
+            _store(folder, f"{world}_{seed}_{i:02d}", taken)
+            for i, taken in enumerate(render(world, seed, frames, STORED if seed % 2 else VGA, varied=True))
+        ]
+        partial_file = rows.with_suffix(".partial")
+        partial_file.write_text(json.dumps(images), encoding="utf-8")
+        partial_file.replace(rows)
+    return len(_images(folder, world, seed))
 
 
 def _store(folder: Path, stem: str, taken: WorldImage) -> dict[str, Any]:
@@ -150,3 +175,26 @@ def _write_annotations(folder: Path, split: str, chosen: Sequence[tuple[str, int
         "annotations": annotations,
     }
     (folder / "annotations" / f"instances_{split}.json").write_text(json.dumps(content), encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Renders a data folder, as told on the command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m operators.training.simulated_worlds",
+        description="Render a data folder for `dataflow train pair`, `detector` and `segmenter`.",
+    )
+    parser.add_argument("data", type=Path, help="the folder to write")
+    parser.add_argument("--worlds", type=int, default=150, help=f"worlds to train on, of seeds from {TRAINING}")
+    parser.add_argument("--validation", type=int, default=10, help=f"worlds to score on, of seeds from {VALIDATION}")
+    parser.add_argument("--frames", type=int, default=16, help="images of each world")
+    parser.add_argument("--processes", type=int, default=1, help="worlds rendered at once")
+    options = parser.parse_args(arguments)
+    chosen = worlds(TRAINING, options.worlds, KINDS), worlds(VALIDATION, options.validation, KINDS)
+    rendered = write_data(options.data, *chosen, options.frames, options.processes)
+    total = options.worlds + options.validation
+    for _ in track(rendered, total=total, description="worlds", console=Console(stderr=True)):
+        pass
+
+
+if __name__ == "__main__":
+    main()

@@ -203,3 +203,24 @@ class Unrepeatable(Operator):
     def process(self, x: FeatureVector) -> FeatureVector:
         self.calls += 1
         return value(x.stamp, number(x) + (time.time() % 1 if self.calls >= 30 else 0.0))
+
+
+class Tuned(Operator):
+    """Adds up, with a factor that may change while it runs."""
+
+    x: In[FeatureVector]
+    y: Out[FeatureVector]
+    factor: float = Param(1.0, ge=0, le=10, live=True, doc="weight of what comes")
+
+    def setup(self) -> None:
+        self.total = 0.0
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        self.total += self.factor * number(x)
+        return value(x.stamp, self.total)
+
+    def snapshot(self) -> Mapping[str, float]:
+        return {"total": self.total}
+
+    def restore(self, state: Mapping[str, float]) -> None:
+        self.total = state["total"]

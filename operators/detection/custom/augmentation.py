@@ -29,8 +29,20 @@ def view(
 ) -> DetectionSample:
     """A random view of a labelled image, of size `target` (width, height)."""
     pixels = image.read()
+    affine = varied(fitted((pixels.shape[1], pixels.shape[0]), target), target, variation, rng)
+    return seen_through(image, pixels, affine, target, variation, rng)
+
+
+def seen_through(
+    image: LabelledImage,
+    pixels: Pixels,
+    affine: NDArray[np.float64],
+    target: tuple[int, int],
+    variation: Variation,
+    rng: np.random.Generator,
+) -> DetectionSample:
+    """The view of a labelled image, whose `pixels` are given, under a map, in random colours."""
     size = (pixels.shape[1], pixels.shape[0])
-    affine = varied(fitted(size, target), target, variation, rng)
     boxes, ignored = moved_boxes(image.boxes * np.array([*size, *size], np.float32), image.ignored, affine, target)
     seen = (boxes[:, 2:] - boxes[:, :2] > 1).all(axis=1)
     return DetectionSample(

@@ -17,7 +17,8 @@ from torch.nn import functional
 MAX_RATIO = 4.0
 IGNORE_IOU = 0.7
 """A box that overlaps an object by more is not punished, even where its anchor was not given the object."""
-_BALANCE = (4.0, 1.0, 0.4)  # many small cells hold few objects, few large cells many
+_SURELY_EMPTY = -3.0  # objectness before the sigmoid, 5 %
+_BALANCE = (4.0, 1.0, 0.4, 0.1)  # many small cells hold few objects, few large cells many
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +117,7 @@ def detection_loss(
             wanted = wanted.scatter_reduce(0, flat, quality, "amax").view(raw.shape[:-1])
             label = functional.one_hot(truth.classes[cells.target], classes).to(raw.dtype)
             class_loss = class_loss + functional.binary_cross_entropy_with_logits(raw[at][:, 1:], label)
-        weight = 1 - _ignored(boxes, truth, strides[level]).to(raw.dtype)
+        weight = 1 - _ignored(boxes, raw[..., 0], truth, strides[level]).to(raw.dtype)
         weight[at] = 1
         entropy = functional.binary_cross_entropy_with_logits(raw[..., 0], wanted, reduction="none")
         objectness_loss = objectness_loss + _BALANCE[level] * (entropy * weight).mean()
@@ -143,12 +144,16 @@ def _flat_index(at: tuple[Tensor, Tensor, Tensor, Tensor], shape: torch.Size) ->
 
 
 @torch.no_grad()
-def _ignored(boxes: Tensor, truth: Truth, stride: int) -> Tensor:
-    """Which predictions (N, A, H, W) are not to be punished: cells in an ignored object, boxes much like an object."""
-    count, anchors, height, width, _ = boxes.shape
+def _ignored(boxes: Tensor, objectness: Tensor, truth: Truth, stride: int) -> Tensor:
+    """Which predictions (N, A, H, W) are not to be punished: cells in an ignored object, boxes much like an object.
+
+    Those that are sure enough to be empty are not compared: most are, and the comparison costs more than the network.
+    """
+    count, _, height, width, _ = boxes.shape
     mask = torch.zeros(boxes.shape[:-1], dtype=torch.bool, device=boxes.device)
     x = (torch.arange(width, device=boxes.device) + 0.5) * stride
     y = (torch.arange(height, device=boxes.device) + 0.5) * stride
+    likely = objectness > _SURELY_EMPTY
     for i in range(count):
         mine = truth.image == i
         if not mine.any():
@@ -156,9 +161,8 @@ def _ignored(boxes: Tensor, truth: Truth, stride: int) -> Tensor:
         hidden, shown = truth.boxes[mine & truth.ignored], truth.boxes[mine]
         columns = (x[None] > hidden[:, 0:1]) & (x[None] < hidden[:, 2:3])
         rows = (y[None] > hidden[:, 1:2]) & (y[None] < hidden[:, 3:4])
-        inside = (rows[:, :, None] & columns[:, None, :]).any(dim=0)
-        alike = _pairwise_iou(boxes[i].reshape(-1, 4), shown).amax(dim=1) > IGNORE_IOU
-        mask[i] = alike.view(anchors, height, width) | inside[None]
+        mask[i] = (rows[:, :, None] & columns[:, None, :]).any(dim=0)
+        mask[i, likely[i]] |= _pairwise_iou(boxes[i, likely[i]], shown).amax(dim=1) > IGNORE_IOU
     return mask
 
 

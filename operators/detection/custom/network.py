@@ -1,48 +1,76 @@
-"""The grid detector: MobileNetV2, a feature pyramid, and per cell and anchor a box, an objectness and class scores."""
+"""The grid detector: a backbone, a feature pyramid, and per cell and anchor a box, an objectness and class scores."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from operators.training.backbone import MobileNetV2, SeparableConv
+from operators.training.backbone import Backbone, MobileNetV2, SeparableConv
 
 STRIDES = (8, 16, 32)
+FINE_STRIDES = (4, *STRIDES)
+"""For objects of less than ten pixels."""
 ANCHORS_PER_CELL = 3
 
 
-class GridDetector(nn.Module):
-    """Images (N, 3, H, W) in [0, 1] → one map (N, A · (5 + C), ⌈H / s⌉, ⌈W / s⌉) for each stride s.
+class GridHead(nn.Module):
+    """Feature maps by stride → one map (N, A · (5 + C), H, W) for each of `strides`, by a feature pyramid.
 
-    H and W must be multiples of 16. What the channels mean is told in `operators.detection.custom.decode`.
+    What the channels mean is told in `operators.detection.custom.decode`.
     """
 
-    def __init__(self, classes: int, width: float = 1.0, channels: int = 96) -> None:
+    def __init__(
+        self, classes: int, inputs: Mapping[int, int], channels: int = 96, strides: Sequence[int] = STRIDES
+    ) -> None:
         super().__init__()
-        self.classes = classes
-        self.backbone = MobileNetV2(width)
-        self.lateral = nn.ModuleList(nn.Conv2d(self.backbone.channels[s], channels, 1) for s in STRIDES)
-        self.smooth = nn.ModuleList(SeparableConv(channels, channels) for _ in STRIDES)
+        self.strides = tuple(strides)
+        self.lateral = nn.ModuleList(nn.Conv2d(inputs[s], channels, 1) for s in strides)
+        self.smooth = nn.ModuleList(SeparableConv(channels, channels) for _ in strides)
         outputs = ANCHORS_PER_CELL * (5 + classes)
         self.heads = nn.ModuleList(
-            nn.Sequential(SeparableConv(channels, channels), nn.Conv2d(channels, outputs, 1)) for _ in STRIDES
+            nn.Sequential(SeparableConv(channels, channels), nn.Conv2d(channels, outputs, 1)) for _ in strides
         )
         for head in self.heads:
             assert isinstance(head, nn.Sequential)
             _start_rare(head[-1], classes)
 
-    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
-        maps = self.backbone(images)
+    def forward(self, maps: Mapping[int, Tensor]) -> tuple[Tensor, ...]:
         merged: list[Tensor] = []
-        for stride, lateral, smooth in reversed(list(zip(STRIDES, self.lateral, self.smooth, strict=True))):
+        for stride, lateral, smooth in reversed(list(zip(self.strides, self.lateral, self.smooth, strict=True))):
             level = lateral(maps[stride])
             if merged:
                 level = level + functional.interpolate(merged[-1], size=level.shape[2:], mode="nearest")
             merged.append(smooth(level))
         return tuple(head(level) for head, level in zip(self.heads, reversed(merged), strict=True))
+
+
+class GridDetector(nn.Module):
+    """Images (N, 3, H, W) in [0, 1] → one map (N, A · (5 + C), ⌈H / s⌉, ⌈W / s⌉) for each stride s.
+
+    H and W must be multiples of 16. Without a `backbone` it is MobileNetV2 of this `width`.
+    """
+
+    def __init__(
+        self,
+        classes: int,
+        width: float = 1.0,
+        channels: int = 96,
+        *,
+        backbone: Backbone | None = None,
+        strides: Sequence[int] = STRIDES,
+    ) -> None:
+        super().__init__()
+        self.classes = classes
+        self.backbone = MobileNetV2(width) if backbone is None else backbone
+        self.head = GridHead(classes, self.backbone.channels, channels, strides)
+
+    def forward(self, images: Tensor) -> tuple[Tensor, ...]:
+        found: tuple[Tensor, ...] = self.head(self.backbone(images))
+        return found
 
 
 def _start_rare(layer: nn.Module, classes: int) -> None:

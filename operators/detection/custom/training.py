@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,12 +19,12 @@ from operators.detection.custom.evaluation import ScoredImage, score_detections
 from operators.detection.custom.loss import Truth, detection_loss
 from operators.detection.custom.network import ANCHORS_PER_CELL, STRIDES, GridDetector
 from operators.training.augmentation import Variation, fitted, tensor_of, warp
-from operators.training.backbone import MobileNetV2, load_backbone
+from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
 
 KIND = "detector"
 STEP = 16
-_SCORING_THRESHOLD, _SCORING_IOU, _SCORING_MOST = 0.01, 0.5, 100
+_SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
 
 
 class DetectorTask:
@@ -40,6 +40,9 @@ class DetectorTask:
         seed: int = 0,
         width: float = 1.0,
         variation: Variation | None = None,
+        architecture: str = "mobilenetv2",
+        strides: Sequence[int] = STRIDES,
+        channels: int = 96,
         backbone: Path | None = None,
     ) -> None:
         if any(extent % STEP or extent <= 0 for extent in size):
@@ -48,11 +51,12 @@ class DetectorTask:
         self.data, self.size = data, size
         self.variation = Variation() if variation is None else variation
         sizes = object_sizes(data.training, size)
-        anchors = fit_anchors(sizes, len(STRIDES) * ANCHORS_PER_CELL, seed)
+        anchors = fit_anchors(sizes, len(strides) * ANCHORS_PER_CELL, seed)
         self.anchor_fit = mean_best_iou(sizes, anchors)
-        self.anchors = anchors.reshape(len(STRIDES), ANCHORS_PER_CELL, 2)
-        self.width = width
-        self.detector = GridDetector(len(data.classes), width)
+        self.anchors = anchors.reshape(len(strides), ANCHORS_PER_CELL, 2)
+        self.width, self.architecture, self.strides = width, architecture, tuple(strides)
+        made = BACKBONES[architecture](width)
+        self.detector = GridDetector(len(data.classes), channels=channels, backbone=made, strides=strides)
         if backbone is not None:
             load_backbone(self.detector.backbone, backbone)
 
@@ -61,7 +65,7 @@ class DetectorTask:
         return self.detector
 
     @property
-    def backbone(self) -> MobileNetV2:
+    def backbone(self) -> Backbone:
         return self.detector.backbone
 
     @property
@@ -73,6 +77,8 @@ class DetectorTask:
             "classes": list(self.data.classes),
             "size": list(self.size),
             "width": self.width,
+            "architecture": self.architecture,
+            "strides": list(self.strides),
             "anchors": np.round(self.anchors, 3).tolist(),
             "images": self.samples,
         }
@@ -81,13 +87,17 @@ class DetectorTask:
         views = [
             view(self.data.training[k], self.size, self.variation, rng) for k, rng in zip(samples, rngs, strict=True)
         ]
-        return torch.from_numpy(np.stack([tensor_of(v.pixels) for v in views])), _truth(views)
+        return torch.from_numpy(np.stack([tensor_of(v.pixels) for v in views])), truth_of(views)
 
     def loss(self, batch: tuple[Tensor, Truth], device: torch.device) -> dict[str, Tensor]:
         images, truth = batch
-        images = images.to(device).contiguous(memory_format=torch.channels_last)
+        return self.loss_of(self.detector(images.to(device).contiguous(memory_format=torch.channels_last)), truth)
+
+    def loss_of(self, maps: Sequence[Tensor], truth: Truth) -> dict[str, Tensor]:
+        """The parts of the loss of what the network answered."""
+        device, maps = maps[0].device, [m.float() for m in maps]
         anchors = torch.from_numpy(self.anchors).to(device)
-        return detection_loss(self.detector(images), truth.to(device), anchors, STRIDES, len(self.data.classes))
+        return detection_loss(maps, truth.to(device), anchors, self.strides, len(self.data.classes))
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:
         device = next(network.parameters()).device
@@ -104,9 +114,7 @@ class DetectorTask:
             affine = fitted(size, self.size)
             boxes, _ = moved_boxes(image.boxes * np.array([*size, *size], np.float32), image.ignored, affine, self.size)
             output = maps(warp(pixels, affine, self.size))
-            found = find_boxes(
-                output, self.anchors, STRIDES, len(self.data.classes), _SCORING_THRESHOLD, _SCORING_IOU, _SCORING_MOST
-            )
+            found = find_boxes(output, self.anchors, self.strides, len(self.data.classes), *_SCORING)
             scored.append(ScoredImage(boxes, image.classes, image.ignored, found))
         score = score_detections(scored, self.data.classes)
         return {"score": score.ap50, "ap50": score.ap50, "ap": score.ap}
@@ -114,16 +122,16 @@ class DetectorTask:
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
         described = {
             "kind": KIND,
-            "architecture": f"mobilenetv2-{self.width:g} fpn grid",
+            "architecture": f"{self.architecture}-{self.width:g} fpn grid",
             "classes": list(self.data.classes),
             "width": self.size[0],
             "height": self.size[1],
-            "strides": list(STRIDES),
+            "strides": list(self.strides),
             "anchors": np.round(self.anchors.astype(float), 4).tolist(),
             "training_images": self.samples,
             **facts,
         }
-        export_network(network, self.size, [f"stride{s}" for s in STRIDES], described, file)
+        export_network(network, self.size, [f"stride{s}" for s in self.strides], described, file)
 
 
 def object_sizes(images: tuple[LabelledImage, ...], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -143,7 +151,8 @@ def object_sizes(images: tuple[LabelledImage, ...], size: tuple[int, int]) -> ND
     return np.concatenate(rows)
 
 
-def _truth(views: list[DetectionSample]) -> Truth:
+def truth_of(views: Sequence[DetectionSample]) -> Truth:
+    """The objects in the views, as a batch."""
     return Truth(
         torch.from_numpy(np.repeat(np.arange(len(views)), [len(v.boxes) for v in views])),
         torch.from_numpy(np.concatenate([v.classes for v in views]).astype(np.int64)),

@@ -46,7 +46,7 @@ class Body:
 
     def shoulder(self, posture: Posture, side: int) -> Array:
         """Place of a shoulder: side 0 is left."""
-        forward, left, up = _axes(posture.yaw, posture.lean)
+        _, left, up = _axes(posture.yaw, posture.lean)
         sign = 1 - 2 * side
         return np.asarray(posture.pelvis + self.height * (_TORSO * 0.93 * up + sign * _SHOULDER * left))
 
@@ -64,7 +64,7 @@ class Body:
     def poses(self, posture: Posture) -> Array:
         """`T_world_part` (P, 4, 4)."""
         h = self.height
-        forward, left, up = _axes(posture.yaw, posture.lean)
+        forward, _, up = _axes(posture.yaw, posture.lean)
         ahead = _axes(posture.yaw, 0.0)[0]
         poses = [
             _frame(posture.pelvis - 0.02 * h * up, forward, up),

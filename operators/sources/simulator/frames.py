@@ -17,7 +17,7 @@ BODY_TO_OPTICAL = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0
 
 @lru_cache(maxsize=64)
 def mounted(mount: Mount) -> Array:
-    """`T_base_sensor` (4, 4) of (x, y, z, roll, pitch, yaw): turned about the fixed x, then y, then z axis (REP 103)."""
+    """`T_base_sensor` (4, 4) of (x, y, z, roll, pitch, yaw): turned about fixed x, then y, then z (REP 103)."""
     x, y, z, roll, pitch, yaw = mount
     (cr, cp, cy), (sr, sp, sy) = np.cos([roll, pitch, yaw]), np.sin([roll, pitch, yaw])
     T = np.array(

@@ -149,7 +149,7 @@ def door(rng: Rng, width: float, height: float, opening: float) -> Shape:
     """A door in its frame, in a wall whose inner face is the plane x = 0; the leaf is open by `opening` radians."""
     paint = timber(rng) if rng.uniform() < 0.6 else any_tone(rng)
     frame = Material("plain", tone(rng, (0, 1), (0.0, 0.15), (0.35, 0.95)), tile=0.5)
-    leaf = Material("door:%d" % rng.integers(3), paint, tile=0)
+    leaf = Material(f"door:{rng.integers(3)}", paint, tile=0)
     shape: Shape = ()
     for sy in (-1, 1):
         shape += box((0.07, 0.08, height + 0.08), frame, center=(0.02, sy * (width / 2 + 0.04), height / 2 + 0.04))
@@ -230,7 +230,7 @@ def _lamp(rng: Rng, height: float, foot: float, shade: float, drop: float) -> Sh
 
 def rover(rng: Rng) -> Shape:
     """A small service robot that faces +x: a round base with a tower, or a boxy one with a mast."""
-    shell = Material("robot:%d" % rng.integers(3), tone(rng, (0, 1), (0.0, 0.55), (0.6, 0.98)), tile=0.6)
+    shell = Material(f"robot:{rng.integers(3)}", tone(rng, (0, 1), (0.0, 0.55), (0.6, 0.98)), tile=0.6)
     black = Material("plain", (0.1, 0.1, 0.12), tile=0.3)
     eye = Material("plain", tone(rng, (0.45, 0.62), (0.6, 0.95), (0.85, 1.0)), tile=0.3, glow=1.15)
     if rng.uniform() < 0.5:

@@ -9,7 +9,8 @@ import numpy as np
 
 from operators.sources.simulator import furniture, objects
 from operators.sources.simulator.body import drawn_body
-from operators.sources.simulator.furnishing import FLOOR, Surface, Wall, put_desk
+from operators.sources.simulator.furnishing import FLOOR, Wall, put_desk
+from operators.sources.simulator.furniture import Surface
 from operators.sources.simulator.movers import (
     Carried,
     Driving,
@@ -94,7 +95,7 @@ def seat_person(builder: Builder, rng: Rng, place: Place, path: Array, timeline:
 
 
 def add_desk_worker(builder: Builder, rng: Rng, wall: Wall, along: float, sense: int, far: float, out: float) -> int:
-    """A desk at a wall, and a person who comes along the wall, `out` metres from it, from `far`, sits down and drinks."""
+    """A desk at a wall, and a person who comes along the wall, `out` metres off, from `far`, sits down and drinks."""
     surface_guess = Surface(0, 0, 0.74, 0.34, 0.7)
     T = wall.place(0.42, along)
     desk = put_desk(

@@ -78,7 +78,7 @@ def book(rng: Rng, *, upright: bool) -> tuple[Shape, tuple[float, float, float]]
     color = any_tone(rng)
     cover = Material(f"cover:{rng.integers(6)}", tile=0)
     paper = Material("plain", (0.93, 0.91, 0.84), tile=0.1)
-    spine = Material("label:%d" % rng.integers(4), color, tile=0)
+    spine = Material(f"label:{rng.integers(4)}", color, tile=0)
     if upright:
         size = (float(width), float(thick), float(height))
         shape = box(size, Material("plain", color, tile=0.2), front=spine, top=paper, cell=0.3)
@@ -95,7 +95,7 @@ def ball(rng: Rng, radius: float) -> Shape:
         radius,
         radius,
         radius,
-        Material("ball:%d" % rng.integers(4) if striped else "fabric", color, tile=0 if striped else 0.3),
+        Material(f"ball:{rng.integers(4)}" if striped else "fabric", color, tile=0 if striped else 0.3),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import RadarScan
 from dataflow.messages.geometry import invert, transform_points
@@ -12,7 +13,7 @@ from operators.sources.simulator.stage import Stage
 
 _CELLS, _LAYERS = 64, 3
 _SPAN = 0.12  # elevation of the outer layers, radians
-_STEP = 1e-3  # seconds; for velocities
+_STEP = 1e-3  # seconds; for the velocities of movers
 
 
 def scan(stage: Stage, radar: Radar, t: float, rng: np.random.Generator, stamp: int, frame: str) -> RadarScan:
@@ -33,7 +34,8 @@ def scan(stage: Stage, radar: Radar, t: float, rng: np.random.Generator, stamp: 
     cosine = np.abs((hits.normals[nearest] * rays[nearest, 3:]).sum(axis=1))
     likely = radar.detection * np.clip(0.35 + 0.65 * cosine, 0, 1)
     seen = np.isfinite(r) & (r < radar.max_range) & (rng.random(_CELLS) < likely)
-    points = rays[nearest, :3] + rays[nearest, 3:] * np.where(np.isfinite(r), r, 0)[:, None]
+    reach = np.where(np.isfinite(r), r, 0.0)
+    points = np.asarray(rays[nearest, :3] + rays[nearest, 3:] * reach[:, None], np.float64)
     velocity = _relative_velocity(stage, radar, t, points, hits.things[nearest])
     radial = (velocity * rays[nearest, 3:]).sum(axis=1)
     ranges = r[seen] + radar.bias + rng.normal(0, radar.range_noise, seen.sum())
@@ -56,11 +58,13 @@ def scan(stage: Stage, radar: Radar, t: float, rng: np.random.Generator, stamp: 
     )
 
 
-def _relative_velocity(stage: Stage, radar: Radar, t: float, points: Array, things: np.ndarray) -> Array:
-    """Velocity (N, 3) of the points hit, relative to the antenna, in the world: by differences over 1 ms."""
-    T_base_radar = mounted(radar.mount)
-    antenna = [(stage.T_world_base(t + dt) @ T_base_radar)[:3, 3] for dt in (-_STEP, _STEP)]
-    velocity = np.tile(-(antenna[1] - antenna[0]) / (2 * _STEP), (len(points), 1))
+def _relative_velocity(stage: Stage, radar: Radar, t: float, points: Array, things: NDArray[np.int32]) -> Array:
+    """Velocity (N, 3) of the points hit, relative to the antenna, in the world."""
+    motion = stage.world.path.at([t])
+    lever = motion.T_world_base()[0, :3, :3] @ mounted(radar.mount)[:3, 3]
+    antenna = np.zeros(3)
+    antenna[:2] = motion.velocity[0] + motion.yaw_rate[0] * np.array([-lever[1], lever[0]])
+    velocity = np.tile(-antenna, (len(points), 1))
     for k in np.unique(things):
         if k >= 0 and not stage.world.things[k].still:
             mover = stage.world.things[k].mover

@@ -8,9 +8,10 @@ is); on movers at every time, without shadows. Results do not depend on `threads
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -32,6 +33,16 @@ _APART = 64.0  # metres between things in the scene of silhouettes; no world is 
 _SILHOUETTE_RAYS = 600  # about so many rays judge how much of a thing would be seen
 
 
+class _Scene(Protocol):
+    """What is used of Open3D's RaycastingScene; tensors are its own."""
+
+    def add_triangles(self, vertices: Any, triangles: Any) -> int: ...
+
+    def cast_rays(self, rays: Any, nthreads: int) -> Mapping[str, Any]: ...
+
+    def test_occlusions(self, rays: Any, tnear: float, tfar: float, nthreads: int) -> Any: ...
+
+
 @dataclass(frozen=True)
 class Optics:
     """A pinhole camera: size in pixels, focal length and principal point in pixels."""
@@ -45,11 +56,11 @@ class Optics:
 
     def columns(self) -> Array:
         """x / z (W,) of every column."""
-        return (np.arange(self.width) - self.cx) / self.fx
+        return np.asarray((np.arange(self.width) - self.cx) / self.fx, np.float64)
 
     def rows(self) -> Array:
         """y / z (H,) of every row."""
-        return (np.arange(self.height) - self.cy) / self.fy
+        return np.asarray((np.arange(self.height) - self.cy) / self.fy, np.float64)
 
 
 @lru_cache(maxsize=8)
@@ -159,8 +170,8 @@ class Renderer:
             np.flatnonzero(_thing_of_vertex(self._moving) == k) for k in self._movers
         ]  # vertices of each mover
 
-        light = _bake(world, self._mesh.vertices, self._mesh.normals, self._occluded)
-        light = np.where(self._mesh.glow > 0, self._mesh.glow, light).astype(np.float32)
+        received = _bake(world, self._mesh.vertices, self._mesh.normals, self._occluded)
+        light = np.where(self._mesh.glow > 0, self._mesh.glow, received).astype(np.float32)
         both = (self._mesh, self._moving)
         self._thing_of_triangle = np.concatenate([m.thing_of_triangle for m in both])
         self._id_of_thing = np.array([thing.id for thing in things], np.uint16)
@@ -185,7 +196,7 @@ class Renderer:
         if self._time == t:
             return
         self._time = t
-        self._apart_movers: tuple[object, Array] | None = None
+        self._apart_movers: _Scene | None = None
         if not self._movers:
             return
         things = self.world.things
@@ -195,8 +206,8 @@ class Renderer:
         normals = np.einsum("vij,vj->vi", of[:, :3, :3], self._moving.normals)
         self._moved = vertices
         self._moving_scene = self._build(vertices, self._moving.triangles)
-        light = _lamps(self.world.lights, vertices, normals) + self.world.ambient * (0.72 + 0.13 * normals[:, 2])
-        light = np.where(self._moving.glow > 0, self._moving.glow, light).astype(np.float32)
+        received = _lamps(self.world.lights, vertices, normals) + self.world.ambient * (0.72 + 0.13 * normals[:, 2])
+        light = np.where(self._moving.glow > 0, self._moving.glow, received).astype(np.float32)
         self._set_light(slice(self._first_moving, None), self._moving.triangles, light)
         shaded = self._floor.shaded([vertices[own] for own in self._mover_vertices])
         self._set_light(self._floor.triangles, self._mesh.triangles[self._floor.triangles], shaded)
@@ -271,11 +282,12 @@ class Renderer:
             rays[:, 3:] = (R @ local.astype(np.float32)).T
             rays[:, :2] += _shift(np.array([k]))[0, :2].astype(np.float32)
             (still if self.world.things[k].still else moving).append((slot, rays, stride))
-        if moving and self._apart_movers is None:
-            self._apart_movers = (self._apart.movers(self._moved), self._moved)
-        for jobs, scene in ((still, self._apart.scene), (moving, self._apart_movers and self._apart_movers[0])):
-            if not jobs:
-                continue
+        scenes = [(still, self._apart.scene)] if still else []
+        if moving:
+            if self._apart_movers is None:
+                self._apart_movers = self._apart.movers(self._moved)
+            scenes.append((moving, self._apart_movers))
+        for jobs, scene in scenes:
             distance, *_ = self._first_hit(scene, np.concatenate([rays for _, rays, _ in jobs]))
             end = 0
             for slot, rays, stride in jobs:
@@ -294,17 +306,17 @@ class Renderer:
     def _vertices_of(self, thing: int) -> NDArray[np.int64]:
         return self._mover_vertices[self._movers.index(thing)]
 
-    def _build(self, vertices: Array, triangles: NDArray[np.int64]) -> object:
+    def _build(self, vertices: Array, triangles: NDArray[np.int64]) -> _Scene:
         """A scene of one mesh. Open3D commits it at the first cast."""
         core = self._o3d.core
-        scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        scene: _Scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         scene.add_triangles(core.Tensor(vertices.astype(np.float32)), core.Tensor(triangles.astype(np.uint32)))
         return scene
 
-    def _first_hit(self, scene: object, rays: F32) -> tuple[F32, I32, F32, F32]:
+    def _first_hit(self, scene: _Scene, rays: F32) -> tuple[F32, I32, F32, F32]:
         """Distance, triangle (0 where nothing is hit), weights of corners 1 and 2, and unit normal per ray (..., 6)."""
         tensor = self._o3d.core.Tensor.from_numpy(rays)
-        answer = scene.cast_rays(tensor, nthreads=self._threads)  # type: ignore[attr-defined]
+        answer = scene.cast_rays(tensor, nthreads=self._threads)
         distance = answer["t_hit"].numpy()
         triangle = answer["primitive_ids"].numpy()
         index = np.where(triangle == _NONE, 0, triangle).astype(np.int32)
@@ -312,7 +324,7 @@ class Renderer:
 
     def _occluded(self, rays: F32, far: float) -> NDArray[np.bool_]:
         tensor = self._o3d.core.Tensor.from_numpy(rays)
-        answer = self._scene.test_occlusions(tensor, 1e-4, far, nthreads=self._threads)  # type: ignore[attr-defined]
+        answer = self._scene.test_occlusions(tensor, 1e-4, far, nthreads=self._threads)
         return np.asarray(answer.numpy())
 
     def _set_light(self, rows: slice | NDArray[np.int64], triangles: NDArray[np.int64], light: F32) -> None:
@@ -384,14 +396,14 @@ class _Floor:
 class _Apart:
     """The same things, each in a place of its own, far from all others: what each alone would look like."""
 
-    def __init__(self, still: _Mesh, moving: _Mesh, build: object) -> None:
+    def __init__(self, still: _Mesh, moving: _Mesh, build: Callable[[Array, NDArray[np.int64]], _Scene]) -> None:
         self._build = build
         self._still, self._moving = still, moving
-        self.scene = build(still.vertices + _shift(_thing_of_vertex(still)), still.triangles)  # type: ignore[operator]
+        self.scene = build(still.vertices + _shift(_thing_of_vertex(still)), still.triangles)
         self._offset = _shift(_thing_of_vertex(moving))
 
-    def movers(self, vertices: Array) -> object:
-        return self._build(vertices + self._offset, self._moving.triangles)  # type: ignore[operator]
+    def movers(self, vertices: Array) -> _Scene:
+        return self._build(vertices + self._offset, self._moving.triangles)
 
 
 _CUBE = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -450,7 +462,7 @@ def _lamp(light: Light, position: Array, points: Array, normals: Array) -> Array
     return np.asarray(light.strength * lambert / np.maximum(square, 0.25))
 
 
-def _bake(world: World, vertices: Array, normals: Array, occluded: object) -> Array:
+def _bake(world: World, vertices: Array, normals: Array, occluded: Callable[[F32, float], NDArray[np.bool_]]) -> Array:
     """Light (V,) on still vertices: lamps with soft shadows, and ambient light where the surroundings are open."""
     rng = np.random.default_rng(20)  # only where on a lamp and in the half sphere the few samples lie
     start = vertices + 4e-3 * normals
@@ -462,7 +474,7 @@ def _bake(world: World, vertices: Array, normals: Array, occluded: object) -> Ar
             received = _lamp(light, spot, vertices, normals)
             lit = received > 1e-4
             rays = np.concatenate([start[lit], spot - start[lit]], axis=1).astype(np.float32)
-            received[lit] *= ~occluded(rays, 0.999)  # type: ignore[operator]
+            received[lit] *= ~occluded(rays, 0.999)
             total += received / samples
     openness = np.zeros(len(vertices))
     directions = rng.standard_normal((20, 3))
@@ -470,5 +482,5 @@ def _bake(world: World, vertices: Array, normals: Array, occluded: object) -> Ar
     for direction in directions:
         toward = normals + 0.98 * direction  # cosine-weighted about the normal
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        openness += ~occluded(np.concatenate([start, toward], axis=1).astype(np.float32), 0.8)  # type: ignore[operator]
+        openness += ~occluded(np.concatenate([start, toward], axis=1).astype(np.float32), 0.8)
     return total + world.ambient * (0.15 + 0.85 * openness / len(directions))

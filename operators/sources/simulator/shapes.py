@@ -76,9 +76,7 @@ def bounds(shape: Shape) -> tuple[Array, Array]:
     return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def sheet(
-    corner: Sequence[float], along: Sequence[float], up: Sequence[float], material: Material, cell: float
-) -> Patch:
+def sheet(corner: Vector | Array, along: Vector | Array, up: Vector | Array, material: Material, cell: float) -> Patch:
     """A rectangle from `corner` along two perpendicular edge vectors, divided into cells of at most `cell`.
 
     Its normal is along × up.

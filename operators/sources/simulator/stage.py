@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,9 +16,15 @@ Array = NDArray[np.float64]
 class Stage:
     """Sensors that measure at one time from one place share one cast."""
 
-    def __init__(self, world: World, renderer: Renderer) -> None:
-        self.world, self.renderer = world, renderer
+    def __init__(self, world: World, seed: int, *, threads: int = 1) -> None:
+        self.world = world
+        self._seed, self._threads = seed, threads
         self._last: tuple[tuple[float, bytes, Optics], View] | None = None
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        """Made when it is first asked for: sensors that cast no rays need none. Raises ImportError without Open3D."""
+        return Renderer(self.world, self._seed, threads=self._threads)
 
     def T_world_base(self, t: float) -> Array:
         """(4, 4)."""

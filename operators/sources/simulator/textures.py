@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 Rng = np.random.Generator
 Pixels = NDArray[np.float32]
 """(SIZE, SIZE, 3) RGB, 0 to 255."""
+Color = Sequence[float] | NDArray[np.float64]
+"""RGB, 0 to 255."""
 
 SIZE = 256
 BORDER = 8  # texels repeated around a pattern, so that interpolation never sees its neighbour
@@ -100,7 +102,7 @@ def _rgb(grey: NDArray[np.float32]) -> Pixels:
     return np.repeat(grey[..., None], 3, axis=2)
 
 
-def _rect(canvas: Pixels, x: float, y: float, w: float, h: float, color: Sequence[float], thickness: int = -1) -> None:
+def _rect(canvas: Pixels, x: float, y: float, w: float, h: float, color: Color, thickness: int = -1) -> None:
     cv2.rectangle(canvas, (int(x), int(y)), (int(x + w), int(y + h)), tuple(map(float, color)), thickness)
 
 
@@ -112,9 +114,7 @@ def _bright(rng: Rng) -> NDArray[np.float64]:
     return np.asarray((0.25 + 0.7 * rgb * rng.uniform(0.6, 1)) * rng.uniform(150, 255))
 
 
-def _lines(
-    rng: Rng, canvas: Pixels, x: float, y: float, w: float, h: float, pitch: int, color: Sequence[float]
-) -> None:
+def _lines(rng: Rng, canvas: Pixels, x: float, y: float, w: float, h: float, pitch: int, color: Color) -> None:
     """Rows of words."""
     row = y
     while row + pitch * 0.6 < y + h:
@@ -210,7 +210,7 @@ def _cardboard(rng: Rng) -> Pixels:
     _rect(canvas, x, y * 0.5, 90, 46, (246, 246, 240))
     _lines(rng, canvas, x + 6, y * 0.5 + 6, 78, 36, 8, (50, 50, 60))
     for k in range(14):
-        _rect(canvas, 150 + k * 5, 190, rng.integers(1, 4), 40, (40, 40, 44))
+        _rect(canvas, 150 + k * 5, 190, int(rng.integers(1, 4)), 40, (40, 40, 44))
     return canvas
 
 
@@ -257,7 +257,8 @@ def _poster(rng: Rng) -> Pixels:
             points = rng.uniform(0, SIZE, (3, 2)).astype(np.int32)
             cv2.fillPoly(canvas, [points], color)
         else:
-            _rect(canvas, x, y, *rng.uniform(10, 90, 2), color)
+            w, h = rng.uniform(10, 90, 2)
+            _rect(canvas, x, y, w, h, color)
     if rng.uniform() < 0.5:
         _rect(canvas, 24, 196, 208, 44, (244, 242, 236))
         _lines(rng, canvas, 34, 202, 188, 34, 11, (30, 30, 36))
@@ -325,7 +326,8 @@ def _whiteboard(rng: Rng) -> Pixels:
         ink = inks[int(rng.integers(4))]
         x, y = rng.uniform(16, 150), rng.uniform(16, 200)
         if rng.uniform() < 0.5:
-            steps = np.cumsum(rng.normal(0, [3, 5], (22, 2)) + [3, 0], axis=0) + [x, y]
+            strokes = rng.normal(0, [3, 5], (22, 2)) + np.array([3, 0])
+            steps = np.cumsum(strokes, axis=0) + np.array([x, y])
             cv2.polylines(canvas, [steps.astype(np.int32)], False, ink, 2)
         else:
             _rect(canvas, x, y, rng.uniform(20, 70), rng.uniform(16, 40), ink, 2)

@@ -44,7 +44,7 @@ class WheelModel:
         speed, rate = (left + right) / 2 / elapsed, (right - left) / wheels.track / elapsed
         ticks = WheelTicks(
             stamp=stamp,
-            names=["left", "right"],
+            names=("left", "right"),
             ticks=counts,
             ticks_per_radian=np.full(2, wheels.ticks_per_turn / (2 * math.pi)),
             radii=np.full(2, wheels.radius),
@@ -53,11 +53,11 @@ class WheelModel:
             stamp=stamp,
             frame=frame,
             child_frame=base,
-            position=[self._pose[0], self._pose[1], 0.0],
+            position=np.array([self._pose[0], self._pose[1], 0.0]),
             orientation=quaternion_from_yaw(self._pose[2]),
             pose_covariance=_spatial(self._spread),
-            linear=[speed, 0.0, 0.0],
-            angular=[0.0, 0.0, rate],
+            linear=np.array([speed, 0.0, 0.0]),
+            angular=np.array([0.0, 0.0, rate]),
         )
         return ticks, odometry
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,21 +65,69 @@ def test_every_declared_port_is_fed_when_everything_is_on(everything: dict[str, 
     assert set(everything) == set(SimulatedRobot.spec.outputs)
 
 
-def test_another_process_with_other_threads_makes_the_same_bytes(everything: dict[str, list[Message]]) -> None:
-    program = (
-        f"import sys; sys.path.insert(0, {__file__.rsplit('/', 1)[0]!r})\n"
-        "from test_simulated_robot import EVERYTHING, digest, run\n"
-        "print(digest(run(**EVERYTHING, threads=2)))"
-    )
-    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=100, check=True)
-    assert answer.stdout.split()[-1] == digest(everything)
+def test_fresh_processes_make_the_same_bytes_with_one_thread_and_with_two(
+    everything: dict[str, list[Message]],
+) -> None:
+    def started(threads: int, hash_seed: str) -> subprocess.Popen[str]:
+        program = (
+            f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r})\n"
+            "from test_simulated_robot import EVERYTHING, digest, run\n"
+            f"print(digest(run(**EVERYTHING, threads={threads})))"
+        )
+        return subprocess.Popen(
+            [sys.executable, "-c", program],
+            env={**os.environ, "PYTHONHASHSEED": hash_seed},
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    processes = [started(1, "1"), started(2, "2")]
+    answers = [process.communicate(timeout=100)[0].split()[-1] for process in processes]
+    assert answers == [digest(everything)] * 2
 
 
-def test_a_sensor_measures_the_same_whatever_else_is_on(everything: dict[str, list[Message]]) -> None:
-    alone = run(seed=5, duration="600ms", color_camera={"rate": 0, **SMALL}, truth=QUIET, radar={"rate": 5})
-    assert alone["radar_scan"] == everything["radar_scan"]
-    # The depth camera is the colour camera's twin, which is off here.
-    assert alone["depth"] == everything["depth"]
+def test_a_robot_set_up_twice_makes_the_same_bytes_again() -> None:
+    robot = SimulatedRobot(**{**EVERYTHING, "duration": "200ms"})
+    digests = []
+    for _ in range(2):
+        robot.setup()
+        digests.append([m.digest() for step in robot.stream() for m in step.values()])
+    assert digests[0] == digests[1]
+
+
+NO_CAMERAS: dict[str, Any] = {"color_camera": {**SMALL, "rate": 0}, "depth_camera": {"rate": 0}, "truth": QUIET}
+
+
+@pytest.mark.parametrize(
+    ("sensor", "ports"),
+    [
+        ("depth_camera", {"depth", "depth_png"}),
+        ("stereo", {"left", "right"}),
+        ("lidar", {"points"}),
+        ("inertial", {"imu"}),
+        ("wheels", {"wheel_ticks", "wheel_odometry"}),
+        ("radar", {"radar_scan"}),
+        ("landmarks", {"sightings"}),
+        ("gnss", {"fix"}),
+        ("truth", {"ground_truth", "true_base", "activities", "scene"}),
+    ],
+)
+def test_a_sensor_measures_the_same_alone_and_beside_all_others(
+    sensor: str, ports: set[str], everything: dict[str, list[Message]]
+) -> None:
+    alone = run(**{**NO_CAMERAS, "seed": 5, "duration": "600ms", sensor: EVERYTHING[sensor]})
+    for port in ports:
+        assert alone[port] == everything[port], port
+
+
+def test_the_camera_and_its_truth_are_the_same_alone_and_beside_all_others(
+    everything: dict[str, list[Message]],
+) -> None:
+    truth = {**QUIET, "boxes": True, "masks": True}
+    camera = EVERYTHING["color_camera"]
+    alone = run(seed=5, duration="600ms", color_camera=camera, depth_camera={"rate": 0}, truth=truth)
+    for port in ("image", "image_jpeg", "objects", "boxes", "masks"):
+        assert alone[port] == everything[port], port
 
 
 def test_a_sensor_that_is_off_has_no_messages_and_no_frame() -> None:
@@ -124,6 +174,7 @@ def test_dropout_loses_its_share_and_outages_all_but_not_the_truth() -> None:
     seconds = np.array([m.stamp for m in lossy]) * 1e-9
     assert not ((seconds >= 5) & (seconds < 6)).any()
     assert abs(len(lossy) / 1900 - 0.7) < 0.04
+    assert len({m.stamp for m in lossy}) == len(lossy)
     blind = run(duration="500ms", color_camera={**SMALL, "dropout": 1.0}, depth_camera={"rate": 0})
     assert "image" not in blind
     assert len(blind["objects"]) == 5
@@ -138,6 +189,27 @@ def test_delay_shows_what_was_so_long_before() -> None:
         assert (earlier.data != later.data).mean() < 0.01  # type: ignore[attr-defined]
         assert later.stamp == earlier.stamp + 200_000_000
     assert (sharp[0].data != sharp[2].data).mean() > 0.3  # type: ignore[attr-defined]
+
+
+def test_a_delay_of_the_inertial_unit_shifts_what_it_measures() -> None:
+    quiet = {"rate": 100, "gyro_noise": 0, "gyro_walk": 0, "accel_noise": 0, "accel_walk": 0}
+    sharp, late = (
+        run(**{**NO_CAMERAS, "movers": False, "duration": "3s", "inertial": {**quiet, "delay": delay}})["imu"]
+        for delay in (0, "50ms")
+    )
+    turning = np.array([m.angular_velocity[2] for m in sharp])  # type: ignore[attr-defined]
+    delayed = np.array([m.angular_velocity[2] for m in late])  # type: ignore[attr-defined]
+    np.testing.assert_allclose(delayed[5:], turning[:-5], atol=1e-9)
+    assert np.abs(delayed - turning).max() > 1e-3
+
+
+def test_black_depth_frames_have_no_return_and_black_pairs_no_light() -> None:
+    dark = run(
+        duration="400ms", movers=False, color_camera={"rate": 0, **SMALL}, truth=QUIET,
+        depth_camera={"rate": 5, "black": 1.0}, stereo={"rate": 5, **SMALL, "black": 1.0},
+    )  # fmt: skip
+    assert not any(m.data.any() for m in dark["depth"])  # type: ignore[attr-defined]
+    assert all(m.data.mean() < 5 for port in ("left", "right") for m in dark[port])  # type: ignore[attr-defined]
 
 
 def test_black_frames_come_with_their_probability() -> None:

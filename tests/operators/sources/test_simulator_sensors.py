@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,15 +12,20 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.messages import Message
-from dataflow.messages.geometry import transform_points
+from dataflow.messages.geometry import invert, transform_points
 from operators.sources import SimulatedRobot
-from operators.sources.simulator import color, depth
+from operators.sources.simulator import color, depth, radar
 from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.sources.simulator.gnss import geodetic
 from operators.sources.simulator.noise import NoisePool
 from operators.sources.simulator.renderer import View
+from operators.sources.simulator.scene import Builder, Light, World
 from operators.sources.simulator.schedule import merged, ticks
-from operators.sources.simulator.settings import DepthCamera
+from operators.sources.simulator.settings import DepthCamera, Radar, Wheels
+from operators.sources.simulator.shapes import Array, Material, box, pose
+from operators.sources.simulator.stage import Stage
+from operators.sources.simulator.trajectory import Trajectory
+from operators.sources.simulator.wheels import WheelModel
 
 OFF: dict[str, Any] = {
     "color_camera": {"rate": 0},
@@ -27,6 +33,7 @@ OFF: dict[str, Any] = {
     "truth": {"poses": 0, "boxes": False, "relations": 0, "activities": 0},
 }
 POOL = NoisePool(0)
+SQUARE = np.array([(0, 0), (4, 0), (4, 4), (0, 4)], float)
 
 
 def robot(**params: Any) -> SimulatedRobot:
@@ -133,6 +140,51 @@ def test_lidar_points_lie_on_what_is_there_and_noise_is_along_the_beam() -> None
     assert angle < 1e-3
 
 
+def test_lidar_and_depth_camera_measure_the_same_surfaces() -> None:
+    source = robot(
+        duration="100ms",
+        depth_camera={"rate": 10, "width": 320, "height": 240, "noise": 0, "specks": 0, "quantum": 0.00011},
+        lidar={"rate": 10, "noise": 0, "missing": 0, "resolution": 0},
+    )
+    (step,) = source.stream()
+    depth_image: Any = step["depth"]
+    cloud: Any = step["points"]
+    T_base_lidar = mounted(source.lidar.mount)
+    p = transform_points(invert(source._T_base_depth) @ T_base_lidar, cloud.points.astype(np.float64))
+    p = p[p[:, 2] > 0.3]
+    info: Any = source.static_outputs()["depth_info"]
+    K = info.K
+    column, row = (p[:, :2] / p[:, 2:] @ K[:2, :2].T + K[:2, 2]).T.round().astype(int)
+    inside = (column >= 0) & (column < 320) & (row >= 0) & (row < 240)
+    z, seen = p[inside, 2], depth_image.data[row[inside], column[inside]]
+    apart = np.abs(z - seen)[seen > 0] / z[seen > 0]
+    assert len(apart) > 100
+    # The two look from different places, so near edges one of them sees what is hidden from the other.
+    assert np.mean(apart < 0.02) > 0.85
+
+
+def test_the_stereo_pair_sees_points_at_the_disparity_of_their_depth() -> None:
+    size = {"width": 320, "height": 240}
+    source = robot(
+        duration="100ms", movers=False, color_camera={"rate": 0, **size},
+        depth_camera={"rate": 10, "noise": 0, "specks": 0, "quantum": 0.00011, "edge_holes": 0},
+        stereo={"rate": 10, **size, "baseline": 0.1, "read_noise": 0, "shot_noise": 0},
+    )  # fmt: skip
+    (step,) = source.stream()
+    left, right, z = (step[port].data.astype(np.float64) for port in ("left", "right", "depth"))  # type: ignore[attr-defined]
+    rows, columns = np.nonzero(z > 0)
+    shifted = columns - 0.85 * 320 * 0.1 / z[rows, columns]
+    inside = shifted >= 0
+    rows, columns, shifted = rows[inside], columns[inside], shifted[inside]
+    whole = np.floor(shifted).astype(int)
+    share = shifted - whole
+    expected = right[rows, whole] * (1 - share) + right[rows, np.minimum(whole + 1, 319)] * share
+    apart = np.abs(left[rows, columns] - expected)
+    unshifted = np.abs(left[rows, columns] - right[rows, columns])
+    assert np.median(apart) < 2
+    assert np.median(apart) < 0.5 * np.median(unshifted)
+
+
 def test_a_moving_lidar_says_when_it_measured() -> None:
     (cloud,) = stream(robot(duration="200ms", lidar={"rate": 5, "columns": 60, "rings": 2, "motion": True}), "points")
     assert cloud.time_offsets.min() >= -0.2  # type: ignore[attr-defined]
@@ -176,6 +228,86 @@ def test_radar_sees_the_still_world_come_nearer_as_the_robot_drives() -> None:
     for scan in stream(source, "radar_scan"):
         speed = source._stage.world.path.at([scan.stamp * 1e-9]).speed()[0]
         np.testing.assert_allclose(scan.velocities, -speed * np.cos(scan.azimuths), atol=0.03)  # type: ignore[attr-defined]
+
+
+@dataclass(frozen=True)
+class Coming:
+    """A wall that slides towards the origin along x at 0.4 m/s."""
+
+    def frame(self, t: float) -> Array:
+        return pose(5.0 - 0.4 * t)
+
+    def parts(self, t: float) -> Array:
+        return self.frame(t)[None]
+
+
+def test_radar_measures_how_fast_a_mover_comes_nearer() -> None:
+    """A wall comes at 0.4 m/s to a robot that stands still: along a beam at azimuth a that is 0.4 · cos a."""
+    builder = Builder()
+    builder.surface("floor", box((30, 30, 0.1), Material("plain"), center=(0, 0, -5.0)))
+    builder.move("robot", (box((0.2, 8, 8), Material("plain")),), Coming())
+    path = Trajectory(SQUARE, hold=100)
+    world = World("test", tuple(builder.things), (Light((0, 0, 2), 1.0),), 0.5, path, np.zeros((0, 3)), (0,) * 6, ())
+    yaw = float(path.at([0.0]).yaw[0])
+    sensor = Radar(
+        rate=1, field=1.0, range_noise=0, azimuth_noise=0, velocity_noise=0, clutter=0, mount=(0, 0, 1, 0, 0, -yaw)
+    )
+    found = radar.scan(Stage(world, 0), sensor, 2.0, np.random.default_rng(0), 0, "radar")
+    assert len(found.ranges) > 20
+    np.testing.assert_allclose(found.velocities, -0.4 * np.cos(found.azimuths), atol=0.005)  # beams look up and down
+    np.testing.assert_allclose(found.ranges * np.cos(found.azimuths), 5 - 0.8 - 0.1, atol=0.04)
+
+
+def test_wheel_ticks_are_the_way_each_wheel_rolls() -> None:
+    track, radius, per_turn = 0.4, 0.08, 2048
+    source = robot(duration="8s", wheels={"rate": 50, "scale_error": 0, "slip": 0})
+    path = source._stage.world.path
+    times = np.linspace(0, 7.98, 40_001)
+    motion = path.at(times)
+    left, right = (motion.speed() + side * motion.yaw_rate * track / 2 for side in (-1, 1))
+    expected = [np.trapezoid(v, times) / (2 * math.pi * radius) * per_turn for v in (left, right)]
+    last: Any = stream(source, "wheel_ticks")[-1]
+    np.testing.assert_allclose(last.ticks, expected, atol=1.5)
+    assert last.names == ("left", "right")
+
+
+def test_wheel_errors_are_as_large_as_stated() -> None:
+    """Slip over many seeds: its standard deviation grows with the square root of the way."""
+    ends, path = [], Trajectory(SQUARE, speed=0.5)
+    for seed in range(60):
+        model = WheelModel(Wheels(rate=5, scale_error=0, slip=0.02, ticks_per_turn=1 << 20), seed)
+        rng = np.random.default_rng(seed)
+        for k in range(20):
+            ticks, _ = model.measure(path, k * 0.2, rng, k, "odom", "base")
+        ends.append(ticks.ticks / (1 << 20) * 2 * math.pi * 0.08)
+    way = np.mean(ends, axis=0)
+    np.testing.assert_allclose(np.std(ends, axis=0), 0.02 * np.sqrt(way), rtol=0.3)
+
+
+def test_sightings_scatter_as_their_covariances_say() -> None:
+    quiet = {"rate": 20, "missing": 0, "max_range": 20}
+    noisy, exact = (
+        stream(robot(duration="2s", movers=False, hold=10, landmarks={**quiet, **noise}), "sightings")
+        for noise in ({}, {"range_noise": 0, "bearing_noise": 0})
+    )
+    pulls = []
+    for m, truth in zip(noisy, exact, strict=True):
+        n, t = cast(Any, m), cast(Any, truth)
+        error = np.stack([n.ranges - t.ranges, n.bearings - t.bearings, n.elevations - t.elevations], axis=1)
+        pulls.append(error / np.sqrt(np.diagonal(n.covariances, axis1=1, axis2=2)))
+    np.testing.assert_allclose(np.concatenate(pulls).std(axis=0), 1, rtol=0.15)
+
+
+def test_a_landmark_behind_something_is_not_sighted() -> None:
+    source = robot(duration="100ms", movers=False, landmarks={"rate": 10, "missing": 0, "max_range": 100})
+    (message,) = stream(source, "sightings")
+    T = source._stage.T_world_base(0.0) @ mounted(source.landmarks.mount)
+    places = source._stage.world.landmarks
+    rays = np.concatenate([np.broadcast_to(T[:3, 3], places.shape), places - T[:3, 3]], axis=1).astype(np.float32)
+    free = source._stage.at(0.0).cast(rays).distance * np.linalg.norm(places - T[:3, 3], axis=1)
+    way = np.linalg.norm(places - T[:3, 3], axis=1)
+    ids: Any = message
+    np.testing.assert_array_equal(np.sort(ids.ids), np.flatnonzero(free > way - 0.06))
 
 
 def test_landmarks_are_where_the_map_says() -> None:

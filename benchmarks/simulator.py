@@ -1,0 +1,106 @@
+"""Times the simulated robot: whole set-ups against real time, and each sensor by itself.
+
+python benchmarks/simulator.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from typing import Any
+
+import cv2
+
+from operators.sources import SimulatedRobot
+
+VGA = {"width": 640, "height": 480}
+SMALL = {"width": 320, "height": 240}
+NOTHING: dict[str, Any] = {
+    "color_camera": {"rate": 0},
+    "depth_camera": {"rate": 0},
+    "truth": {"poses": 0, "boxes": False, "relations": 0, "activities": 0},
+}
+TRUTH = {"poses": 10, "boxes": True, "relations": 1, "activities": 5, "masks": True}
+DEMO: dict[str, Any] = {
+    "color_camera": {**SMALL, "output": "jpeg", "jpeg_quality": 80},
+    "depth_camera": {"output": "png"},
+    "lidar": {"rate": 5},
+    "inertial": {"rate": 100},
+    "wheels": {"rate": 20},
+    "truth": TRUTH,
+}
+SETUPS: dict[str, dict[str, Any]] = {
+    "colour + depth, 640x480, 10 Hz": {"color_camera": VGA, "depth_camera": {}},
+    "colour + depth, 320x240, 10 Hz": {"color_camera": SMALL, "depth_camera": {}},
+    "the same with boxes, masks, poses, activities, relations": {
+        "color_camera": SMALL, "depth_camera": {}, "truth": TRUTH,
+    },
+    "all of the bundled recording": DEMO,
+}  # fmt: skip
+SENSORS: dict[str, dict[str, Any]] = {
+    "colour, 640x480": {"color_camera": VGA},
+    "colour, 320x240": {"color_camera": SMALL},
+    "colour with JPEG, 320x240": {"color_camera": {**SMALL, "output": "both"}},
+    "depth, 640x480": {"color_camera": {**VGA, "rate": 0}, "depth_camera": {}},
+    "depth, 320x240": {"color_camera": {**SMALL, "rate": 0}, "depth_camera": {}},
+    "depth with PNG, 320x240": {"color_camera": {**SMALL, "rate": 0}, "depth_camera": {"output": "both"}},
+    "stereo pair, 2 x 320x240": {"stereo": {"rate": 10}},
+    "LiDAR, 16x360": {"lidar": {"rate": 10}},
+    "LiDAR, 64x1024": {"lidar": {"rate": 10, "rings": 64, "columns": 1024}},
+    "radar": {"radar": {"rate": 10}},
+    "landmark sightings": {"landmarks": {"rate": 10}},
+    "IMU": {"inertial": {"rate": 100}},
+    "wheels": {"wheels": {"rate": 50}},
+    "satellite fixes": {"gnss": {"rate": 10}},
+    "poses": {"truth": {**NOTHING["truth"], "poses": 10}},
+    "activities": {"truth": {**NOTHING["truth"], "activities": 10}},
+    "scene graph": {"truth": {**NOTHING["truth"], "relations": 10}},
+}
+
+
+def timed(params: dict[str, Any], seconds: float, repeats: int) -> tuple[float, int]:
+    """Seconds that a span of simulated time takes, and its steps: the sum over steps of the least of all repeats.
+
+    Every repeat computes the same, so the least is what a step takes when nothing disturbs it. Set-up and the first
+    second are left out.
+    """
+    least: list[float] = []
+    for _ in range(repeats):
+        robot = SimulatedRobot(**{**NOTHING, **params, "duration": f"{seconds + 1}s"})
+        robot.setup()
+        spans, begin = [], time.perf_counter()
+        for step in robot.stream():
+            end = time.perf_counter()
+            if next(iter(step.values())).stamp >= 1_000_000_000:
+                spans.append(end - begin)
+            begin = time.perf_counter()
+        least = [min(pair) for pair in zip(least, spans, strict=True)] if least else spans
+    return sum(least), len(least)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=2, help="simulated time of each run")
+    parser.add_argument("--repeats", type=int, default=3, help="runs of each; of every step the fastest counts")
+    arguments = parser.parse_args()
+
+    print("| what | world | threads | ms of computing a second of the world | x real time |")
+    print("| --- | --- | --- | --- | --- |")
+    for name, params in SETUPS.items():
+        for world in ("office", "corridor", "table_top") if "640x480" in name else ("office",):
+            for threads in (1, 2):
+                cv2.setNumThreads(threads)
+                given = {**params, "world": world, "threads": threads}
+                best, _ = timed(given, arguments.seconds, arguments.repeats)
+                share = best / arguments.seconds
+                print(f"| {name} | {world} | {threads} | {1000 * share:.0f} | {1 / share:.1f} |", flush=True)
+
+    print("\n| sensor | ms a measurement |\n| --- | --- |")
+    cv2.setNumThreads(1)
+    for name, params in SENSORS.items():
+        best, steps = timed(params, arguments.seconds, arguments.repeats)
+        print(f"| {name} | {1000 * best / steps:.2f} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,220 @@
+"""What verification found, in words: one recording in full, many in a table."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from rich.console import Console
+from rich.text import Text
+
+from dataflow.cli.output import count, plural, seconds, size, table
+from dataflow.recording.diff import FieldDifference
+from dataflow.runtime.completion import Completion
+from dataflow.runtime.gate import Checked, Judged
+from dataflow.runtime.outputs import OutputComparison
+from dataflow.runtime.reexecute import Difference, Verification
+from dataflow.runtime.verify import VerifyReport
+from dataflow.sync.stamps import format_stamp
+
+STYLES = {
+    "identical": "green",
+    "within tolerance": "cyan",
+    "accepted": "cyan",
+    "culprit": "bold red",
+    "different": "bold red",
+    "not as accepted": "bold red",
+    "could not run": "bold red",
+    "downstream": "yellow",
+    "unverifiable": "yellow",
+    "not wholly verified": "yellow",
+}
+FIELDS_SHOWN = 6
+
+
+def print_one(console: Console, checked: Checked) -> None:
+    """Operators with their verdicts, what there is to say about each, what differs between the machines, the end."""
+    report = checked.report
+    assert report is not None
+    numbers = ("firings", "repeated", "outputs", "differing")
+    verdicts = table("operator", *numbers, "verdict", right=numbers)
+    for v, judged in zip(report.operators, checked.judged, strict=True):
+        cells = (count(n) for n in (v.firings, v.verified, v.outputs, v.differing))
+        verdicts.add_row(Text(v.operator), *cells, Text(judged.verdict, style=STYLES[judged.verdict]))
+    console.print(verdicts)
+    for judged in checked.judged:
+        for line in explain(checked, judged):
+            console.print(Text(line), soft_wrap=True)
+    if not report.identical:
+        for line in fact_lines(report):
+            console.print(Text(line, style="dim"), soft_wrap=True)
+    console.print(Text.assemble((checked.verdict, STYLES[checked.verdict]), _conclusion(checked, report)))
+
+
+def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
+    """A table of recordings, then what there is to say about those that did not pass."""
+    numbers = ("messages", "× real time")
+    summary = table("recording", "verdict", *numbers, "look at", right=numbers)
+    for checked in all_checked:
+        report = checked.report
+        summary.add_row(
+            Text(checked.name),
+            Text(checked.verdict, style=STYLES[checked.verdict]),
+            "" if report is None else count(report.messages),
+            f"{report.span / report.wall:.1f}" if report is not None and report.wall and report.span else "",
+            Text(", ".join(checked.culprits)),
+        )
+    console.print(summary)
+    for checked in all_checked:
+        if checked.passed:
+            continue
+        console.print(Text(checked.name, style="bold"))
+        if checked.report is None:
+            console.print(Text(f"  {checked.error}"), soft_wrap=True)
+            continue
+        for judged in checked.judged:
+            if not judged.passed:
+                for line in explain(checked, judged):
+                    console.print(Text(f"  {line}"), soft_wrap=True)
+        for line in fact_lines(checked.report):
+            console.print(Text(f"  {line}", style="dim"), soft_wrap=True)
+    passed = sum(c.passed for c in all_checked)
+    failed = {verdict: sum(c.verdict == verdict for c in all_checked) for verdict in STYLES}
+    rest = [f"{n} {verdict}" for verdict, n in failed.items() if n and verdict not in ("identical",)]
+    style = "green" if passed == len(all_checked) else "bold red"
+    total = plural(len(all_checked), "recording")
+    console.print(Text.assemble((f"{passed} of {total} passed", style), f" ({', '.join(rest)})" if rest else ""))
+
+
+def print_completion(console: Console, made: Completion) -> None:
+    """What was computed and stored; or which operator came out otherwise, and where."""
+    for v in made.operators:
+        if v.first is not None:
+            lines = [
+                *_difference(v, v.first, None),
+                f"  {v.operator} is {'the culprit' if v.verdict == 'culprit' else 'downstream'}",
+            ]
+            for line in lines:
+                console.print(Text(line), soft_wrap=True)
+        for line in _left_out(v):
+            console.print(Text(line), soft_wrap=True)
+    if not made.stored:
+        culprits = [v.operator for v in made.operators if v.verdict == "culprit"]
+        at = f"look at {', '.join(culprits)}" if culprits else "see above"
+        console.print(Text.assemble(("different", "bold red"), f": nothing written; {at}"))
+        return
+    written = f"{made.path} ({plural(made.messages, 'message')}, {size(made.nbytes)}, {seconds(made.wall)})"
+    console.print(
+        Text.assemble(
+            ("complete" if made.whole else "not wholly complete", "green" if made.whole else "yellow"),
+            f": wrote {written}",
+        ),
+        soft_wrap=True,
+    )
+    console.print(Text(f"computed again: {', '.join(made.added) or 'nothing that was not recorded'}"), soft_wrap=True)
+
+
+def explain(checked: Checked, judged: Judged) -> Iterator[str]:
+    """What there is to say about one operator besides its verdict."""
+    report = checked.report
+    assert report is not None
+    v = next(v for v in report.operators if v.operator == judged.operator)
+    compared = report.comparisons.get(v.operator)
+    if judged.verdict == "accepted":
+        yield f"{v.operator}: other than recorded, as the baseline accepts"
+    elif judged.verdict == "not as accepted":
+        yield f"{v.operator}: as recorded, but the baseline accepts another outcome (--accept takes this one)"
+    elif judged.verdict == "within tolerance":
+        assert compared is not None
+        yield _tolerated(compared, report.tolerance)
+    elif v.first is not None:
+        yield from _difference(v, v.first, compared)
+        if compared is not None and report.tolerance is not None and not compared.note:
+            counts = f"{count(compared.equal)} identical, {count(compared.within)} within {report.tolerance:g}"
+            more = f", {count(compared.otherwise)} missing, uncalled for or in error" if compared.otherwise else ""
+            yield f"{v.operator}: given the recorded inputs, {counts}, {count(compared.beyond)} beyond it{more}"
+    repeats = report.repeats(v.operator)
+    if repeats is False and judged.verdict != "within tolerance":
+        yield (
+            f"{v.operator}: run a second time, it came out otherwise again: it does not repeat "
+            "(it may read the clock, draw numbers that are not self.rng's, or use several threads)"
+        )
+    elif repeats and judged.verdict == "culprit":
+        yield f"{v.operator}: run a second time, it came out the same: its code, its libraries or the machine changed"
+    yield from _left_out(v)
+    for file in v.files_changed:
+        yield f"{v.operator}: file {file} is not the one that was read then"
+
+
+def _left_out(v: Verification) -> Iterator[str]:
+    """What could not be repeated."""
+    if v.lost_records:
+        yield f"{v.operator}: {plural(v.lost_records, 'firing')} could not be repeated (records before them are lost)"
+    if v.unverifiable:
+        missing = v.missing or "input"
+        yield f"{v.operator}: {plural(v.unverifiable, 'firing')} could not be repeated (missing {missing})"
+    if v.after_cut:
+        yield f"{v.operator}: {plural(v.after_cut, 'message')} after its last record"
+
+
+def fact_lines(report: VerifyReport) -> Iterator[str]:
+    """What differs between the machine that recorded and this one, for beside a difference."""
+    if not report.facts:
+        yield "machine, libraries, threads and devices are as when it was recorded"
+    for fact, then, now in report.facts:
+        yield f"{fact}: {then or 'none'} when recorded, {now or 'none'} here"
+
+
+def _difference(v: Verification, first: Difference, compared: OutputComparison | None) -> Iterator[str]:
+    port = f", port {first.port}" if first.port else ""
+    again = f" of incarnation {first.incarnation}" if first.incarnation else ""
+    when = f"{format_stamp(first.stamp)} ({first.stamp})"
+    yield f"{v.operator}: first difference in firing {first.index}{again} ({first.kind}) at {when}{port}"
+    yield f"  recorded  {first.expected}"
+    yield f"  here      {first.got}"
+    if compared is None:
+        return
+    if compared.note:
+        yield f"  {compared.note}"
+    for output in compared.first:
+        if (output.index, output.incarnation) != (first.index, first.incarnation):
+            yield f"  compared in firing {output.index} ({output.kind}) at {format_stamp(output.firing)}:"
+        if output.note:
+            yield f"  {output.port}: {output.note}, so only digests can be compared"
+        for found in output.fields[:FIELDS_SHOWN]:
+            yield f"  {output.port}.{_field(found)}"
+        if len(output.fields) > FIELDS_SHOWN:
+            yield f"  {output.port}: {len(output.fields) - FIELDS_SHOWN} more fields differ"
+
+
+def _field(found: FieldDifference) -> str:
+    largest = "" if found.max_difference is None else f", by at most {found.max_difference:.3g}"
+    if found.index is None:
+        return f"{found.field}: recorded {found.a}, here {found.b}{largest}"
+    where = ", ".join(map(str, found.index))
+    elements = f"{count(found.count)} of {count(found.size)} elements differ"
+    return f"{found.field}[{where}]: recorded {found.a}, here {found.b}; {elements}{largest}"
+
+
+def _tolerated(compared: OutputComparison, tolerance: float | None) -> str:
+    if not compared.within:
+        return f"{compared.operator}: differs with its inputs; given the recorded ones it is identical"
+    return (
+        f"{compared.operator}: not identical: given the recorded inputs, {plural(compared.within, 'message')} "
+        f"differ from the recorded ones by at most {compared.max_difference:.3g}, within {tolerance:g}; "
+        f"{count(compared.equal)} identical"
+    )
+
+
+def _conclusion(checked: Checked, report: VerifyReport) -> str:
+    pace = f", {seconds(report.span)} of event time in {seconds(report.wall)}" if report.wall and report.span else ""
+    what = f"{plural(report.messages, 'message')} of {plural(report.streams, 'stream')}"
+    if report.wall and report.span:
+        pace += f", {report.span / report.wall:.1f} × real time"
+    match checked.verdict:
+        case "identical":
+            return f": {what}{pace}"
+        case "within tolerance":
+            return f" of {report.tolerance:g}, not identical: {what}{pace}"
+        case "different" if checked.culprits:
+            return f": look at {', '.join(checked.culprits)}{pace}"
+    return pace

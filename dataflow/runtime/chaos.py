@@ -1,0 +1,226 @@
+"""Faults on purpose: a seeded plan of what is to go wrong in a live run, and when.
+
+The plan is pure: it expands to the same timeline for the same seed. What the faults do is up to the supervisor (to
+processes) and the hosts (to operators and sources). All of it is what robots do to software anyway; the run records it,
+and `dataflow verify` repeats the run, faults included.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pydantic
+from ruamel.yaml import YAML
+from ruamel.yaml.error import MarkedYAMLError
+
+from dataflow.graph.model import Graph
+from dataflow.messages.base import Message
+from dataflow.operator import Duration
+
+SECOND = 1_000_000_000
+TO_OPERATORS = ("raise", "hang", "slow", "leak")
+TO_SOURCES = ("stop", "flood", "jump", "past")
+TO_PROCESSES = ("kill", "freeze")
+
+
+class ChaosError(ValueError):
+    """A fault plan that cannot be followed: says which entry, and what would be right."""
+
+
+class _Timed(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    operator: str
+    at: Duration | None = pydantic.Field(None, description="time after the sources were released")
+    every: Duration | None = pydantic.Field(
+        None, description="again and again, at random times with this mean distance"
+    )
+    until: Duration | None = pydantic.Field(None, description="end of `every`; default: the whole run")
+
+    @pydantic.model_validator(mode="after")
+    def _once_or_often(self) -> _Timed:
+        if (self.at is None) == (self.every is None):
+            raise ValueError("give either 'at' (once) or 'every' (again and again)")
+        return self
+
+
+class _Plain(_Timed):
+    kind: Literal["kill", "raise", "hang"]
+
+
+class _Lasting(_Timed):
+    kind: Literal["freeze", "stop"]
+    span: Duration = pydantic.Field(alias="for")
+
+
+class _Slow(_Timed):
+    kind: Literal["slow"]
+    by: Duration
+    span: Duration = pydantic.Field(alias="for")
+
+
+class _Flood(_Timed):
+    kind: Literal["flood"]
+    factor: int = pydantic.Field(ge=2, le=1000)
+    span: Duration = pydantic.Field(alias="for")
+
+
+class _Jump(_Timed):
+    kind: Literal["jump", "past"]
+    by: Duration
+    back: bool = pydantic.Field(True, description="backwards; false: forwards")
+
+
+class _Leak(_Timed):
+    kind: Literal["leak"]
+    megabytes: int = pydantic.Field(ge=1, le=100_000)
+
+
+class _Malformed(_Timed):
+    kind: Literal["malformed"]
+
+
+class _Param(_Timed):
+    kind: Literal["param"]
+    name: str
+    values: list[Any] = pydantic.Field(min_length=1)
+
+
+_Entry = Annotated[
+    _Plain | _Lasting | _Slow | _Flood | _Jump | _Leak | _Malformed | _Param, pydantic.Field(discriminator="kind")
+]
+
+
+class _Plan(pydantic.BaseModel):
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+    seed: int = 0
+    faults: list[_Entry]
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """One fault: `at` seconds after the release; `fields` belong to the kind (durations in seconds)."""
+
+    at: float
+    kind: str
+    operator: str
+    fields: Mapping[str, Any]
+
+
+def load_plan(path: Path, graph: Graph, *, seed: int | None = None) -> Iterator[Fault]:
+    """The faults of a plan file in the order of their time; endless where one has `every` without `until`.
+
+    `seed` replaces the plan's own. Raises `ChaosError`.
+    """
+    try:
+        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except (OSError, MarkedYAMLError) as error:
+        raise ChaosError(f"{path}: {error}") from error
+    return plan_of(content, graph, seed=seed, name=str(path))
+
+
+def plan_of(content: Any, graph: Graph, *, seed: int | None = None, name: str = "plan") -> Iterator[Fault]:
+    """As `load_plan`, from the plan's content."""
+    try:
+        plan = _Plan.model_validate(content)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise ChaosError(f"{name}: {place}: {first['msg']} (got {first['input']!r})") from error
+    for k, entry in enumerate(plan.faults):
+        _check(entry, graph, f"{name}: faults.{k}")
+    return _merged(plan, plan.seed if seed is None else seed)
+
+
+def _check(entry: Any, graph: Graph, place: str) -> None:
+    node = graph.nodes.get(entry.operator)
+    if node is None:
+        raise ChaosError(f"{place}: no operator {entry.operator!r}; there are {', '.join(graph.nodes)}")
+    if entry.kind in TO_SOURCES and not node.source:
+        sources = ", ".join(n.name for n in graph.sources())
+        raise ChaosError(f"{place}: {entry.kind!r} is for sources ({sources}); {entry.operator!r} is none")
+    if entry.kind in TO_OPERATORS and node.source:
+        raise ChaosError(f"{place}: {entry.kind!r} is for operators with inputs; {entry.operator!r} is a source")
+    needs_restart = entry.kind in ("kill", "raise", "hang")
+    if needs_restart and node.live.restart.max < 1:
+        raise ChaosError(
+            f"{place}: {entry.kind!r} would end the run: give {entry.operator!r} a restart policy, "
+            "live: {restart: {max: 100, backoff: 100ms}}"
+        )
+    if entry.kind == "hang" and node.live.deadline is None:
+        raise ChaosError(f"{place}: nothing would notice that {entry.operator!r} hangs: give it live: {{deadline: 1s}}")
+
+
+def _merged(plan: _Plan, seed: int) -> Iterator[Fault]:
+    """All entries' faults by time; each entry draws from a generator of its own, so that one does not move another."""
+    import heapq
+
+    entries = [_times(entry, random.Random(f"{seed} {k}")) for k, entry in enumerate(plan.faults)]
+    return iter(heapq.merge(*entries, key=lambda fault: fault.at))
+
+
+def _times(entry: Any, rng: random.Random) -> Iterator[Fault]:
+    def fault(at: float) -> Fault:
+        fields = entry.model_dump(exclude={"kind", "operator", "at", "every", "until"}, exclude_none=True)
+        for name in ("by", "span"):
+            if name in fields:
+                fields[name] = fields[name] / SECOND
+        if "values" in fields:
+            fields["value"] = rng.choice(fields.pop("values"))
+        return Fault(at, entry.kind, entry.operator, fields)
+
+    if entry.at is not None:
+        yield fault(entry.at / SECOND)
+        return
+    at = 0.0
+    while True:
+        at += rng.expovariate(SECOND / entry.every)
+        if entry.until is not None and at > entry.until / SECOND:
+            return
+        yield fault(at)
+
+
+Step = Mapping[str, Message]
+
+
+class SourceFaults:
+    """What is done to the steps of one source on their way out. `now` is in seconds, never going back."""
+
+    def __init__(self) -> None:
+        self._silent_until = 0.0
+        self._flood: tuple[int, float] = (1, 0.0)
+        self._shift = 0
+        self._past: int | None = None
+
+    def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
+        match kind:
+            case "stop":
+                self._silent_until = now + fields["span"]
+            case "flood":
+                self._flood = (fields["factor"], now + fields["span"])
+            case "jump":
+                self._shift += round(fields["by"] * SECOND) * (-1 if fields["back"] else 1)
+            case "past":
+                self._past = -round(fields["by"] * SECOND)
+
+    def apply(self, step: Step, now: float) -> Iterator[dict[str, Message]]:
+        """The steps that take this one's place: none, itself, or several."""
+        if now < self._silent_until:
+            return
+        if self._shift:
+            step = _shifted(step, self._shift)
+        if self._past is not None:
+            past, self._past = self._past, None
+            yield _shifted(step, past)
+        factor, until = self._flood
+        for k in range(factor if now < until else 1):
+            yield _shifted(step, k) if k else dict(step)
+
+
+def _shifted(step: Step, by: int) -> dict[str, Message]:
+    return {port: message.replace(stamp=max(0, message.stamp + by)) for port, message in step.items()}

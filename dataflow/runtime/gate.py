@@ -1,0 +1,261 @@
+"""The regression gate: many recordings verified, each judged against itself or against an accepted baseline."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import traceback
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from dataflow.messages import MessageError
+from dataflow.operator import ParameterError
+from dataflow.recording import RecordingError
+from dataflow.runtime.firings import FiringRecordError
+from dataflow.runtime.reexecute import Verification
+from dataflow.runtime.replay import ReplayError
+from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.verify import VerifyReport
+
+FORMAT = 1
+
+OperatorVerdict = Literal[
+    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "unverifiable"
+]
+RecordingVerdict = Literal[
+    "identical", "within tolerance", "accepted", "different", "not wholly verified", "could not run"
+]
+PASSES = ("identical", "within tolerance", "accepted")
+"""The verdicts with which the gate lets pass."""
+
+Outcome = Mapping[str, Any]
+"""What an operator that differs made here: digests of its streams, how much differs, and the first difference."""
+
+
+class BaselineError(ValueError):
+    """A baseline file that cannot be read: says what is wrong with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One operator of one recording, measured by what is expected of it: the recording, or the accepted outcome.
+
+    `firm`: it came out alike both times it was run, so it can be accepted.
+    """
+
+    operator: str
+    verdict: OperatorVerdict
+    outcome: Outcome | None = None
+    firm: bool = True
+
+    @property
+    def passed(self) -> bool:
+        return self.verdict in PASSES
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all."""
+
+    path: Path
+    name: str
+    report: VerifyReport | None
+    judged: tuple[Judged, ...] = ()
+    error: str = ""
+    details: str = ""
+    wall: float = 0.0
+
+    @property
+    def verdict(self) -> RecordingVerdict:
+        found = {j.verdict for j in self.judged}
+        if self.report is None:
+            return "could not run"
+        if found & {"culprit", "downstream", "not as accepted"}:
+            return "different"
+        if "unverifiable" in found:
+            return "not wholly verified"
+        return "accepted" if "accepted" in found else "within tolerance" if "within tolerance" in found else "identical"
+
+    @property
+    def passed(self) -> bool:
+        return self.verdict in PASSES
+
+    @property
+    def culprits(self) -> tuple[str, ...]:
+        """The operators to look at."""
+        return tuple(j.operator for j in self.judged if j.verdict in ("culprit", "not as accepted"))
+
+    def as_json(self) -> dict[str, Any]:
+        value = {"recording": self.name, "verdict": self.verdict, "passed": self.passed, "total_wall_s": self.wall}
+        if self.report is None:
+            return value | {"error": self.error}
+        report = self.report.as_json()
+        verdicts = {j.operator: j.verdict for j in self.judged}
+        for operator in report["operators"]:
+            operator["verdict"] = verdicts[operator["operator"]]
+        return value | report | {"culprits": list(self.culprits)}
+
+
+@dataclass(slots=True)
+class Baseline:
+    """The outcomes that were accepted although they are not what was recorded: recording → operator → outcome.
+
+    Recordings go by their path from the baseline file's folder, so the file can be kept beside them under version
+    control and used from anywhere.
+    """
+
+    file: Path
+    accepted: dict[str, dict[str, Outcome]] = field(default_factory=dict)
+
+    @staticmethod
+    def load(file: Path) -> Baseline:
+        """Raises `BaselineError`, `OSError`. A file that does not exist accepts nothing."""
+        if not file.exists():
+            return Baseline(file)
+        try:
+            value = json.loads(file.read_text(encoding="utf-8"))
+            if value["format"] != FORMAT:
+                raise BaselineError(f"{file}: a baseline of format {value['format']!r}; this version reads {FORMAT}")
+            accepted = {str(name): dict(operators) for name, operators in value["accepted"].items()}
+        except BaselineError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise BaselineError(
+                f"{file} is not a baseline: {type(error).__name__}: {error}; `dataflow verify ... --accept` writes one"
+            ) from error
+        return Baseline(file, accepted)
+
+    def save(self) -> None:
+        text = json.dumps({"format": FORMAT, "accepted": self.accepted}, indent=2, sort_keys=True, ensure_ascii=False)
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        part = self.file.with_name(f"{self.file.name}.part")
+        part.write_text(text + "\n", encoding="utf-8")
+        part.replace(self.file)
+
+    def name_of(self, recording: Path) -> str:
+        return Path(os.path.relpath(recording.resolve(), self.file.parent.resolve())).as_posix()
+
+    def of(self, recording: Path) -> Mapping[str, Outcome]:
+        return self.accepted.get(self.name_of(recording), {})
+
+    def accept(self, checked: Checked) -> tuple[list[str], list[str]]:
+        """Takes over what a recording came to. (operators accepted anew or otherwise, operators that cannot be)."""
+        outcomes = {j.operator: j.outcome for j in checked.judged if j.outcome is not None and j.firm}
+        refused = [
+            j.operator for j in checked.judged if j.verdict == "unverifiable" or (j.outcome is not None and not j.firm)
+        ]
+        before = self.of(checked.path)
+        changed = [name for name in {**before, **outcomes} if before.get(name) != outcomes.get(name)]
+        name = self.name_of(checked.path)
+        if outcomes:
+            self.accepted[name] = outcomes
+        else:
+            self.accepted.pop(name, None)
+        return sorted(changed), refused
+
+    def unused(self, checked: Iterable[Checked]) -> list[str]:
+        """Recordings that the baseline names and that were not among those verified."""
+        return sorted(self.accepted.keys() - {self.name_of(c.path) for c in checked})
+
+
+def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
+    """Files as they are, of folders every .mcap in them, at any depth: (path, name to show).
+
+    Raises `ReplayError` for what is not there, and for a folder that holds no recording.
+    """
+    found: dict[Path, str] = {}
+    for target in targets:
+        if target.is_dir():
+            inside = sorted(p for p in target.rglob("*.mcap") if p.is_file())
+            if not inside:
+                raise ReplayError(f"folder {target} holds no recording (no .mcap file, at any depth)")
+            found |= {path: path.relative_to(target).as_posix() for path in inside if path not in found}
+        elif target.exists():
+            found.setdefault(target, target.name)
+        else:
+            raise ReplayError(f"no file or folder {target}")
+    names = list(found.values())
+    return [(path, name if names.count(name) == 1 else str(path)) for path, name in found.items()]
+
+
+def check(
+    path: Path, name: str, verify: Callable[[Path], VerifyReport], accepted: Mapping[str, Outcome] | None = None
+) -> Checked:
+    """Verifies one recording and judges it; whatever prevents that becomes its `error`.
+
+    Raises only `RunFailed` for a run that was interrupted.
+    """
+    started = time.monotonic()
+    try:
+        report = verify(path)
+    except RunFailed as failure:
+        if failure.interrupted:
+            raise
+        return Checked(path, name, None, (), str(failure), failure.details, time.monotonic() - started)
+    except (RecordingError, ReplayError, FiringRecordError, MessageError, ParameterError, OSError) as error:
+        return Checked(path, name, None, (), str(error), "", time.monotonic() - started)
+    except (
+        Exception
+    ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
+        what = f"{type(error).__name__}: {error}"
+        return Checked(path, name, None, (), what, traceback.format_exc(), time.monotonic() - started)
+    return Checked(path, name, report, judge(report, accepted or {}), wall=time.monotonic() - started)
+
+
+def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged, ...]:
+    """The verdict on each operator, given what has been accepted.
+
+    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well.
+    """
+    outcomes = {v.operator: outcome_of(report, v) for v in report.operators}
+    unexpected = {
+        v.operator
+        for v in report.operators
+        if outcomes[v.operator] is not None and outcomes[v.operator] != accepted.get(v.operator)
+    }
+    judged = []
+    for v in report.operators:
+        own, outcome = report.verdict(v), outcomes[v.operator]
+        verdict: OperatorVerdict = own
+        if v.operator in accepted and outcome is None and own != "unverifiable":
+            verdict = "not as accepted"
+        elif outcome is not None and v.operator not in unexpected:
+            verdict = "accepted"
+        elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
+            verdict = "culprit"
+        judged.append(Judged(v.operator, verdict, outcome, report.repeats(v.operator) is not False))
+    return tuple(judged)
+
+
+def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | None:
+    """What an operator made here, where that is not what was recorded."""
+    first = verification.first
+    if first is None or report.verdict(verification) == "within tolerance":
+        return None
+    streams = {s: report.digests[s] for s in report.outputs.get(verification.operator, ()) if s in report.digests}
+    return {
+        "streams": {stream: {"messages": count, "digest": digest} for stream, (count, digest) in streams.items()},
+        "differing": verification.differing,
+        "first": {"firing": first.index, "stamp": first.stamp, "port": first.port, "got": first.got},
+    }
+
+
+def _led_astray(operator: str, unexpected: Collection[str], producers: Mapping[str, frozenset[str]]) -> bool:
+    """Whether an operator depends on an unexpected one that does not in turn depend on it."""
+    return any(
+        other != operator and operator not in _upstream(other, producers)
+        for other in _upstream(operator, producers) & set(unexpected)
+    )
+
+
+def _upstream(operator: str, producers: Mapping[str, frozenset[str]]) -> set[str]:
+    found: set[str] = set()
+    left = [operator]
+    while left:
+        new = producers.get(left.pop(), frozenset()) - found
+        found |= new
+        left += new
+    return found

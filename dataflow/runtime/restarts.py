@@ -1,0 +1,49 @@
+"""How often what failed is started again, and when: the restart policy of one operator or host."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from dataflow.graph.model import Restart
+
+LONGEST_BACKOFF = 30.0
+"""Seconds; the time before an attempt doubles up to here."""
+
+
+class Restarts:
+    """Counts attempts. A failure after `forgive_after` seconds without one begins the count again."""
+
+    def __init__(self, policy: Restart, clock: Callable[[], float], *, used: int = 0, forgive_after: float = 60.0):
+        self.policy, self.clock, self.forgive_after = policy, clock, forgive_after
+        self.used = used
+        self.total = used
+        self._last: float | None = None
+        self._due: float | None = None
+
+    def failed(self) -> bool:
+        """Notes a failure; False when the policy allows no further attempt."""
+        now = self.clock()
+        if self._last is not None and now - self._last > self.forgive_after:
+            self.used = 0
+        self._last = now
+        if self.used >= self.policy.max:
+            return False
+        pause = min(self.policy.backoff * 1e-9 * 2**self.used, LONGEST_BACKOFF)
+        self.used += 1
+        self.total += 1
+        self._due = now + pause
+        return True
+
+    @property
+    def pending(self) -> bool:
+        """Whether an attempt is to be made, now or later."""
+        return self._due is not None
+
+    def due_in(self) -> float:
+        """Seconds until the attempt that is pending."""
+        assert self._due is not None
+        return max(0.0, self._due - self.clock())
+
+    def begun(self) -> None:
+        """The attempt is made."""
+        self._due = None

@@ -1,0 +1,61 @@
+"""Operator states as bytes: what `Operator.snapshot()` gives, in one form that equal states share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+import numpy as np
+
+_ARRAY = 1
+
+
+class StateError(ValueError):
+    """A state that holds something else than numbers, strings, bytes, None, arrays, lists and mappings."""
+
+
+def pack_state(state: Mapping[str, Any]) -> bytes:
+    """Raises `StateError` for values of other types, with the place in the state."""
+    packed: bytes = msgpack.packb(_plain(state, "state"), use_bin_type=True)
+    return packed
+
+
+def unpack_state(data: bytes) -> Any:
+    """Raises `StateError` for bytes that `pack_state` did not make."""
+    try:
+        return msgpack.unpackb(data, raw=False, ext_hook=_array, strict_map_key=True)
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        raise StateError(f"not an operator's state: {error}") from error
+
+
+def _plain(value: Any, place: str) -> Any:
+    match value:
+        case np.ndarray() if value.dtype != object:
+            header = msgpack.packb([value.dtype.str, list(value.shape)])
+            return msgpack.ExtType(_ARRAY, header + np.ascontiguousarray(value).tobytes())
+        case np.generic():
+            return _plain(np.asarray(value), place)
+        case Mapping():
+            for key in value:
+                if not isinstance(key, str):
+                    raise StateError(f"{place}: key {key!r} is no string")
+            return {key: _plain(value[key], f"{place}.{key}") for key in sorted(value)}
+        case list() | tuple():
+            return [_plain(item, f"{place}[{k}]") for k, item in enumerate(value)]
+        case None | bool() | int() | float() | str() | bytes():
+            return value
+        case _:
+            raise StateError(
+                f"{place} is a {type(value).__name__}; a state holds numbers, strings, bytes, None, numpy arrays, "
+                "lists and mappings"
+            )
+
+
+def _array(code: int, data: bytes) -> Any:
+    if code != _ARRAY:
+        raise StateError(f"a value of unknown kind {code}")
+    unpacker = msgpack.Unpacker(raw=False)
+    unpacker.feed(data)
+    dtype, shape = unpacker.unpack()
+    return np.frombuffer(data, np.dtype(dtype), offset=unpacker.tell()).reshape(shape).copy()

@@ -1,0 +1,203 @@
+"""`dataflow verify` as a regression gate, and `replay --complete`: files, tables, exit codes."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+NUDGED = '{use: "verified_operators:Nudged", inputs: {x: left/fast}}'
+ADDED = '{use: "verified_operators:Chatty", inputs: {x: left/fast}}'
+SMOOTH = '{use: "runtime_operators:Smooth", inputs: {x: left/fast}}'
+ORIGINAL = """\
+graph: gated
+namespace: test
+operators:
+  left: {use: "runtime_operators:Counter", params: {count: 12}}
+  one: SMOOTH
+  two: {use: "runtime_operators:Smooth", inputs: {x: one/mean}}
+"""
+
+
+def graph_of(folder: Path, name: str, one: str, two: str | None = None) -> Path:
+    text = ORIGINAL.replace("SMOOTH", one)
+    if two is not None:
+        text = text.replace('"runtime_operators:Smooth", inputs: {x: one/mean}', f'"{two}", inputs: {{x: one/mean}}')
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+@pytest.fixture(scope="module")
+def folder(dataflow, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two recordings and a broken file, one of the recordings deeper down."""
+    path = tmp_path_factory.mktemp("gate")
+    made = path / "recordings"
+    (made / "deep").mkdir(parents=True)
+    graph_of(path, "same.yaml", SMOOTH)
+    dataflow("run", path / "same.yaml", "--record", made / "first.mcap", "--one-host", "-q")
+    shutil.copy(made / "first.mcap", made / "deep" / "second.mcap")
+    return path
+
+
+def gate(dataflow, folder: Path, *words: object, code: int):
+    return dataflow("verify", folder / "recordings", "--one-host", "-q", *words, code=code)
+
+
+def test_a_folder_of_recordings_passes_with_a_row_each(dataflow, folder: Path) -> None:
+    told = gate(dataflow, folder, code=0).stdout
+
+    assert "2 of 2 recordings passed" in told
+    for name in ("first.mcap", "deep/second.mcap"):
+        assert any(line.split()[:2] == [name, "identical"] for line in told.splitlines())
+
+
+def test_a_broken_file_ends_with_2_and_the_others_are_verified_all_the_same(
+    dataflow, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(folder / "recordings", tmp_path / "recordings")
+    (tmp_path / "recordings" / "broken.mcap").write_bytes(b"\x89MCAP0\r\nnothing of the kind")
+
+    outcome = gate(dataflow, tmp_path, "--json", "--junit", tmp_path / "out" / "v.xml", code=2)
+
+    result = json.loads(outcome.stdout)
+    assert {r["recording"]: r["verdict"] for r in result["recordings"]} == {
+        "broken.mcap": "could not run",
+        "deep/second.mcap": "identical",
+        "first.mcap": "identical",
+    }
+    assert result["passed"] is False
+    root = ElementTree.parse(tmp_path / "out" / "v.xml").getroot()
+    assert [s.get("errors") for s in root] == ["1", "0", "0"]
+    error = root.find("testsuite[@name='broken.mcap']/testcase/error")
+    assert error is not None
+    assert "broken.mcap" in (error.get("message") or "")
+
+
+def test_a_change_is_named_with_its_field_in_the_table_the_json_and_the_junit_file(
+    dataflow, folder: Path, tmp_path: Path
+) -> None:
+    changed = graph_of(tmp_path, "changed.yaml", NUDGED)
+    junit = tmp_path / "v.xml"
+
+    told = gate(dataflow, folder, "--graph", changed, "--junit", junit, code=1).stdout
+
+    assert "0 of 2 recordings passed (2 different)" in told
+    assert "one: first difference in firing" in told
+    assert "mean.vectors[0, 2]: recorded" in told
+    assert "machine, libraries, threads and devices are as when it was recorded" in told
+    root = ElementTree.parse(junit).getroot()
+    assert root.tag == "testsuites"
+    for suite in root:
+        assert [child.tag for child in suite] == ["properties", "testcase", "testcase", "system-out", "system-err"]
+        needed = {"name", "package", "id", "timestamp", "hostname", "tests", "failures", "errors", "time"}
+        assert needed <= set(suite.keys())
+        cases = suite.findall("testcase")
+        assert int(suite.get("tests", "")) == len(cases)
+        assert int(suite.get("failures", "")) == len(suite.findall("testcase/failure"))
+        assert all({"name", "classname", "time"} <= set(case.keys()) for case in cases)
+        failure = suite.find("testcase[@name='one']/failure")
+        assert failure is not None
+        assert failure.get("type") == "culprit"
+        assert "mean.vectors[0, 2]" in (failure.text or "")
+    result = json.loads(gate(dataflow, folder, "--graph", changed, "--json", code=1).stdout)
+    [one, *_] = result["recordings"][0]["operators"]
+    [field] = one["comparison"]["first"][0]["fields"]
+    assert (field["field"], field["index"]) == ("vectors", [0, 2])
+
+
+def test_an_accepted_change_passes_until_something_else_changes(dataflow, folder: Path, tmp_path: Path) -> None:
+    baseline = tmp_path / "accepted.json"
+    changed = graph_of(tmp_path, "changed.yaml", NUDGED)
+    words = ["--graph", changed, "--baseline", baseline]
+
+    gate(dataflow, folder, *words, code=1)
+    assert not baseline.exists()
+    told = gate(dataflow, folder, *words, "--accept", code=0)
+    assert "first.mcap: one" in told.stderr
+    assert "2 accepted" in gate(dataflow, folder, *words, code=0).stdout
+    further = graph_of(tmp_path, "further.yaml", NUDGED, two="verified_operators:Nudged")
+    told = gate(dataflow, folder, "--graph", further, "--baseline", baseline, code=1)
+    rows = [line.split() for line in told.stdout.splitlines() if line.strip().startswith("first.mcap  ")]
+    assert rows[0][1:2] + rows[0][-1:] == ["different", "two"]
+    assert (
+        "as recorded, but the baseline accepts another" in gate(dataflow, folder, "--baseline", baseline, code=1).stdout
+    )
+    assert "first.mcap: one" in gate(dataflow, folder, "--baseline", baseline, "--accept", code=0).stderr
+    assert json.loads(baseline.read_text())["accepted"] == {}
+
+
+def test_a_tolerance_passes_with_its_own_word_and_not_as_identical(dataflow, folder: Path, tmp_path: Path) -> None:
+    changed = graph_of(tmp_path, "changed.yaml", NUDGED)
+    one = folder / "recordings" / "first.mcap"
+
+    told = dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-host", "-q")
+
+    assert "within tolerance of 1e-05, not identical" in told.stdout
+    assert "identical:" not in told.stdout
+    value = json.loads(
+        dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-host", "-q", "--json").stdout
+    )
+    assert (value["identical"], value["within_tolerance"], value["verdict"]) == (False, True, "within tolerance")
+    dataflow("verify", one, "--graph", changed, "--tolerance", "1e-9", "--one-host", "-q", code=1)
+
+
+def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder: Path, tmp_path: Path) -> None:
+    broken = graph_of(tmp_path, "broken.yaml", '{use: "verified_operators:Unable", inputs: {x: left/fast}}')
+
+    told = dataflow("verify", folder / "recordings" / "first.mcap", "--graph", broken, "--one-host", "-q", code=2)
+
+    assert "no weights" in told.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--accept"], "name the file with --baseline"),
+        (["--accept", "--baseline", "b.json", "--only", "one"], "leave --from and --only out"),
+        (["--baseline", "b.yaml"], "ends in .json"),
+        (["--junit", "v.txt"], "ends in .xml"),
+        (["--tolerance", "-1"], "0 or more"),
+        (["absent.mcap"], "absent.mcap"),
+    ],
+)
+def test_wrong_options_of_the_gate_are_refused(dataflow, folder: Path, words: list[str], message: str) -> None:
+    assert message in gate(dataflow, folder, *words, code=2).stderr
+
+
+def test_a_thin_recording_is_completed_and_is_then_verified(dataflow, folder: Path, tmp_path: Path) -> None:
+    same = folder / "same.yaml"
+    thin_graph = tmp_path / "thin.yaml"
+    thin_graph.write_text(same.read_text() + 'record: {topics: ["left/**"]}\n')
+    thin, full = tmp_path / "thin.mcap", tmp_path / "full.mcap"
+    dataflow("run", thin_graph, "--record", thin, "--one-host", "-q")
+
+    told = dataflow("replay", thin, "--complete", full, "-q").stdout
+
+    assert "computed again: test/one/mean, test/two/mean" in told
+    assert "identical" in dataflow("verify", full, "--one-host", "-q").stdout
+    assert "the same" in dataflow("diff", folder / "recordings" / "first.mcap", full).stdout
+    assert "replace it with --overwrite" in dataflow("replay", thin, "--complete", full, code=2).stderr
+    assert json.loads(dataflow("replay", thin, "--complete", full, "--overwrite", "--json", "-q").stdout)["whole"]
+    assert "is the recording" in dataflow("replay", thin, "--complete", thin, "--overwrite", code=2).stderr
+    assert (
+        "--complete repeats a run as it was" in dataflow("replay", thin, "--complete", full, "--rate", 1, code=2).stderr
+    )
+
+
+def test_a_completion_that_comes_out_otherwise_writes_nothing_and_says_where(
+    dataflow, folder: Path, tmp_path: Path
+) -> None:
+    changed = graph_of(tmp_path, "changed.yaml", NUDGED)
+    out = tmp_path / "out.mcap"
+
+    told = dataflow(
+        "replay", folder / "recordings" / "first.mcap", "--graph", changed, "--complete", out, "-q", code=1
+    ).stdout
+
+    assert "nothing written; look at one" in told
+    assert "one: first difference in firing" in told
+    assert not out.exists()

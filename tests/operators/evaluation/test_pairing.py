@@ -1,0 +1,47 @@
+"""Pairing while messages come gives what pairing of the whole lists gives, and keeps little."""
+
+from __future__ import annotations
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from operators.association import mutually_nearest
+from operators.evaluation.pairing import Pairing
+
+stamps = st.lists(st.integers(0, 300), max_size=30, unique=True).map(sorted)
+
+
+@settings(max_examples=150, deadline=None)
+@given(stamps, stamps, st.integers(0, 20), st.integers(1, 60))
+def test_pairs_are_those_of_the_whole_lists(found: list[int], truth: list[int], tolerance: int, step: int) -> None:
+    pairing: Pairing[int, int] = Pairing(tolerance)
+    pairs: list[tuple[int, int]] = []
+    for now in range(0, 301, step):
+        for stamp in found:
+            if now - step < stamp <= now:
+                pairing.add_found(stamp, stamp)
+        for stamp in truth:
+            if now - step < stamp <= now:
+                pairing.add_truth(stamp, stamp)
+        pairs += pairing.settle(now)
+    for stamp in found:
+        if stamp > 300 - 300 % step:
+            pairing.add_found(stamp, stamp)
+    for stamp in truth:
+        if stamp > 300 - 300 % step:
+            pairing.add_truth(stamp, stamp)
+    pairs += pairing.finish()
+    expected = [(found[i], truth[j]) for i, j in mutually_nearest(found, truth, tolerance)]
+    assert sorted(pairs) == expected
+    assert pairing.pairs == len(expected)
+    assert pairing.unmatched_found == len(found) - len(expected)
+    assert pairing.unmatched_truths == len(truth) - len(expected)
+
+
+def test_what_is_decided_is_not_kept() -> None:
+    pairing: Pairing[int, int] = Pairing(1)
+    for stamp in range(0, 10_000, 10):
+        pairing.add_found(stamp, stamp)
+        pairing.add_truth(stamp, stamp)
+        pairing.settle(stamp)
+        assert len(pairing._found) + len(pairing._truth) <= 4

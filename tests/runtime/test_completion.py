@@ -1,0 +1,114 @@
+"""A thin recording of a live run is completed to what a full recording of that run holds, or refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph import Graph, load_graph
+from dataflow.recording import Recording, RecordingWriter, diff
+from dataflow.recording.layout import RESERVED_METADATA
+from dataflow.runtime.completion import complete
+from dataflow.runtime.execute import replay as replay_recording
+from dataflow.runtime.execute import run
+from dataflow.runtime.firings import decode_batch
+from dataflow.runtime.replay import ReplayError
+from dataflow.runtime.verify import verify
+
+HERE = Path(__file__).resolve().parent
+SENSORS = tuple(f"test/{source}/{port}" for source in ("left", "right") for port in ("fast", "slow", "constant"))
+
+
+def thin(full: Path, out: Path, *, streams: tuple[str, ...] = SENSORS, keep: float = 1.0) -> Path:
+    """Only those streams of a recording, its firing records and metadata. `keep`: how much of each stream."""
+    with Recording(full) as recording:
+        metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in RESERVED_METADATA}
+        with RecordingWriter(out, metadata=metadata, namespace="test") as writer:
+            for stream in streams:
+                info = recording.streams[stream]
+                assert info.message_type is not None
+                extra = {"operator": info.metadata["operator"], "port": info.metadata["port"]}
+                writer.add_stream(stream, info.message_type, static=info.static, extra=extra)
+                for m in list(recording.messages([stream]))[: round(keep * info.count)]:
+                    writer.write(stream, m.message, seq=m.seq, incarnation=m.incarnation)
+            for operator, payload in recording.firings():
+                writer.write_firings(operator, decode_batch(payload).records[-1].stamp, payload)
+    return out
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A full recording of a live run with drops and timeouts."""
+    path = tmp_path_factory.mktemp("live") / "full.mcap"
+    report = run(load_graph(HERE / "live.yaml", live=True), live=True, placement="one_host", record=path)
+    assert report.drops
+    return path
+
+
+def test_the_completed_recording_of_a_live_run_is_equal_to_the_full_one_and_verified(
+    live: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.mcap"
+
+    made = complete(thin(live, tmp_path / "thin.mcap"), out)
+
+    assert made.whole
+    assert set(made.added) == {"test/mix/mixed", "test/slow/mean", "test/smooth/mean", "test/merge/seen"}
+    with Recording(live) as a, Recording(out) as b:
+        assert diff(a, b).same
+        assert list(a.firings()) == list(b.firings())
+        assert a.metadata["dataflow:graph"] == b.metadata["dataflow:graph"]
+        assert a.metadata["dataflow:outcome"] == b.metadata["dataflow:outcome"]
+        assert b.metadata["dataflow:completed"]["from"] == "thin.mcap"
+    verified = verify(out, placement="one_host")
+    assert verified.identical
+    assert verify(out, only="smooth", placement="one_host").identical  # its input stands in from the new file
+    assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".part")] == []
+
+
+def test_a_graph_that_records_its_sensors_only_gives_a_thin_recording_that_can_be_completed(tmp_path: Path) -> None:
+    graph = _recording_sensors_only(load_graph(HERE / "mixed.yaml", settings=["count=40"]))
+    path, out = tmp_path / "thin.mcap", tmp_path / "out.mcap"
+    full = run(graph, placement="one_host", record=path)
+    with Recording(path) as recording:
+        assert set(recording.streams) == set(SENSORS)
+
+    assert complete(path, out).whole
+
+    with Recording(out) as recording:
+        assert recording.digests() == full.digests()
+    assert replay_recording(out, placement="one_host").digests() == full.digests()
+
+
+def _recording_sensors_only(graph: Graph) -> Graph:
+    return replace(graph, record=replace(graph.record, streams=SENSORS))
+
+
+def test_code_that_changed_since_completes_nothing_and_says_where(live: Path, tmp_path: Path) -> None:
+    graph = load_graph(HERE / "live.yaml", live=True)
+    smooth = graph.nodes["smooth"]
+    changed = replace(graph, nodes={**graph.nodes, "smooth": replace(smooth, use="runtime_operators:SmoothChanged")})
+    out = tmp_path / "out.mcap"
+
+    made = complete(thin(live, tmp_path / "thin.mcap"), out, graph=changed)
+
+    assert not made.stored
+    [culprit] = [v for v in made.operators if v.verdict == "culprit"]
+    assert culprit.operator == "smooth"
+    assert culprit.first is not None
+    assert culprit.first.port == "mean"
+    assert list(tmp_path.iterdir()) == [tmp_path / "thin.mcap"]
+
+
+def test_what_is_not_to_be_had_is_not_made_up(live: Path, tmp_path: Path) -> None:
+    short = thin(live, tmp_path / "short.mcap", keep=0.5)
+
+    made = complete(short, tmp_path / "out.mcap")
+
+    assert made.stored
+    assert not made.whole
+    assert {v.verdict for v in made.operators} == {"unverifiable"}
+    with pytest.raises(ReplayError, match="no stream of 'right' is in the recording"):
+        complete(thin(live, tmp_path / "left.mcap", streams=SENSORS[:3]), tmp_path / "other.mcap")

@@ -1,0 +1,201 @@
+"""The gate lets pass what is as recorded or as accepted, and names what is new and whose fault it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from dataflow.runtime.gate import (
+    Baseline,
+    BaselineError,
+    Checked,
+    Judged,
+    check,
+    judge,
+    recordings_in,
+)
+from dataflow.runtime.outputs import OutputComparison
+from dataflow.runtime.reexecute import Difference, Verification
+from dataflow.runtime.replay import ReplayError
+from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.verify import VerifyReport
+
+Outcomes = dict[str, str | None]
+"""Operator → what came out otherwise (any word), None for nothing."""
+
+
+def report(outcomes: Outcomes, producers: Mapping[str, set[str]], *, culprits: set[str] | None = None) -> VerifyReport:
+    """What verification gives for operators that each have one stream `<operator>/out`."""
+    made = []
+    for name, got in outcomes.items():
+        v = Verification(name, firings=9, verified=9, outputs=9)
+        if got is not None:
+            v.differing = 3
+            v.first = Difference(4, "fire", 400, "out", "recorded", got)
+            fault = culprits is None or name in culprits
+            v.tainted = None if fault else 1
+            if hasattr(v, "own_fault"):
+                v.own_fault = fault
+        made.append(v)
+    return VerifyReport(
+        operators=tuple(made),
+        stood_in=(),
+        facts=(),
+        messages=9,
+        streams=1,
+        wall=1.0,
+        span=2.0,
+        digests={f"{name}/out": (9, got or "recorded") for name, got in outcomes.items()},
+        outputs={name: (f"{name}/out",) for name in outcomes},
+        producers={name: frozenset(producers.get(name, ())) for name in outcomes},
+    )
+
+
+CHAIN = {"b": {"a"}, "c": {"b"}}
+
+
+def accepted(outcomes: Outcomes, producers: Mapping[str, set[str]] = CHAIN) -> dict[str, object]:
+    return {j.operator: j.outcome for j in judge(report(outcomes, producers), {}) if j.outcome is not None}
+
+
+def verdicts(judged: tuple[Judged, ...]) -> dict[str, str]:
+    return {j.operator: j.verdict for j in judged}
+
+
+def test_without_a_baseline_the_verdicts_are_those_of_verification() -> None:
+    found = judge(report({"a": None, "b": "x", "c": "y"}, CHAIN, culprits={"b"}), {})
+
+    assert verdicts(found) == {"a": "identical", "b": "culprit", "c": "downstream"}
+
+
+def test_what_was_accepted_passes_and_only_that() -> None:
+    known = accepted({"a": None, "b": "x", "c": "y"})
+    same = report({"a": None, "b": "x", "c": "y"}, CHAIN, culprits={"b"})
+
+    assert verdicts(judge(same, known)) == {"a": "identical", "b": "accepted", "c": "accepted"}  # type: ignore[arg-type]
+    other = report({"a": None, "b": "z", "c": "y"}, CHAIN, culprits={"b"})
+    assert verdicts(judge(other, known))["b"] == "culprit"  # type: ignore[arg-type]
+
+
+def test_a_new_change_behind_an_accepted_one_is_a_culprit_although_its_inputs_differ_from_the_recording() -> None:
+    known = accepted({"a": None, "b": "x", "c": "y"})
+
+    found = judge(report({"a": None, "b": "x", "c": "new"}, CHAIN, culprits={"b"}), known)  # type: ignore[arg-type]
+
+    assert verdicts(found) == {"a": "identical", "b": "accepted", "c": "culprit"}
+
+
+def test_what_follows_from_a_new_change_is_downstream_of_it() -> None:
+    known = accepted({"a": "x", "b": "x", "c": "x"})
+
+    found = judge(report({"a": "x", "b": "new", "c": "new"}, CHAIN, culprits={"a"}), known)  # type: ignore[arg-type]
+
+    assert verdicts(found) == {"a": "accepted", "b": "culprit", "c": "downstream"}
+
+
+def test_operators_that_feed_each_other_are_both_named_rather_than_neither() -> None:
+    circle = {"a": {"b"}, "b": {"a"}, "c": {"b"}}
+    known = accepted({"a": "x", "b": "x", "c": "x"}, circle)
+
+    found = judge(report({"a": "n", "b": "n", "c": "n"}, circle, culprits=set()), known)  # type: ignore[arg-type]
+
+    assert verdicts(found) == {"a": "culprit", "b": "culprit", "c": "downstream"}
+
+
+def test_an_accepted_change_that_is_gone_does_not_pass_unseen() -> None:
+    found = judge(report({"a": None, "b": None, "c": None}, CHAIN), accepted({"a": None, "b": "x", "c": None}))  # type: ignore[arg-type]
+
+    assert verdicts(found)["b"] == "not as accepted"
+    assert not Checked(Path("x"), "x", report({}, {}), found).passed
+
+
+def test_what_could_not_be_repeated_never_passes_and_is_never_accepted(tmp_path: Path) -> None:
+    made = report({"a": None}, {})
+    made.operators[0].unverifiable = 2
+    one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
+    baseline = Baseline(tmp_path / "b.json")
+
+    assert one.verdict == "not wholly verified"
+    assert baseline.accept(one) == ([], ["a"])
+    assert baseline.of(one.path) == {}
+
+
+def test_what_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
+    made = report({"a": "x"}, {})
+    made = VerifyReport(
+        **{name: getattr(made, name) for name in made.__dataclass_fields__ if name != "comparisons"},
+        comparisons={"a": OutputComparison("a", index=4, got="y")},
+    )
+    one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
+
+    assert Baseline(tmp_path / "b.json").accept(one) == ([], ["a"])
+
+
+def test_a_baseline_survives_its_file_and_goes_by_places_beside_it(tmp_path: Path) -> None:
+    made = report({"a": "x", "b": None}, {})
+    one = Checked(tmp_path / "day" / "r.mcap", "r", made, judge(made, {}))
+    baseline = Baseline(tmp_path / "accepted.json")
+    assert baseline.accept(one) == (["a"], [])
+    baseline.save()
+
+    again = Baseline.load(tmp_path / "accepted.json")
+
+    assert set(again.accepted) == {"day/r.mcap"}
+    assert verdicts(judge(made, again.of(one.path))) == {"a": "accepted", "b": "identical"}
+    assert again.accept(one) == ([], [])
+    assert again.unused([]) == ["day/r.mcap"]
+    back = report({"a": None, "b": None}, {})
+    assert again.accept(Checked(one.path, "r", back, judge(back, again.of(one.path)))) == (["a"], [])
+    assert again.accepted == {}
+    assert Baseline.load(tmp_path / "absent.json").accepted == {}
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 7, "accepted": {}}', '{"format": 1, "accepted": [1]}'])
+def test_a_file_that_is_no_baseline_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "b.json").write_text(text)
+
+    with pytest.raises(BaselineError, match="baseline"):
+        Baseline.load(tmp_path / "b.json")
+
+
+def test_a_folder_stands_for_all_its_recordings_each_once(tmp_path: Path) -> None:
+    for name in ("b.mcap", "a.mcap", "sub/a.mcap", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+
+    found = recordings_in([tmp_path, tmp_path / "a.mcap"])
+
+    assert [name for _, name in found] == ["a.mcap", "b.mcap", "sub/a.mcap"]
+    assert [name for _, name in recordings_in([tmp_path / "a.mcap", tmp_path / "sub" / "a.mcap"])] == [
+        str(tmp_path / "a.mcap"),
+        str(tmp_path / "sub" / "a.mcap"),
+    ]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ReplayError, match="holds no recording"):
+        recordings_in([tmp_path / "empty"])
+    with pytest.raises(ReplayError, match="no file or folder"):
+        recordings_in([tmp_path / "absent"])
+
+
+@pytest.mark.parametrize(
+    "error", [ReplayError("no sensors"), RunFailed("host died", "its last words"), KeyError("a fault of ours")]
+)
+def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Exception) -> None:
+    def broken(path: Path) -> VerifyReport:
+        raise error
+
+    one = check(Path("x.mcap"), "x", broken)
+
+    assert one.verdict == "could not run"
+    assert str(error.args[0]) in one.error
+    assert not one.passed
+
+
+def test_an_interruption_ends_the_gate() -> None:
+    def interrupted(path: Path) -> VerifyReport:
+        raise RunFailed("stopped", interrupted=True)
+
+    with pytest.raises(RunFailed, match="stopped"):
+        check(Path("x.mcap"), "x", interrupted)

@@ -1,0 +1,59 @@
+"""Operators that stand in for a `Smooth` that somebody changed, each in another way."""
+
+from __future__ import annotations
+
+import os
+
+from runtime_operators import Smooth
+
+from dataflow.messages import FeatureVector
+
+
+class Nudged(Smooth):
+    """Adds a tiny number to one element, from the fifth call on: what another machine's rounding might do."""
+
+    NUDGE = 1e-6
+
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+        made = super().process(x, context)
+        if made is None or self.calls < 5:
+            return made
+        vectors = made.vectors.copy()
+        vectors[0, 2] += self.NUDGE
+        return made.replace(vectors=vectors)
+
+
+class Chatty(Nudged):
+    """Nudged, and emits where it had been silent."""
+
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+        made = super().process(x, context)
+        if made is None:
+            made = FeatureVector(stamp=context.stamp, vectors=[[0.0]], model="test")
+        return made
+
+
+class Moody(Smooth):
+    """Other numbers every time: bytes of the system's generator, which nobody seeds."""
+
+    def process(self, x: FeatureVector | None, context) -> FeatureVector | None:  # type: ignore[no-untyped-def]
+        made = super().process(x, context)
+        if made is None or self.calls < 5:
+            return made
+        return made.replace(vectors=made.vectors + int.from_bytes(os.urandom(2)))
+
+
+class Dying(Smooth):
+    """Takes its process with it when it is run again alone, and only then."""
+
+    def setup(self) -> None:
+        super().setup()
+        if "DATAFLOW_TEST_DIE" in os.environ:
+            os._exit(7)
+
+
+class Unable(Smooth):
+    """Cannot be set up."""
+
+    def setup(self) -> None:
+        raise FileNotFoundError("no weights for it")
