@@ -208,8 +208,8 @@ def replay(
     Exit codes:
 
       0    it ran to its end
-      1    an operator failed; or --complete: not as recorded, or not wholly
-      2    could not run: a wrong option, a recording that lacks what is needed
+      1    an operator failed; with --complete: not as recorded, or in part
+      2    could not run: a wrong option, a recording that lacks something
       130  interrupted with Ctrl-C
 
     Examples:

@@ -199,7 +199,7 @@ def _tolerated(compared: OutputComparison, tolerance: float | None) -> str:
     if not compared.within:
         return f"{compared.operator}: differs with its inputs; given the recorded ones it is identical"
     return (
-        f"{compared.operator}: not identical: given the recorded inputs, {plural(compared.within, 'message')} "
+        f"{compared.operator}: given the recorded inputs, {plural(compared.within, 'message')} "
         f"differ from the recorded ones by at most {compared.max_difference:.3g}, within {tolerance:g}; "
         f"{count(compared.equal)} identical"
     )

@@ -22,7 +22,7 @@ _GATE = "Regression gate"
 
 def verify(
     recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING...", help="Recordings (.mcap), or folders of them.")
+        list[Path], typer.Argument(metavar="RECORDING", help="Recordings (.mcap), or folders of them.")
     ],
     graph: Annotated[
         Path | None,
@@ -77,9 +77,9 @@ def verify(
 
     Exit codes:
 
-      0    identical; or all differences lie within --tolerance, or are those that --baseline accepts
+      0    identical, or within --tolerance, or as --baseline accepts
       1    different, or not wholly verifiable
-      2    could not run: no recording, a faulty one (even if others passed), an operator that fails to start
+      2    could not run (of several recordings: at least one)
       130  interrupted with Ctrl-C
 
     Examples:
@@ -88,8 +88,8 @@ def verify(
       dataflow verify run.mcap --only odometry --json
       dataflow verify run.mcap --from odometry --graph changed.yaml
       dataflow verify run.mcap --tolerance 1e-5
-      dataflow verify recordings --junit verify.xml
-      dataflow verify recordings --baseline recordings/accepted.json --accept
+      dataflow verify runs/ --junit verify.xml
+      dataflow verify runs/ --baseline runs/accepted.json --accept
     """
     from dataflow.graph import load_graph
     from dataflow.runtime.gate import Baseline, BaselineError, recordings_in

@@ -295,7 +295,7 @@ class LiveRunner(OperatorRunner):
         try:
             if pause and self._clock() < until:
                 time.sleep(pause)
-            if self._injected is not None:
+            if self._injected is not None and firing.kind != "finish":
                 self._fail_injected(firing)
             super()._fire(firing)
         except OperatorFailure as failure:

@@ -24,7 +24,7 @@ from dataflow.runtime.firings import decode_batch
 from dataflow.runtime.recompute import Feeding, Recomputation
 from dataflow.runtime.recorder import ENDS, OUTCOME, RecorderSink
 from dataflow.runtime.reexecute import Verification
-from dataflow.runtime.replay import plan_replay, recorded_graph
+from dataflow.runtime.replay import ReplayError, plan_replay, recorded_graph
 from dataflow.runtime.supervisor import OperatorCounts, Status
 from dataflow.runtime.verify import require_records
 from dataflow.sync import Entry
@@ -172,10 +172,24 @@ class _Store:
             self.sink.writer.write_event(event.name, event.stamp, event.data)
         for operator, payload in recording.firings():
             self.sink.firings(operator, decode_batch(payload).records[-1].stamp, payload)
+        self._copied = 0
+        for stream in sorted(recording.streams.keys() - graph.streams.keys()):
+            self._copy(recording, stream)
+
+    def _copy(self, recording: Recording, stream: str) -> None:
+        """A stream that no operator makes: the runtime's own, such as its diagnostics."""
+        info = recording.streams[stream]
+        if info.message_type is None:
+            raise ReplayError(f"{recording.path}: stream {stream!r} holds {info.schema}, which is not known here")
+        extra = {name: info.metadata[name] for name in ("operator", "port") if name in info.metadata}
+        self.sink.writer.add_stream(stream, info.message_type, static=info.static, extra=extra)
+        for found in recording.messages([stream]):
+            self.sink.writer.write(stream, found.message, seq=found.seq, incarnation=found.incarnation)
+            self._copied += 1
 
     def take(self, stream: str, entry: Entry) -> None:
         self.sink.message(stream, entry.value, entry.seq, entry.incarnation)
 
     def close(self) -> int:
         self.sink.close(self._outcome)
-        return self.sink.messages
+        return self.sink.messages + self._copied

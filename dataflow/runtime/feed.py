@@ -86,6 +86,8 @@ class LogFeed:
 
     `streams` maps each stream to the node that made it. `finals` holds the stamps that streams ended with in the
     recorded run, where known. `start` and `end` (ns, inclusive) cut the recording; static streams are always given.
+    Without `promises` nothing is said of stamps to come, so that they may go back, as after a jump of a clock: enough
+    for operators that are driven by their records.
     """
 
     def __init__(
@@ -98,8 +100,9 @@ class LogFeed:
         finals: Mapping[str, int],
         start: int | None = None,
         end: int | None = None,
+        promises: bool = True,
     ) -> None:
-        self.recording, self.emitter = recording, emitter
+        self.recording, self.emitter, self._promises = recording, emitter, promises
         self._ports = ports
         self._records = {node: Recorder(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
@@ -182,6 +185,8 @@ class LogFeed:
 
     def promise(self) -> None:
         """Every stream of a log is known up to the last stamp that was read, so sparse streams hold nobody up."""
+        if not self._promises:
+            return
         self._end_before(self.last)
         for state in self._streams.values():
             if not state.ended and state.promised < self.last:
@@ -189,6 +194,8 @@ class LogFeed:
                 self.emitter.frontier(state.name, self.last)
 
     def _end_before(self, stamp: int) -> None:
+        if not self._promises:
+            return
         for state in self._streams.values():
             if not state.ended and state.final < stamp:
                 self._end(state, state.final, "end of stream")

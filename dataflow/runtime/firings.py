@@ -154,11 +154,12 @@ def decode_batch(data: bytes) -> Batch:
             _record(operator, incarnation, first + offset, row, names, streams)
             for offset, row in enumerate(batch["rows"])
         )
+        last = bool(batch["last"])
     except FiringRecordError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, msgpack.UnpackException) as error:
         raise FiringRecordError(f"not a batch of firing records: {type(error).__name__}: {error}") from error
-    return Batch(operator, incarnation, bool(batch["last"]), records)
+    return Batch(operator, incarnation, last, records)
 
 
 def _record(

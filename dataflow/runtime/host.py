@@ -341,6 +341,7 @@ class Host:
                 finals=replay["finals"],
                 start=replay["start"],
                 end=replay["end"],
+                promises=self.config.verify is None,
             )
         )
 

@@ -6,14 +6,17 @@ from collections.abc import Callable
 
 from dataflow.graph.model import Restart
 
+MOST_DOUBLINGS = 4
 LONGEST_BACKOFF = 30.0
-"""Seconds; the time before an attempt doubles up to here."""
+"""Seconds. The time before an attempt doubles with each, so many times and up to here."""
 
 
 class Restarts:
     """Counts attempts. A failure after `forgive_after` seconds without one begins the count again."""
 
-    def __init__(self, policy: Restart, clock: Callable[[], float], *, used: int = 0, forgive_after: float = 60.0):
+    def __init__(
+        self, policy: Restart, clock: Callable[[], float], *, used: int = 0, forgive_after: float = 60.0
+    ) -> None:
         self.policy, self.clock, self.forgive_after = policy, clock, forgive_after
         self.used = used
         self.total = used
@@ -28,7 +31,7 @@ class Restarts:
         self._last = now
         if self.used >= self.policy.max:
             return False
-        pause = min(self.policy.backoff * 1e-9 * 2**self.used, LONGEST_BACKOFF)
+        pause = min(self.policy.backoff * 1e-9 * 2 ** min(self.used, MOST_DOUBLINGS), LONGEST_BACKOFF)
         self.used += 1
         self.total += 1
         self._due = now + pause

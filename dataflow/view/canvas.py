@@ -71,7 +71,7 @@ class Canvas:
         if not len(values):
             return
         if self.scene.changed(self.entity, where, tuple(names)):
-            paint = colors.AXES if len(names) == 3 else colors.of_identities(list(range(len(names))))
+            paint = colors.AXES if len(names) == 3 else colors.of_classes(names)
             self.log(where, rr.SeriesLines(names=list(names), colors=paint), static=True)
         self.log(where, rr.Scalars(np.asarray(values, np.float64)))
 

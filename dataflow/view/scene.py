@@ -26,6 +26,9 @@ FRAMES = "/frames"
 VIEWER_LOG = "/viewer/log"
 """Entity of what the viewer itself has to say."""
 
+_ONE_SIDED = 0.5
+"""Length of the mean direction of points that lie more to one side of their sensor than all round it."""
+
 ASSUMPTION_GRACE = 1_000_000_000
 """Event time (ns) for which a frame may stay unplaced before the viewer says so."""
 
@@ -84,6 +87,7 @@ class SceneState:
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
     _noted: set[tuple[str, str]] = field(default_factory=set)
     _ranges: list[float] = field(default_factory=list)
+    _around: list[Vector] = field(default_factory=list)
     _posed: dict[str, None] = field(default_factory=dict)
     _waiting: dict[str, int] = field(default_factory=dict)
 
@@ -186,11 +190,27 @@ class SceneState:
         if d.size and len(self._ranges) < 256:
             self._ranges.append(float(np.median(d)))
 
-    def outlook(self) -> Outlook:
-        """Where to look from: behind and above the cameras, or else the robot, so that what they see is in view.
+    def saw_points(self, frame: str, points: npt.ArrayLike) -> None:
+        """Points (N, 3) of a cloud in its sensor's frame: how far things are and, of a scan all round, where the place is.
 
-        Up is +z (REP 103), unless the root is itself like an optical frame (y down), as in data sets whose world is
-        their first camera.
+        Call it when the frame is known to the tree.
+        """
+        p = np.asarray(points, np.float64).reshape(-1, 3)
+        distances = np.linalg.norm(p, axis=1)
+        self.saw_range(distances)
+        p, distances = p[distances > 0], distances[distances > 0]
+        if len(p) < 16 or len(self._around) >= 16:
+            return
+        T = self.tree.pose(frame)
+        if T is not None and np.linalg.norm((p / distances[:, None]).mean(axis=0)) < _ONE_SIDED:
+            self._around.append(p @ T[:3, :3].T + T[:3, 3])
+
+    def outlook(self) -> Outlook:
+        """Where to look from, so that what is seen is in view.
+
+        From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
+        place is in view, since the robot will drive about in it. Up is +z (REP 103), unless the root is itself like an
+        optical frame (y down), as in data sets whose world is their first camera.
         """
         up = np.array([0.0, 0.0, 1.0])
         cameras = [T for frame in self.optical if (T := self.tree.pose(frame)) is not None]
@@ -209,6 +229,11 @@ class SceneState:
         level /= np.linalg.norm(level)
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
+        if self._around:
+            lower, upper = np.percentile(np.concatenate(self._around), [3, 97], axis=0)
+            middle = (lower + upper) / 2
+            size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
+            return Outlook(up, middle - level * (0.95 * size) + up * (1.05 * size) + side * (0.4 * size), middle)
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
 

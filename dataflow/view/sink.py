@@ -28,7 +28,7 @@ from dataflow.view.blueprint import blueprint_of
 from dataflow.view.canvas import visualize
 from dataflow.view.layout import layout
 from dataflow.view.process import LOOPBACK, ViewerError
-from dataflow.view.scene import SCENE, VIEWER_LOG, SceneState, ViewOptions, entity_of
+from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, SceneState, ViewOptions, entity_of
 
 SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
@@ -146,7 +146,9 @@ class ViewerSink:
         self._counts: Counter[str] = Counter()
         self._reported: set[tuple[str, str]] = set()
         self._started_at: int | None = None
-        self._settled = False
+        self._graph: Graph | None = None
+        self._outlook: Outlook | None = None
+        self._seen: set[str] = set()
 
     def open(
         self, streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()
@@ -158,6 +160,7 @@ class ViewerSink:
         """
         if self._recording is not None:
             raise ViewerError("this sink is open already")
+        self._graph = graph
         self._scene = SceneState(layout(streams, graph, static), self._options)
         name = graph.name if graph is not None else self._application
         recording = rr.RecordingStream(name, recording_id=uuid.uuid4())
@@ -304,25 +307,34 @@ class ViewerSink:
             self._counts["drawn"] += 1
         else:
             self._counts["failed"] += 1
+        new = stream not in self._seen
+        self._seen.add(stream)
+        if new and self._outlook is not None:
+            self._guarded("", lambda: self._lay_out(recording))
         if static:
             return
         if self._started_at is None:
             self._started_at = message.stamp
-        if not self._settled and message.stamp - self._started_at >= SETTLE:
+        if self._outlook is None and message.stamp - self._started_at >= SETTLE:
             self._guarded("", lambda: self._settle(recording))
         for doubt in self._scene.doubts(message.stamp):
             recording.log(VIEWER_LOG, rr.TextLog(doubt, level="WARN"))
 
     def _settle(self, recording: rr.RecordingStream) -> None:
         """Decides, once, which way is up and where to look from."""
-        if self._settled:
+        if self._outlook is not None:
             return
-        self._settled = True
-        outlook = self._scene.outlook()
-        if outlook.up[1] < 0:
+        self._outlook = self._scene.outlook()
+        if self._outlook.up[1] < 0:
             recording.log(SCENE, rr.ViewCoordinates.RDF, static=True)
+        self._lay_out(recording)
+
+    def _lay_out(self, recording: rr.RecordingStream) -> None:
+        """Views for the streams that have had a message: a sensor that is off leaves no empty view."""
+        full = self._scene.layout
+        shown = layout({name: type_ for name, type_ in full.streams.items() if name in self._seen}, self._graph)
         following = not isinstance(self.target, Save)
-        recording.send_blueprint(blueprint_of(self._scene.layout, outlook=outlook, following=following))
+        recording.send_blueprint(blueprint_of(shown, outlook=self._outlook, following=following))
 
     def _guarded(self, stream: str, action: Callable[[], object]) -> bool:
         """Runs an action whose failure must not end the viewer; returns whether it worked."""

@@ -62,14 +62,21 @@ class SegmentationNetwork(nn.Module):
 
 
 class DeployedSegmenter(nn.Module):
-    """Images (1, 3, H, W) → class (1, H, W) int32 and its probability (1, H, W): what the network file computes."""
+    """Images (1, 3, H, W) → class (1, H, W) int32 and its probability (1, H, W): what the network file computes.
+
+    The scores are enlarged before a class is chosen, for smooth borders; the probability, which needs more arithmetic,
+    is enlarged after.
+    """
 
     def __init__(self, network: nn.Module, size: Sequence[int]) -> None:
         super().__init__()
         self.network, self.size = network, tuple(size)
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
-        scores = functional.interpolate(self.network(images), size=self.size, mode="bilinear", align_corners=False)
-        best, label = scores.max(dim=1)
-        confidence = 1 / (scores - best[:, None]).exp().sum(dim=1)
-        return label.to(torch.int32), confidence
+        scores = self.network(images)
+        best = 1 / (scores - scores.amax(dim=1, keepdim=True)).exp().sum(dim=1, keepdim=True)
+        label = self._enlarged(scores).argmax(dim=1)
+        return label.to(torch.int32), self._enlarged(best)[:, 0]
+
+    def _enlarged(self, maps: Tensor) -> Tensor:
+        return functional.interpolate(maps, size=self.size, mode="bilinear", align_corners=False)

@@ -34,6 +34,17 @@ class Variation:
     noise: float = 8.0
     blur: float = 0.15
 
+    def times(self, strength: float) -> Variation:
+        """Weaker or stronger changes, mirror images as often; 1 leaves all as it is."""
+        return Variation(
+            self.flip,
+            self.scale**strength,
+            self.shift * strength,
+            self.color * strength,
+            self.noise * strength,
+            self.blur * strength,
+        )
+
 
 NONE = Variation(flip=0, scale=1, shift=0, color=0, noise=0, blur=0)
 

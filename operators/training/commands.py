@@ -6,7 +6,6 @@ import contextlib
 import json as jsonlib
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -58,6 +57,9 @@ Initial = Annotated[
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]
+Strength = Annotated[
+    float, typer.Option("--variation", min=0, max=2, help="Strength of the random changes of training images.")
+]
 Every = Annotated[int, typer.Option(min=1, help="Score after every so many epochs.")]
 Workers = Annotated[int, typer.Option(min=1, help="Threads that prepare images.")]
 Threads = Annotated[int | None, typer.Option(min=1, help="Threads that compute. Default: one a core.")]
@@ -89,6 +91,7 @@ def train_detector(
     frozen_stride: Frozen = None,
     initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    variation: Strength = 1.0,
     evaluate_every: Every = 1,
     workers: Workers = 2,
     threads: Threads = None,
@@ -115,7 +118,7 @@ def train_detector(
             _size(size, [image.file for image in read.training[:20]]),
             seed=seed,
             width=width,
-            variation=Variation() if flip else replace(Variation(), flip=0.0),
+            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
             backbone=backbone_weights,
         )
         _prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
@@ -144,6 +147,7 @@ def train_segmenter(
     frozen_stride: Frozen = None,
     initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    variation: Strength = 1.0,
     evaluate_every: Every = 1,
     workers: Workers = 2,
     threads: Threads = None,
@@ -165,7 +169,7 @@ def train_segmenter(
             _size(size, [image.image for image in read.training[:20]]),
             seed=seed,
             width=width,
-            variation=Variation() if flip else replace(Variation(), flip=0.0),
+            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
             backbone=backbone_weights,
         )
         _prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
@@ -192,6 +196,7 @@ def train_pair(
     width: Width = 1.0,
     initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    variation: Strength = 1.0,
     evaluate_every: Every = 1,
     workers: Workers = 2,
     threads: Threads = None,
@@ -220,7 +225,7 @@ def train_pair(
             _size(size, [image.file for image in boxes.training[:20]]),
             seed=seed,
             width=width,
-            variation=Variation() if flip else replace(Variation(), flip=0.0),
+            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
         )
         _prepare(task.network, task.backbone, None, 0, initial)
         _tell(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)

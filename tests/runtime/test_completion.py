@@ -26,10 +26,11 @@ def thin(full: Path, out: Path, *, streams: tuple[str, ...] = SENSORS, keep: flo
     with Recording(full) as recording:
         metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in RESERVED_METADATA}
         with RecordingWriter(out, metadata=metadata, namespace="test") as writer:
-            for stream in streams:
+            runs_own = [s for s in recording.streams if "/@/" in s]
+            for stream in (*streams, *runs_own):
                 info = recording.streams[stream]
                 assert info.message_type is not None
-                extra = {"operator": info.metadata["operator"], "port": info.metadata["port"]}
+                extra = {name: info.metadata[name] for name in ("operator", "port") if name in info.metadata}
                 writer.add_stream(stream, info.message_type, static=info.static, extra=extra)
                 for m in list(recording.messages([stream]))[: round(keep * info.count)]:
                     writer.write(stream, m.message, seq=m.seq, incarnation=m.incarnation)

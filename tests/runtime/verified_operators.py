@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 
-from runtime_operators import Smooth
+from runtime_operators import Broken, Smooth
 
 from dataflow.messages import FeatureVector
 
@@ -57,3 +57,10 @@ class Unable(Smooth):
 
     def setup(self) -> None:
         raise FileNotFoundError("no weights for it")
+
+
+class Doubled(Broken):
+    """A pass-through that somebody changed."""
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        return x.replace(vectors=x.vectors * 2)

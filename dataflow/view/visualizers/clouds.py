@@ -26,8 +26,8 @@ def point_cloud(canvas: Canvas, message: PointCloud) -> None:
         paint = colors.of_values(message.intensities[kept])
     else:
         paint = colors.of_values(points[:, 2])
-    canvas.scene.saw_range(np.linalg.norm(points[::16], axis=1))
     canvas.draw("space", message.frame, rr.Points3D(points, colors=paint, radii=rr.Radius.ui_points(1.5)))
+    canvas.scene.saw_points(message.frame, points[::16])
 
 
 @visualizer(Clusters, "space")

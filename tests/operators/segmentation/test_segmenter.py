@@ -96,8 +96,12 @@ def test_the_file_computes_the_class_and_its_probability(tmp_path: Path) -> None
     classes, confidence = open_network(file, "segmenter").run(pixels)
     with torch.inference_mode():
         scores = network(torch.from_numpy(pixels.transpose(2, 0, 1)[None].astype(np.float32) / 255))
-        scores = torch.nn.functional.interpolate(scores, size=(48, 64), mode="bilinear", align_corners=False)
-        best, label = scores.softmax(dim=1).max(dim=1)
+        best = scores.softmax(dim=1).amax(dim=1, keepdim=True)
+        scores, best = (
+            torch.nn.functional.interpolate(x, size=(48, 64), mode="bilinear", align_corners=False)
+            for x in (scores, best)
+        )
+        label, best = scores.argmax(dim=1), best[:, 0]
     assert (classes == label.numpy()).mean() > 0.995
     np.testing.assert_allclose(confidence, best.numpy(), atol=5e-3)
 
@@ -171,7 +175,7 @@ def test_rare_classes_weigh_more_but_not_without_bound(tmp_path: Path) -> None:
     data = read_segmentation_data(write_folder(tmp_path, 10))
     weights = class_weights(data)
     assert weights[2] > weights[0]
-    assert float(weights.max() / weights.min()) <= 8.001
+    assert float(weights.max() / weights.min()) <= 4.001
 
 
 def test_dice_is_none_for_the_right_answer_and_blind_to_void() -> None:

@@ -30,7 +30,7 @@ from operators.segmentation import Segmenter
 image = Image(stamp=5, frame="camera", data=np.load(sys.argv[1]))
 for made in (CustomDetector(), Segmenter(with_confidence=True)):
     made.setup()
-    print(made.process(image).digest())
+    print(made.process(image).digest().hex())
 """
 
 
