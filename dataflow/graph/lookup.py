@@ -97,7 +97,7 @@ def _nearest_module(name: str, parent: str) -> str:
     return "" if near is None else f"did you mean {near!r}?"
 
 
-def _where(error: Exception, module: str) -> str:
+def _where(error: BaseException, module: str) -> str:
     """The deepest frame of the module's own code, or of the last code that failed."""
     frames = traceback.extract_tb(error.__traceback__)
     if isinstance(error, SyntaxError) and error.filename:

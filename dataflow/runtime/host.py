@@ -210,6 +210,7 @@ class Host:
         self._left = False
         self._since_promise = 0
         self._step_done = 0
+        self._asked: int | None = None
 
     @property
     def makers(self) -> list[SourceRunner | OperatorRunner | RecordedRunner]:
@@ -356,6 +357,24 @@ class Host:
             worked = self._work()
             self.outlet.flush_due()
             self._report(idle=not worked)
+            self._answer_poll(idle=not worked)
+
+    def _answer_poll(self, *, idle: bool) -> None:
+        """Answers after the work that was there: a host is idle only when a look at everything found nothing to do."""
+        if self._asked is None:
+            return
+        asked, self._asked = self._asked, None
+        self.outlet.flush_all()
+        settled = idle and self.inbox.empty() and not self._waits_for_clock() and all(s.ended for s in self.live)
+        self.channel.send(
+            "state",
+            round=asked,
+            idle=settled,
+            sent=self.outlet.sent,
+            received=self.received,
+            full=self.window.full and any(not f.ended for f in self.feeds),
+            waiting=self._waiting(),
+        )
 
     def _wait_time(self) -> float:
         if self._probing:
@@ -662,18 +681,7 @@ class Host:
             case "grow":
                 self.window.grow()
             case "poll":
-                self.outlet.flush_all()
-                idle = self.inbox.empty() and not self._waits_for_clock() and all(s.ended for s in self.live)
-                full = self.window.full and any(not f.ended for f in self.feeds)
-                self.channel.send(
-                    "state",
-                    round=fields["round"],
-                    idle=idle,
-                    sent=self.outlet.sent,
-                    received=self.received,
-                    full=full,
-                    waiting=self._waiting(),
-                )
+                self._asked = fields["round"]
             case "stop":
                 self._stopping.set()
                 for feed in self.feeds:

@@ -191,7 +191,7 @@ class SceneState:
             self._ranges.append(float(np.median(d)))
 
     def saw_points(self, frame: str, points: npt.ArrayLike) -> None:
-        """Points (N, 3) of a cloud in its sensor's frame: how far things are and, of a scan all round, where the place is.
+        """Points (N, 3) of a cloud in its sensor's frame: how far things are and where the place of a scan all round is.
 
         Call it when the frame is known to the tree.
         """
