@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from dataflow.cli.arguments import (
     FLAG,
@@ -25,6 +26,7 @@ from dataflow.cli.output import DIFFERENT, INTERRUPTED, err, fail, friendly_erro
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.recording import Recording
     from dataflow.runtime.execute import Watch
     from dataflow.runtime.supervisor import RunReport
 
@@ -147,7 +149,7 @@ def run(
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
-      dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml --chaos-seed 7 --record chaos.mcap
+      dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml --record r.mcap
     """
     from dataflow.graph import load_graph
     from dataflow.runtime.chaos import load_plan
@@ -198,7 +200,8 @@ def replay(
     """Replay a recording through the graph that made it, or another one.
 
     Recorded streams replace the sources; everything else runs again, with identical results. Compare two recordings of
-    it with `dataflow diff`.
+    it with `dataflow diff`. With --start, operators begin in the state they had then, where the recording is of the
+    same operators: their last recorded snapshot, and what they did since, repeated.
 
     With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
     nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded
@@ -247,6 +250,8 @@ def replay(
                 return
             whole = span(opened, plan_replay(opened, loaded).streams)
             begin, finish = window(whole, start, end, recording)
+            if begin is not None:
+                _say_what_begins_fresh(opened, loaded)
         outputs = _outputs(record, view, open_view, overwrite)
         options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid)
         shown = None
@@ -260,6 +265,15 @@ def replay(
             json=json,
             quiet=quiet,
         )
+
+
+def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
+    """With --start: which operators cannot have the state they had then."""
+    from dataflow.runtime.warmup import fresh_because
+
+    for node in graph.nodes.values():
+        if not node.source and (reason := fresh_because(recording, graph, node)) is not None:
+            say(f"[yellow]{node.name} begins with fresh state:[/] {escape(reason)}")
 
 
 def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli import execution, inspection, live, recordings, verification, viewing
+from dataflow.cli import execution, inspection, live, param, recordings, top, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup
@@ -84,8 +84,11 @@ def _paragraphs(text: str) -> str:
     return "\n\n".join(block if block.startswith(" ") else " ".join(block.split("\n")) for block in blocks)
 
 
-def _add(function: Callable[..., None], panel: str, name: str | None = None) -> None:
-    app.command(name, rich_help_panel=panel, help=_paragraphs(function.__doc__ or ""))(function)
+def _add(
+    function: Callable[..., None], panel: str | None, name: str | None = None, to: typer.Typer = app, **settings: bool
+) -> None:
+    text = _paragraphs(function.__doc__ or "")
+    to.command(name, rich_help_panel=panel, help=text, context_settings=dict(settings))(function)
 
 
 _add(execution.run, _MAKE)
@@ -100,6 +103,12 @@ _add(viewing.view, _LOOK)
 _add(live.list_running, _FOLLOW, "list")
 _add(live.echo, _FOLLOW)
 _add(live.hz, _FOLLOW)
+_add(top.top, _FOLLOW)
+parameters = typer.Typer(no_args_is_help=True, help="Read and change the parameters of a running graph.")
+_add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
+_add(param.get, None, to=parameters)
+_add(param.list_, None, "list", parameters)
+app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 
 def main() -> None:

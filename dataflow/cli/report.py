@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.columns import Columns
+from rich.console import Console, Group
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -14,9 +15,12 @@ from rich.text import Text
 from dataflow.cli.output import count, figure, plural, seconds, size, table
 from dataflow.runtime.supervisor import RunReport
 
+_VALUE_WIDTH = 30
+"""Columns that the text of a figure may take before it is folded."""
+
 
 def print_report(console: Console, report: RunReport) -> None:
-    """Operators, figures of metrics sinks, drops, notes, files."""
+    """Operators, figures of metrics sinks side by side, drops, restarts, notes, files."""
     title = Text.assemble(
         (report.graph, "bold"),
         ("  interrupted", "yellow") if report.interrupted else ("  complete", "green"),
@@ -24,13 +28,18 @@ def print_report(console: Console, report: RunReport) -> None:
     )
     console.print(title)
     console.print(_operators(report))
-    for operator, summary in report.summaries.items():
-        if summary:
-            console.print(Text(operator, style="bold"))
-            console.print(Padding(_figures(summary), (0, 0, 1, 2), expand=False))
+    blocks = [
+        Group(Text(operator, style="bold"), Padding(_figures(summary), (0, 0, 1, 2), expand=False))
+        for operator, summary in report.summaries.items()
+        if summary
+    ]
+    if blocks:
+        console.print(Columns(blocks, padding=(0, 3)))
     if any(report.drops.values()):
         console.print(Text("dropped", style="bold yellow"))
         console.print(Padding(_drops(report), (0, 0, 1, 2), expand=False))
+    for operator, times in report.restarts.items():
+        console.print(Text(f"{operator} was restarted {plural(times, 'time')}", style="yellow"))
     for note in report.notes:
         console.print(Text(f"note: {note}", style="dim"))
     for facts in report.files.values():
@@ -42,13 +51,16 @@ def print_report(console: Console, report: RunReport) -> None:
 
 
 def _operators(report: RunReport) -> Table:
-    numbers = ("firings", "out", "dropped", "work", "per firing")
+    """A row for each operator; Hz is firings per second of event time."""
+    numbers = ("firings", "out", "Hz", "dropped", "work", "per firing")
     made = table("operator", *numbers, right=numbers)
+    span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
     for name, counts in report.operators.items():
         made.add_row(
             Text(name),
             count(counts.firings) if counts.firings else "",
             count(counts.emitted) if counts.emitted else "",
+            f"{(counts.firings - 1) / span:.1f}" if counts.firings > 1 and span > 0 else "",
             Text(count(counts.dropped), style="yellow") if counts.dropped else "",
             f"{counts.busy_ns * 1e-9:.2f} s",
             f"{counts.busy_ns * 1e-6 / counts.firings:.2f} ms" if counts.firings else "",
@@ -60,7 +72,7 @@ def _figures(summary: Mapping[str, Any]) -> Table:
     """One line a figure; the decimal values in a column of their own, with their unit."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
-    grid.add_column(overflow="fold")
+    grid.add_column(overflow="fold", max_width=_VALUE_WIDTH)
     for name, value in summary.items():
         label, text, unit = figure(name, value)
         grid.add_row(Text(label, style="dim"), Text(f"{text} {unit}".rstrip()))
@@ -103,6 +115,7 @@ def report_json(report: RunReport) -> dict[str, Any]:
             operator: [{"input": i, "reason": why, "count": n} for i, why, n in drops]
             for operator, drops in report.drops.items()
         },
+        "restarts": dict(report.restarts),
         "summaries": {operator: dict(summary) for operator, summary in report.summaries.items()},
         "transport": {label: dict(counts) for label, counts in report.transport.items()},
         "files": {

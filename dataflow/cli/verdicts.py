@@ -140,6 +140,8 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         )
     elif repeats and judged.verdict == "culprit":
         yield f"{v.operator}: run a second time, it came out the same: its code, its libraries or the machine changed"
+    if report.start is not None and v.began == "start":
+        yield f"{v.operator}: keeps state and the recording has no snapshot of it there: repeated from its beginning"
     yield from _left_out(v)
     for file in v.files_changed:
         yield f"{v.operator}: file {file} is not the one that was read then"

@@ -42,6 +42,14 @@ def verify(
             "inputs. Reported as within tolerance, never as identical.",
         ),
     ] = None,
+    start: Annotated[
+        float | None,
+        typer.Option(
+            "--start",
+            metavar="S",
+            help="Begin S seconds after the recording's first message, from the states that it holds there.",
+        ),
+    ] = None,
     baseline: Annotated[
         Path | None,
         typer.Option(
@@ -88,6 +96,7 @@ def verify(
       dataflow verify run.mcap --only odometry --json
       dataflow verify run.mcap --from odometry --graph changed.yaml
       dataflow verify run.mcap --tolerance 1e-5
+      dataflow verify run.mcap --start 60
       dataflow verify runs/ --junit verify.xml
       dataflow verify runs/ --baseline runs/accepted.json --accept
     """
@@ -103,6 +112,8 @@ def verify(
             raise fail("--set changes a graph file: name it with --graph")
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
+        if start is not None and (tolerance is not None or one_host or host_each or baseline is not None):
+            raise fail("--start goes with --from, --only, --graph and --json only")
         if accept and baseline is None:
             raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
         if accept and (first is not None or only is not None):
@@ -124,6 +135,7 @@ def verify(
             "first": first,
             "only": only,
             "tolerance": tolerance,
+            "start": start,
             "placement": "one_host" if one_host else "host_each" if host_each else "graph",
         }
         single = len(recordings) == 1 and not recordings[0].is_dir()

@@ -19,7 +19,7 @@ from rich.text import Text
 
 from dataflow.graph.lookup import NotFound, find_operator, is_concrete
 from dataflow.graph.problems import did_you_mean
-from dataflow.operator import InputPort, Operator, OutputPort, is_source
+from dataflow.operator import InputPort, Operator, OutputPort, is_live, is_source
 from dataflow.sync.stamps import format_duration, parse_duration
 
 ENTRY_POINTS = "dataflow.operators"
@@ -127,6 +127,7 @@ class Described:
             "source": is_source(cls),
             "live": bool(getattr(cls, "live", False)),
             "external": cls.external,
+            "stateless": cls.stateless,
             "fires": fires(cls),
             "inputs": [_input(port) for port in spec.inputs.values()],
             "outputs": [_output(port) for port in spec.outputs.values()],
@@ -198,7 +199,7 @@ def _output(port: OutputPort) -> dict[str, Any]:
 
 
 def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
-    """One row per parameter: name, type, default (None when required), bounds, unit, doc."""
+    """One row per parameter: name, type, default (None when required), bounds, unit, live, doc."""
     rows: list[Mapping[str, Any]] = []
     schema = cls.spec.parameters.model_json_schema()
     for name, info in cls.spec.parameters.model_fields.items():
@@ -215,6 +216,7 @@ def parameters(cls: type[Operator]) -> list[Mapping[str, Any]]:
                 "default": default,
                 "bounds": _bounds(declared),
                 "unit": declared.get("unit", ""),
+                "live": is_live(info),
                 "doc": info.description or "",
             }
         )
@@ -288,7 +290,7 @@ def page(described: Described) -> RenderableType:
                 row["name"],
                 Text(row["type"]),
                 Text(default),
-                _notes([row["bounds"] + unit] if row["bounds"] else [], row["doc"]),
+                _notes(parameter_notes(row), row["doc"]),
             )
         parts += [Text(), table]
     return Group(*parts)
@@ -319,6 +321,13 @@ def input_notes(port: InputPort) -> list[str]:
     if port.max is not None:
         notes.append(f"at most {port.max}")
     return notes
+
+
+def parameter_notes(row: Mapping[str, Any]) -> list[str]:
+    """What is particular to a parameter: its bounds, and whether it may change while the graph runs."""
+    unit = "" if not row["unit"] or row["bounds"].startswith(("items", "length", "matches")) else f" {row['unit']}"
+    notes = [row["bounds"] + unit] if row["bounds"] else []
+    return [*notes, "changes while running"] if row["live"] else notes
 
 
 def output_notes(port: OutputPort) -> list[str]:

@@ -12,7 +12,16 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from dataflow.graph.catalogue import BUILT_IN, Catalogue, discover, fires, input_notes, output_notes, parameters
+from dataflow.graph.catalogue import (
+    BUILT_IN,
+    Catalogue,
+    discover,
+    fires,
+    input_notes,
+    output_notes,
+    parameter_notes,
+    parameters,
+)
 from dataflow.messages.base import Message
 from dataflow.operator import Operator
 
@@ -28,6 +37,7 @@ describes one of them; both show the operators of other installed packages as we
 
 An `In` makes the operator fire; a `Sampled` gives the newest message at that time, a `Batch` all since the last firing.
 A source fires by itself: one that can wait (a dataset) is read as fast as the graph takes it, a device is not.
+A parameter that `changes while running` can be set with `dataflow param set`.
 """
 
 _KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
@@ -87,7 +97,9 @@ def _types(types: Iterable[type[Message]]) -> str:
 
 
 def _world(cls: type[Operator]) -> str:
-    return " It touches the world: always recorded, never run again." if cls.external else ""
+    if cls.external:
+        return " It touches the world: always recorded, never run again."
+    return " It keeps no state." if cls.stateless else ""
 
 
 def _meaning(doc: str, notes: list[str]) -> str:
@@ -97,8 +109,7 @@ def _meaning(doc: str, notes: list[str]) -> str:
 def _parameter(row: Mapping[str, Any]) -> str:
     unit = f" {row['unit']}" if row["unit"] else ""
     default = "must be given" if row["required"] else f"`{_cell(json.dumps(row['default'], ensure_ascii=False))}`{unit}"
-    counts = row["bounds"].startswith(("items", "length", "matches"))
-    meaning = _meaning(row["doc"], [row["bounds"] + ("" if counts else unit)] if row["bounds"] else [])
+    meaning = _meaning(row["doc"], parameter_notes(row))
     return f"| `{row['name']}` | `{_cell(row['type'])}` | {default} | {meaning} |"
 
 

@@ -19,7 +19,7 @@ from dataflow.operator import Operator
 from dataflow.runtime.firings import DropRecord
 from dataflow.runtime.restarts import Restarts
 from dataflow.runtime.runner import Emitter, OperatorFailure, OperatorRunner, Recorder, set_up_again
-from dataflow.sync import NEVER, Aligner, Entry, Firing, InputValue
+from dataflow.sync import NEVER, Aligner, Entry, Firing, InputValue, StreamOrderError
 
 Clock = Callable[[], float]
 """Seconds, never going back."""
@@ -227,7 +227,7 @@ class LiveRunner(OperatorRunner):
         if stream in self.queue.triggers:
             self.queue.put(stream, _Arrival("end", NEVER if final_stamp is None else final_stamp, None, reason))
         else:
-            self.aligner.end(stream, final_stamp, reason)
+            self._end_at(stream, final_stamp, reason)
 
     # Work
 
@@ -385,7 +385,13 @@ class LiveRunner(OperatorRunner):
             case "frontier":
                 self.aligner.advance(stream, arrival.stamp)
             case "end":
-                self.aligner.end(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
+                self._end_at(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
+
+    def _end_at(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        try:
+            self.aligner.end(stream, final_stamp, reason)
+        except StreamOrderError:  # its clock went back, and it ended before it sent a message at its new time
+            self.aligner.end(stream, None, reason)
 
     def _give_up(self) -> bool:
         """Forces the frontiers of inputs whose wait has run out; False when there is none."""

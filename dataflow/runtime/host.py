@@ -12,13 +12,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import msgpack
 
 from dataflow.graph.model import Graph, Node
 from dataflow.messages.base import Message
-from dataflow.operator import ParameterError
+from dataflow.operator import ParameterError, is_live
 from dataflow.recording import Recording
 from dataflow.runtime.admission import LiveRunner
 from dataflow.runtime.chaos import TO_SOURCES, SourceFaults
@@ -54,7 +55,8 @@ class HostConfig:
     (messages, bytes). `firings`: whether a recorder takes the firing records. `verify` names a recording by whose
     firing records the operators are driven. `live`: sources do not wait for the graph, and operators not for their
     inputs. `resume` is given to a host that takes the place of one that died: for each operator, where it had got to
-    (`Resumed`, as plain values). `snapshots`: nanoseconds of event time between two snapshots of an operator.
+    (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the operators'
+    states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
     label: str
@@ -73,16 +75,18 @@ class HostConfig:
     live: bool = False
     resume: dict[str, Any] | None = None
     snapshots: int | None = None
+    warm: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
     """Where an operator had got to when its process died: the next incarnation, the last stamp of each port, the
-    parameters that were changed, the last stamp of a source and how often it has been started again."""
+    parameters that were changed, and how often it has been started again."""
 
     incarnation: int = 0
     last: Mapping[str, int] = field(default_factory=dict)
     changed: Mapping[str, Any] = field(default_factory=dict)
+    restarts: int = 0
 
     def apply(self, runner: SourceRunner | LiveRunner) -> None:
         if self.incarnation:
@@ -301,7 +305,22 @@ class Host:
             return LiveRunner(
                 node, self.outlet, **common, event_clock=self._event_clock, on_failure=self._on_outlived_failure
             )
-        return OperatorRunner(node, self.outlet, **common)
+        runner = OperatorRunner(node, self.outlet, **common)
+        if self.config.warm is not None:
+            self._begin_in_the_middle(runner, Path(self.config.warm["path"]), self.config.warm["stamp"])
+        return runner
+
+    def _begin_in_the_middle(self, runner: OperatorRunner, path: Path, stamp: int) -> None:
+        from dataflow.runtime.warmup import held_before, warm_start
+
+        held, began = held_before(path, runner.node, stamp, self.static)
+        if began:
+            runner.aligner.begin_at(stamp)
+        warm = warm_start(path, self.graph, runner.node, stamp)
+        if warm is not None:
+            runner.take_over(warm.operator, stamp)
+        for entry in held:
+            runner.aligner.push(entry.stream, entry)
 
     def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
         self.channel.send(
@@ -593,7 +612,7 @@ class Host:
         if not idle and now < self._report_due:
             return
         done = {r.node.name: r.done for r in self.runners if self._reported.get(r.node.name) != r.done}
-        firings = sum(r.firings for r in self.runners) + sum(f.firings for f in self.feeds)
+        firings = sum(maker.firings for maker in (*self.runners, *self.feeds, *self.live))
         if not done and firings == self._step_done:
             return
         self._report_due = now + REPORT_EVERY
@@ -609,7 +628,7 @@ class Host:
             counts[source.node.name] = [
                 source.firings,
                 source.ports.emitted,
-                source.overflow,
+                source.overflow + source.refused["past"],
                 source.busy_ns,
                 source.last,
             ]
@@ -719,17 +738,25 @@ class Host:
         return asked
 
     def _set_parameter(self, name: str, query: Any) -> None:
-        """Answers a request to change a parameter: between two firings, with the value as validated or an error."""
+        """Answers a request to change a parameter, between two firings: with the value as validated, or an error.
+
+        A request `{"get": true}` is answered with the values of all, and whether they can change now.
+        """
         maker = next(m for m in self.makers if m.node.name == name)
         with query:
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
-                if isinstance(maker, RecordedRunner):
+                if asked.get("get"):
+                    fields = maker.operator.spec.parameters.model_fields
+                    values = maker.operator.params.model_dump(mode="json")
+                    value = {n: {"value": values[n], "live": is_live(field)} for n, field in fields.items()}
+                elif isinstance(maker, RecordedRunner):
                     raise ParameterError("the parameters of a re-execution are the recorded ones")
-                value = maker.set_parameter(asked["name"], asked["value"])
-                answer = {"ok": True, "value": value}
+                else:
+                    value = maker.set_parameter(asked["name"], asked["value"])
+                answer = {"ok": True, "operator": name, "value": value}
             except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
-                answer = {"ok": False, "error": str(error)}
+                answer = {"ok": False, "operator": name, "error": str(error)}
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def _set_parameter_quietly(
@@ -744,7 +771,18 @@ class Host:
     def _status_asked(self, query: Any) -> None:
         """Answers with the counts of the last report; on Zenoh's thread, so an operator at work holds up nothing."""
         with query:
-            query.reply(query.key_expr, msgpack.packb({"host": self.config.label, "counts": self._counted}))
+            status = {
+                "host": self.config.label,
+                "counts": self._counted,
+                "restarts": {m.node.name: self._restarts_of(m) for m in self.makers},
+                "ended": [m.node.name for m in self.makers if m.ended],
+            }
+            query.reply(query.key_expr, msgpack.packb(status))
+
+    def _restarts_of(self, maker: SourceRunner | OperatorRunner | RecordedRunner) -> int:
+        """How often an operator was started again, by this process and in place of those before it."""
+        before = int((self.config.resume or {}).get(maker.node.name, {}).get("restarts", 0))
+        return before + (maker.restarts.total if isinstance(maker, LiveRunner) else 0)
 
     def _waiting(self) -> dict[str, list[Any]]:
         """Per operator that is not done: the stamp it cannot decide, and the inputs (with frontiers) that hold it."""

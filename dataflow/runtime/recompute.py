@@ -6,14 +6,14 @@ one differs, and to store them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.runtime.feed import LogFeed
 from dataflow.runtime.firings import FiringRecord
-from dataflow.runtime.reexecute import RecordedRunner, Verification, recorded_digests, recorded_firings
+from dataflow.runtime.reexecute import CALLS, RecordedRunner, Verification, recorded_digests, recorded_firings
 from dataflow.runtime.replay import ReplayError, check_type, final_stamps
 from dataflow.runtime.threads import limit_threads
 from dataflow.sync import Entry
@@ -64,6 +64,7 @@ def plan_feeding(recording: Recording, graph: Graph, operators: Collection[str])
 class Recomputation:
     """Recorded operators, driven by their records on one thread.
 
+    Re-execution begins at the stamp `begin` (see `reexecute.beginning`) and ends before the firings from `end` on.
     `made` is given every message that the operators make, `read` every message that is read for them; `ended` the ends
     of the streams that are made.
     """
@@ -77,13 +78,16 @@ class Recomputation:
         made: Take,
         read: Take | None = None,
         ended: End | None = None,
+        begin: int | None = None,
+        end: int | None = None,
     ) -> None:
         self._fed = frozenset(feeding.streams)
         self._consumers: dict[str, list[RecordedRunner]] = {}
-        self.records = {name: list(recorded_firings(recording, name)) for name in feeding.operators}
+        self.records = {name: list(_until(recorded_firings(recording, name), end)) for name in feeding.operators}
         outlet = _Outlet(self._consumers, self._fed, made, ended)
         self.runners = {
-            name: _runner(recording, graph, graph.nodes[name], self.records[name], outlet) for name in feeding.operators
+            name: _runner(recording, graph, graph.nodes[name], self.records[name], outlet, begin)
+            for name in feeding.operators
         }
         for runner in self.runners.values():
             for stream in {s for taken in runner.node.inputs.values() for s in taken}:
@@ -95,11 +99,14 @@ class Recomputation:
             _Outlet(self._consumers, frozenset(), read or _nowhere, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
             finals=final_stamps(recording, feeding.streams),
+            start=None if begin is None else _first_stamp(recording, graph, self.runners.values()),
+            end=end,
+            promises=False,
         )
         self._threads = graph.threads
 
-    def run(self, *, until: Callable[[], bool] = lambda: False) -> Mapping[str, Verification]:
-        """Makes the recorded firings, to the end or until `until()`; asked after every round.
+    def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
+        """Makes the recorded firings, to the end or until `until()`, asked after every round; then closes.
 
         Raises `OperatorFailure`, `RecordingError`, `Stuck`.
         """
@@ -122,7 +129,8 @@ class Recomputation:
                 return self.results()
         finally:
             for runner in runners:
-                runner.operator.close()
+                if close:
+                    runner.operator.close()
         if waiting := [r.node.name for r in runners if not r.ended]:
             raise Stuck(f"everything is read and {', '.join(waiting)} still wait: {self.runners[waiting[0]].waiting()}")
         return self.results()
@@ -133,7 +141,12 @@ class Recomputation:
 
 
 def _runner(
-    recording: Recording, graph: Graph, node: Node, records: Iterable[FiringRecord], outlet: _Outlet
+    recording: Recording,
+    graph: Graph,
+    node: Node,
+    records: Iterable[FiringRecord],
+    outlet: _Outlet,
+    begin: int | None,
 ) -> RecordedRunner:
     inputs = frozenset(s for taken in node.inputs.values() for s in taken)
     producers = [graph.nodes[name] for name in {graph.streams[s].node for s in inputs}]
@@ -144,7 +157,38 @@ def _runner(
         records=records,
         inputs=recorded_digests(recording, producers, inputs),
         seed=graph.seed,
+        begin=begin,
     )
+
+
+def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringRecord]:
+    """The records before the first call at or after the stamp `end`."""
+    for record in records:
+        if end is not None and record.kind in CALLS and record.stamp >= end:
+            return
+        yield record
+
+
+def _first_stamp(recording: Recording, graph: Graph, runners: Iterable[RecordedRunner]) -> int | None:
+    """The stamp from which the recording must be read; None where that is not known: then from its start."""
+    needed: dict[str, tuple[int, int]] = {}
+    for runner in runners:
+        for stream, place in runner.needs_from().items():
+            needed[stream] = min(place, needed.get(stream, place))
+    stamps: list[int] = []
+    for maker in {graph.streams[stream].node for stream in needed}:
+        streams = list(graph.nodes[maker].outputs.values())
+        known: set[str] = set()
+        for record in recorded_firings(recording, maker):
+            if record.kind == "reset":
+                return None  # stamps went back there
+            for stream, emission in zip(streams, record.outputs, strict=False):
+                if emission is not None and needed.get(stream) == (record.incarnation, emission.seq):
+                    stamps.append(emission.stamp)
+                    known.add(stream)
+        if not needed.keys() & set(streams) <= known:
+            return None
+    return min((s for s in stamps if s >= 0), default=None)
 
 
 def _nowhere(stream: str, entry: Entry) -> None:

@@ -20,8 +20,8 @@ from dataflow.runtime.align import align_spec
 from dataflow.runtime.firings import WITHHELD, Emission, FiringRecord, decode_batch
 from dataflow.runtime.runner import Emitter, OperatorFailure, OutputPorts, call_operator, changed_input, entries_of
 from dataflow.runtime.seeding import firing_seed, seed_generators
-from dataflow.runtime.states import pack_state
-from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
+from dataflow.runtime.states import pack_state, unpack_state
+from dataflow.sync import FOREVER, NEVER, Entry, Firing, InputRef, MessageRef, RecordedAligner
 
 CALLS = ("fire", "tick", "finish")
 """The kinds of records that stand for a call with messages."""
@@ -52,6 +52,7 @@ class Verification:
     is not to be had; `lost_records` are missing between others, so the firings that follow them in their incarnation
     cannot be repeated either; `after_cut` messages lie after the operator's last record. `tainted` is the index of the
     first firing that was given anything other than recorded, `own_fault` says that the first difference came before.
+    `began` says from where it was repeated: "start", "snapshot" (its recorded state) or "stateless".
     """
 
     operator: str
@@ -63,6 +64,7 @@ class Verification:
     after_cut: int = 0
     lost_records: int = 0
     complete: bool = False
+    began: str = "start"
     own_fault: bool = False
     tainted: int | None = None
     first: Difference | None = None
@@ -88,6 +90,35 @@ def recorded_firings(recording: Recording, operator: str) -> Iterator[FiringReco
     """The firing records of one operator, in order."""
     for _, payload in recording.firings(operator):
         yield from decode_batch(payload).records
+
+
+def first_places(ref: InputRef) -> Iterator[tuple[str, tuple[int, int]]]:
+    """(stream, (incarnation, number)) of the first message that a reference names on each stream."""
+    match ref:
+        case None:
+            return
+        case MessageRef():
+            yield ref.stream, (ref.incarnation, ref.seq)
+        case tuple():
+            for run in ref:
+                yield run.stream, (run.incarnation, run.first_seq)
+        case _:
+            for one in ref.values():
+                yield one.stream, (one.incarnation, one.seq)
+
+
+def messages_of(ref: InputRef) -> Iterator[MessageRef]:
+    """Every message that a reference names."""
+    match ref:
+        case None:
+            return
+        case MessageRef():
+            yield ref
+        case tuple():
+            for run in ref:
+                yield from run
+        case _:
+            yield from ref.values()
 
 
 def recorded_digests(recording: Recording, nodes: Iterable[Node], streams: frozenset[str]) -> Digests:
@@ -130,6 +161,23 @@ def whole(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
     return kept, lost
 
 
+def beginning(
+    records: list[FiringRecord], begin: int | None, *, stateless: bool
+) -> tuple[list[FiringRecord], list[FiringRecord], str]:
+    """What lies before the place from which records are repeated, the rest, and how that place was found.
+
+    It is after the last snapshot at or before the stamp `begin`, or at `begin` itself for an operator without state;
+    for any other at the start, since its state in the middle is not known.
+    """
+    if begin is None:
+        return [], records, "start"
+    place = max((k + 1 for k, r in enumerate(records) if r.kind == "snapshot" and r.stamp <= begin), default=0)
+    if stateless:
+        place = next((k for k, r in enumerate(records) if r.kind in CALLS and r.stamp >= begin), len(records))
+    found = "start" if not place else "stateless" if stateless else "snapshot"
+    return records[:place], records[place:], found
+
+
 class RecordedRunner:
     """One operator, re-executed. The same shape as `OperatorRunner`, so a host drives either."""
 
@@ -143,6 +191,7 @@ class RecordedRunner:
         inputs: Digests,
         seed: int = 0,
         paranoid: bool = False,
+        begin: int | None = None,
     ) -> None:
         self.node, self.seed, self.paranoid = node, seed, paranoid
         self.operator: Operator = node.make()
@@ -151,12 +200,15 @@ class RecordedRunner:
         self.emitter = emitter
         self.result = Verification(node.name)
         self._inputs = inputs
-        self._records, lost = whole(records)
+        kept, lost = whole(records)
+        self._setup_record = kept.pop(0) if kept and kept[0].kind == "setup" else None
+        self._before, self._records, self.result.began = beginning(kept, begin, stateless=self.operator.stateless)
         calls = [r for r in self._records if r.kind in CALLS]
         self.result.firings = len(calls) + lost
         self.result.lost_records = lost
         self.result.complete = any(r.kind == "finish" for r in calls)
-        self.aligner = RecordedAligner(align_spec(node, self.spec, static), (r.firing() for r in calls))
+        self.aligner_spec = align_spec(node, self.spec, static)
+        self.aligner = RecordedAligner(self.aligner_spec, (r.firing() for r in calls))
         self._position = 0
         self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
@@ -170,18 +222,31 @@ class RecordedRunner:
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
         statics = self._set_up()
-        first = next(iter(self._records), None)
-        if first is not None and first.kind == "setup":
+        first = self._setup_record
+        if first is not None:
             before = first.detail.get("files", {})
             self.result.files_changed = sorted(
                 f for f, digest in self.operator.files.items() if before.get(f) != digest
             )
             self._compare(first, statics)
-            self._position = 1
+        self._take_up()
         for state in self.ports.states.values():
             if state.port.static:
                 state.promised = FOREVER
                 self.emitter.end(state.stream, None, "static")
+
+    def _take_up(self) -> None:
+        """Where re-execution begins in the middle: the parameters and the state of that moment."""
+        for record in self._before:
+            if record.kind == "param":
+                self._changed[record.detail["name"]] = record.detail["value"]
+        try:
+            for name, value in self._changed.items():
+                self.operator.set_parameter(name, value)
+            if self._before and self._before[-1].kind == "snapshot":
+                self.operator.restore(unpack_state(self._before[-1].detail["state"]))
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "restore()", error) from error
 
     def _set_up(self) -> dict[str, Message]:
         try:
@@ -237,6 +302,8 @@ class RecordedRunner:
                     self._attempt(record, lambda d: self.operator.on_reset(d["input"]))
                 case "snapshot":
                     self._compare_state(record)
+                case "restore":
+                    self._restore(record)
 
     def _start_again(self, record: FiringRecord) -> None:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
@@ -259,6 +326,20 @@ class RecordedRunner:
             if record.outcome == "error":
                 self._differ(record, "", f"error: {record.detail.get('error', '')}", "no error")
 
+    def _restore(self, record: FiringRecord) -> None:
+        """A replay that began in the middle: with this state, or with one that cannot be had again."""
+        state = record.detail["state"]
+        if state is None:
+            rest = self._records[self._position :]
+            self.result.lost_records += sum(r.kind in CALLS for r in rest)
+            del self._records[self._position :]
+            self.aligner = RecordedAligner(self.aligner_spec, ())
+            return
+        try:
+            self.operator.restore(unpack_state(state))
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "restore()", error) from error
+
     def _compare_state(self, record: FiringRecord) -> None:
         state = self.operator.snapshot()
         packed = b"" if state is None else pack_state(state)
@@ -277,6 +358,15 @@ class RecordedRunner:
         missing = self.aligner.missing()
         stamp = self._records[self._position].stamp if self._position < len(self._records) else None
         return stamp, {} if missing is None else {missing.stream: missing.seq}
+
+    def needs_from(self) -> dict[str, tuple[int, int]]:
+        """By stream, the first message (incarnation, number) that is needed to repeat what is to be repeated."""
+        needed: dict[str, tuple[int, int]] = {}
+        for record in self._records:
+            for ref in record.inputs.values():
+                for stream, place in first_places(ref):
+                    needed[stream] = min(place, needed.get(stream, place))
+        return needed
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:

@@ -214,12 +214,15 @@ class Recorder:
         self.index += 1
 
 
-def set_up(operator: Operator, ports: OutputPorts, records: Recorder, node: Node, seed: int) -> None:
-    """`setup()`, then the static outputs; both are recorded. Raises `OperatorFailure`."""
+def set_up(
+    operator: Operator, ports: OutputPorts, records: Recorder, node: Node, seed: int, *, already: bool = False
+) -> None:
+    """`setup()` (unless that is done `already`), then the static outputs; recorded. Raises `OperatorFailure`."""
     started = time.time_ns()
     try:
         operator.rng = seed_generators(firing_seed(seed, node.name, NEVER))
-        operator.setup()
+        if not already:
+            operator.setup()
         emissions = ports.prepare(checked_statics(operator, node), NEVER)
     except (Exception, SystemExit, KeyboardInterrupt) as error:
         raise OperatorFailure(node.name, "setup()", error) from error
@@ -274,6 +277,7 @@ class OperatorRunner:
     ) -> None:
         self.node, self.seed, self.paranoid, self.snapshots = node, seed, paranoid, snapshots
         self._next_snapshot: int | None = None
+        self._warm: int | None = None
         self.operator = node.make() if operator is None else operator
         self.spec = self.operator.spec
         self.ports = OutputPorts(node, self.spec, emitter, lossy=lossy)
@@ -287,8 +291,20 @@ class OperatorRunner:
         """When the call that is under way began (monotonic seconds), for whoever watches over it."""
         self.working_stamp = NEVER
 
+    def take_over(self, operator: Operator, stamp: int) -> None:
+        """Begins in the middle: with an operator that is set up and has the state it had before `stamp`. To be called
+        before `setup()`."""
+        self.operator, self._warm = operator, stamp
+
     def setup(self) -> None:
-        set_up(self.operator, self.ports, self.records, self.node, self.seed)
+        if self._warm is None:
+            set_up(self.operator, self.ports, self.records, self.node, self.seed)
+            return
+        started = time.time_ns()
+        set_up(self.operator, self.ports, self.records, self.node, self.seed, already=True)
+        state = self.operator.snapshot()
+        detail = {"state": None if state is None else pack_state(state), "before": self._warm}
+        self.records.add("restore", self._warm, started, detail=detail)
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:

@@ -255,6 +255,7 @@ class Supervisor:
                     "firings": self.plan.record is not None,
                     "verify": self._verified_recording(),
                     "snapshots": graph.record.snapshots,
+                    "warm": self._warm_config(),
                 }
             self._spawn(label, host.nodes, "sink" if host.sink else "host", config)
             for node in host.nodes or ((label,) if host.sink or host.has_log else ()):
@@ -267,6 +268,12 @@ class Supervisor:
     def _verified_recording(self) -> str | None:
         log = self.plan.log
         return str(log.path) if self.plan.verify is not None and log is not None else None
+
+    def _warm_config(self) -> dict[str, Any] | None:
+        log = self.plan.log
+        if log is None or log.start is None or self.plan.verify is not None:
+            return None
+        return {"path": str(log.path), "stamp": log.start}
 
     def _log_config(self) -> dict[str, Any]:
         log = self.plan.log
@@ -503,7 +510,11 @@ class Supervisor:
         assert old.restarts is not None
         old.restarts.begun()
         self._close_process(old)
-        resume = {name: resumed(self._records.get(name, ()), self.plan.graph.nodes[name]) for name in old.nodes}
+        resume = {
+            name: resumed(self._records.get(name, ()), self.plan.graph.nodes[name])
+            | {"restarts": self.status.restarts.get(name, 0)}
+            for name in old.nodes
+        }
         self._spawn(old.label, old.nodes, old.kind, {**old.config, "resume": resume})
         new = self._processes[old.label]
         new.restarts, new.back, new.rejoining = old.restarts, False, time.monotonic()

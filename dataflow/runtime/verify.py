@@ -12,6 +12,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.runtime.execute import Watch, execute
+from dataflow.runtime.midway import verify_from
 from dataflow.runtime.outputs import OutputComparison, compare_outputs
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import Verification, recorded_firings
@@ -30,7 +31,7 @@ class VerifyReport:
     recorded and this one: (fact, then, now); `wall` is in seconds, `span` seconds of event time.
     `comparisons` hold, for culprits (with a `tolerance`: for all that differ), how their messages compare with the
     recorded ones. `digests` are (messages, stream digest) of what was made here, by stream; `outputs` the streams of
-    each operator, `producers` those that it takes from.
+    each operator, `producers` those that it takes from. `start`: seconds into the recording, where it began there.
     """
 
     operators: tuple[Verification, ...]
@@ -45,6 +46,7 @@ class VerifyReport:
     digests: Mapping[str, tuple[int, str]] = field(default_factory=dict)
     outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    start: float | None = None
 
     @property
     def identical(self) -> bool:
@@ -90,6 +92,7 @@ class VerifyReport:
             "tolerance": self.tolerance,
             "within_tolerance": None if self.tolerance is None else self.within_tolerance,
             "culprits": list(self.culprits),
+            "start_s": self.start,
             "messages": self.messages,
             "streams": self.streams,
             "wall_s": self.wall,
@@ -107,6 +110,7 @@ def verify(
     first: str | None = None,
     only: str | None = None,
     tolerance: float | None = None,
+    start: float | None = None,
     watch: Watch | None = None,
     **options: Any,
 ) -> VerifyReport:
@@ -116,7 +120,8 @@ def verify(
     the recording. Operators marked `external` always are. Operators that differ are run once more, alone and given the
     recorded inputs, and their messages compared field by field: the culprits as far as the first difference, with a
     `tolerance` (absolute, in the unit of each floating-point field) all of them to the end.
-    Further options are the fields of `RunPlan`.
+    `start` (seconds from the first message) begins in the middle, from recorded states where there are any; see
+    `midway.verify_from`. Further options are the fields of `RunPlan`.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
     if tolerance is not None and not 0 <= tolerance < math.inf:
@@ -128,8 +133,21 @@ def verify(
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
-        log = plan_replay(recording, played, replaced=feeding)
+        log = None if start is not None else plan_replay(recording, played, replaced=feeding)
         facts = _differing_facts(recording.metadata, played)
+        begin, last = _span(recording, start)
+    if start is not None:
+        results, wall = verify_from(path, played, chosen, begin)
+        return VerifyReport(
+            operators=tuple(results),
+            stood_in=tuple(name for name in played.nodes if name not in chosen or name in feeding),
+            facts=facts,
+            messages=sum(v.outputs for v in results),
+            streams=sum(len(played.nodes[v.operator].outputs) for v in results),
+            wall=wall,
+            span=(last - begin) * 1e-9,
+            start=start,
+        )
     report = execute(RunPlan(played, log=log, verify=frozenset(chosen), **options), mode="verify", watch=watch)
     found = {v["operator"]: Verification.from_wire(v) for v in report.verifications}
     compared = [found[name] for name in played.nodes if name in found]
@@ -154,6 +172,17 @@ def verify(
             for v in compared
         },
     )
+
+
+def _span(recording: Recording, start: float | None) -> tuple[int, int]:
+    """The stamp `start` seconds after the first message of the recording, and its last stamp."""
+    spans = [s for s in recording.streams.values() if s.first is not None and not s.static and "/@/" not in s.name]
+    first = min((s.first for s in spans if s.first is not None), default=0)
+    last = max((s.last for s in spans if s.last is not None), default=0)
+    begin = first + round((start or 0.0) * 1e9)
+    if not first <= begin <= last:
+        raise ReplayError(f"--start {start:g}: the recording is {(last - first) * 1e-9:.3g} s long")
+    return begin, last
 
 
 def require_records(recording: Recording, operators: Iterable[str]) -> None:

@@ -93,6 +93,13 @@ class Aligner:
         self._last_firing = NEVER
         self._finished = False
 
+    def begin_at(self, stamp: int) -> None:
+        """Everything before `stamp` was decided elsewhere, ticks included. To be called before the first `push`;
+        messages from before may still be pushed, as partners, samples and parts of batches of what is to come."""
+        self._decided = stamp - 1
+        if self._ticks is not None:
+            self._ticks.begin_at(stamp)
+
     # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:

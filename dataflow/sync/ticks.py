@@ -45,6 +45,11 @@ class Ticks:
         self.stamp = self._next if open_ended or self._next <= reach else FOREVER
         self.confirmed = self.started and self.stamp <= reach
 
+    def begin_at(self, stamp: int) -> None:
+        """Ticks went on before `stamp`; the next is the first grid point from there."""
+        self._next = self.stamp = self._grid_from(stamp)
+        self.started = True
+
     def needs(self) -> dict[str, int]:
         """The frontiers with which `stamp` would be decided to be a tick, or not."""
         if self.confirmed:

@@ -19,6 +19,8 @@ class CloudBuilder(Operator):
     lens distortion must have been removed.
     """
 
+    stateless = True
+
     depth: In[DepthImage] = In(doc="depth, metres")
     image: In[Image] = In(doc="colour or grey, of the same stamp")
     depth_info: Sampled[CameraInfo] = Sampled(doc="calibration of the depth camera")
@@ -28,12 +30,13 @@ class CloudBuilder(Operator):
     )
     cloud: Out[PointCloud] = Out(doc="points with colours, row by row")
 
-    stride: int = Param(2, ge=1, doc="keep every stride-th pixel in both directions")
-    min_range: float = Param(0.3, ge=0, doc="nearest depth kept", unit="m")
-    max_range: float = Param(6.0, gt=0, doc="farthest depth kept", unit="m")
+    stride: int = Param(2, ge=1, live=True, doc="keep every stride-th pixel in both directions")
+    min_range: float = Param(0.3, ge=0, live=True, doc="nearest depth kept", unit="m")
+    max_range: float = Param(6.0, gt=0, live=True, doc="farthest depth kept", unit="m")
     edge_ratio: float = Param(
         0.05,
         ge=0,
+        live=True,
         doc="drop pixels whose depth differs from a neighbour's by more than this share: they fly between foreground "
         "and background; 0 keeps them",
     )
@@ -60,10 +63,14 @@ class CloudBuilder(Operator):
         return PointCloud(stamp=depth.stamp, frame=depth.frame, points=points, colors=colors)
 
     def _rays_of(self, info: CameraInfo) -> Rays:
-        """The ray table, made once for each calibration."""
-        if self._rays is None or (self._rays[0] is not info and self._rays[0] != info):
-            self._rays = info, Rays.through(info.K, (info.width, info.height), self.stride)
-        return self._rays[1]
+        """The ray table, made once for each calibration and stride."""
+        if self._rays is not None:
+            known, rays = self._rays
+            if rays.stride == self.stride and (known is info or known == info):
+                return rays
+        rays = Rays.through(info.K, (info.width, info.height), self.stride)
+        self._rays = info, rays
+        return rays
 
 
 def transform_between(extrinsics: Transforms | None, depth_frame: str, image_frame: str) -> NDArray[np.float64]:

@@ -13,10 +13,12 @@ from dataflow.operator import In, Operator, Out, Param
 class ImageDecoder(Operator):
     """Decodes JPEG, PNG or WebP files to images: grey files to grey images, all others to RGB."""
 
+    stateless = True
+
     compressed: In[CompressedImage] = In(doc="the encoded file")
     image: Out[Image] = Out(doc="its pixels, of the same stamp and frame")
 
-    max_pixels: int = Param(64_000_000, ge=1, doc="a file that decodes to more pixels is refused")
+    max_pixels: int = Param(64_000_000, ge=1, live=True, doc="a file that decodes to more pixels is refused")
 
     def process(self, compressed: CompressedImage) -> Image:
         """Raises ValueError where the bytes are not a whole image."""
@@ -35,10 +37,12 @@ class DepthDecoder(Operator):
     measures in such steps, the result is bit by bit the depth image that was compressed.
     """
 
+    stateless = True
+
     compressed: In[CompressedDepth] = In(doc="the encoded file and what its numbers mean")
     depth: Out[DepthImage] = Out(doc="metres, 0 for no return, of the same stamp and frame")
 
-    max_pixels: int = Param(64_000_000, ge=1, doc="a file that decodes to more pixels is refused")
+    max_pixels: int = Param(64_000_000, ge=1, live=True, doc="a file that decodes to more pixels is refused")
 
     def process(self, compressed: CompressedDepth) -> DepthImage:
         """Raises ValueError where the bytes are not a whole image."""

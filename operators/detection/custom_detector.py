@@ -18,15 +18,17 @@ class CustomDetector(Operator):
     knows the objects of the simulated worlds. To find your own objects: `dataflow train detector DATA`.
     """
 
+    stateless = True
+
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
     detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score")
 
     weights: str | None = Param(
         None, doc="network file written by `dataflow train detector`; none means the shipped one"
     )
-    score_threshold: float = Param(0.3, ge=0, le=1, doc="boxes below are dropped")
-    nms_iou: float = Param(0.5, ge=0, le=1, doc="overlap above which the weaker box of a class is dropped")
-    max_detections: int = Param(100, ge=1, doc="keep the best so many")
+    score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes below are dropped")
+    nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
+    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""

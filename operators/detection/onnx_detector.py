@@ -29,15 +29,17 @@ class OnnxDetector(Operator):
     The model takes one (1, 3, H, W) float32 input in [0, 1]; the decoder says what its colours, fit and output mean.
     """
 
+    stateless = True
+
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
     detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score")
 
     model: str = Param(doc="ONNX file")
     decoder: DecoderName = Param(doc="family of the network: how its input is made and its output read")
     classes: str | None = Param(None, doc="text file with one class name a line; none means the 80 of COCO")
-    score_threshold: float = Param(0.3, ge=0, le=1, doc="boxes below are dropped")
-    nms_iou: float = Param(0.45, ge=0, le=1, doc="overlap above which the weaker box of a class is dropped")
-    max_detections: int = Param(100, ge=1, doc="keep the best so many")
+    score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes below are dropped")
+    nms_iou: float = Param(0.45, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
+    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
     fit: Literal["default", "stretch", "letterbox"] = Param(
         "default", doc="how the image fills the input; by default as the decoder's family was trained"
     )

@@ -12,13 +12,16 @@ from operators.training.backbone import Backbone, ConvNorm, MobileNetV2, Separab
 
 _LEVELS = ((16, 64, 64), (8, 48, 48), (4, 32, 24), (2, 16, 24))
 """(stride, channels taken from the backbone, channels after merging) on the way back."""
+_DETAIL = 32
 
 
 class ClassDecoder(nn.Module):
     """Feature maps by stride → class scores (N, C, H, W) at stride 2, before the softmax.
 
     The deepest map is weighed by the scene as a whole, as in LR-ASPP (Howard et al. 2019), then enlarged and merged
-    with finer maps step by step, since a mug is a few pixels wide.
+    with finer maps step by step, since a mug is a few pixels wide. What is finer than its cells, the map of stride 4
+    tells in four answers a cell, where arithmetic is cheaper than at stride 2. A score is for the upper left pixel of
+    its cell.
     """
 
     def __init__(self, classes: int, inputs: Mapping[int, int]) -> None:
@@ -34,15 +37,27 @@ class ClassDecoder(nn.Module):
             for above, (s, fine, c) in zip(coarser, _LEVELS, strict=False)
         )
         self.head = nn.Conv2d(coarser[-1], classes, 1)
+        _, fine, merged = _LEVELS[-2]
+        last = nn.Conv2d(_DETAIL, 4 * classes, 1)
+        nn.init.zeros_(last.weight)
+        assert last.bias is not None
+        nn.init.zeros_(last.bias)
+        self.detail = nn.Sequential(
+            ConvNorm(fine + merged, _DETAIL), ConvNorm(_DETAIL, _DETAIL), last, nn.PixelShuffle(2)
+        )
 
     def forward(self, maps: Mapping[int, Tensor]) -> Tensor:
         x = self.context(maps[32]) * self.gate(maps[32])
+        detail: Tensor | None = None
         for (stride, _, _), lateral, merge in zip(_LEVELS, self.lateral, self.merge, strict=True):
             fine = lateral(maps[stride])
             x = functional.interpolate(x, size=fine.shape[2:], mode="bilinear", align_corners=False)
             x = merge(torch.cat([x, fine], dim=1))
+            if stride == 4:
+                detail = self.detail(torch.cat([x, fine], dim=1))
         scores: Tensor = self.head(x)
-        return scores
+        assert detail is not None
+        return scores + detail[..., : scores.shape[2], : scores.shape[3]]
 
 
 class SegmentationNetwork(nn.Module):
@@ -64,8 +79,8 @@ class SegmentationNetwork(nn.Module):
 class DeployedSegmenter(nn.Module):
     """Images (1, 3, H, W) → class (1, H, W) int32 and its probability (1, H, W): what the network file computes.
 
-    The scores are enlarged before a class is chosen, for smooth borders; the probability, which needs more arithmetic,
-    is enlarged after.
+    `size` is (H, W), both even. The scores are enlarged before a class is chosen, for smooth borders; the probability,
+    which needs more arithmetic, is enlarged after.
     """
 
     def __init__(self, network: nn.Module, size: Sequence[int]) -> None:
@@ -75,8 +90,13 @@ class DeployedSegmenter(nn.Module):
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         scores = self.network(images)
         best = 1 / (scores - scores.amax(dim=1, keepdim=True)).exp().sum(dim=1, keepdim=True)
-        label = self._enlarged(scores).argmax(dim=1)
-        return label.to(torch.int32), self._enlarged(best)[:, 0]
+        label = enlarged(scores, self.size).argmax(dim=1)
+        return label.to(torch.int32), enlarged(best, self.size)[:, 0]
 
-    def _enlarged(self, maps: Tensor) -> Tensor:
-        return functional.interpolate(maps, size=self.size, mode="bilinear", align_corners=False)
+
+def enlarged(maps: Tensor, size: Sequence[int]) -> Tensor:
+    """Maps (N, C, H / 2, W / 2) at `size` (H, W): pixel (2i, 2j) takes the value of cell (i, j), others lie between."""
+    height, width = size
+    edged = functional.pad(maps, (0, 1, 0, 1), mode="replicate")
+    wide = functional.interpolate(edged, size=(height + 1, width + 1), mode="bilinear", align_corners=True)
+    return wide[..., :height, :width]

@@ -23,12 +23,14 @@ class Segmenter(Operator):
     file, the network that comes with the project is used; it knows the simulated worlds.
     """
 
+    stateless = True
+
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
     segmentation: Out[SegmentationMap] = Out(doc="class of every pixel of the image")
 
     weights: str | None = Param(None, doc="network file of `dataflow train segmenter`; none means the shipped one")
-    confidence_threshold: float = Param(0.0, ge=0, le=1, doc="pixels below become void (255)")
-    with_confidence: bool = Param(False, doc="also give the confidence of every pixel")
+    confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void (255)")
+    with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
 
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
-from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork
+from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork, enlarged
 from operators.segmentation.score import confusion, mean_iou
 from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
 from operators.training.backbone import BACKBONES, Backbone, load_backbone
@@ -95,7 +95,7 @@ class SegmenterTask:
             pixels, mask = self._view(image, None)
             with torch.inference_mode():
                 scores = network(torch.from_numpy(tensor_of(pixels))[None].to(device))
-                scores = functional.interpolate(scores, size=mask.shape, mode="bilinear", align_corners=False)
+                scores = enlarged(scores, mask.shape)
             table += confusion(mask, scores.argmax(dim=1)[0].cpu().numpy().astype(np.uint8), classes)
         score = mean_iou(table)
         return {"score": score, "miou": score}

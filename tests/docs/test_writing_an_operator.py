@@ -26,7 +26,7 @@ def blocks(repository: Path) -> Blocks:
     text = (repository / "docs" / "writing-an-operator.md").read_text(encoding="utf-8")
     found: Blocks = {"python": [], "yaml": []}
     for language, code in re.findall(r"```(\w+)\n(.*?)```", text, re.DOTALL):
-        found[language].append(code)
+        found.setdefault(language, []).append(code)
     return found
 
 

@@ -224,3 +224,10 @@ class Tuned(Operator):
 
     def restore(self, state: Mapping[str, float]) -> None:
         self.total = state["total"]
+
+
+class TunedForgetful(Tuned):
+    """`Tuned` whose `restore` loses something."""
+
+    def restore(self, state: Mapping[str, float]) -> None:
+        self.total = state["total"] + 1

@@ -21,7 +21,7 @@ from operators.weights import NetworkFileError
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from operators.segmentation.assessment import assess  # noqa: E402
-from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork  # noqa: E402
+from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork, enlarged  # noqa: E402
 from operators.segmentation.training import SegmenterTask, class_weights, dice_loss  # noqa: E402
 from operators.training.export import export_network  # noqa: E402
 from operators.training.loop import Settings, train  # noqa: E402
@@ -97,13 +97,16 @@ def test_the_file_computes_the_class_and_its_probability(tmp_path: Path) -> None
     with torch.inference_mode():
         scores = network(torch.from_numpy(pixels.transpose(2, 0, 1)[None].astype(np.float32) / 255))
         best = scores.softmax(dim=1).amax(dim=1, keepdim=True)
-        scores, best = (
-            torch.nn.functional.interpolate(x, size=(48, 64), mode="bilinear", align_corners=False)
-            for x in (scores, best)
-        )
-        label, best = scores.argmax(dim=1), best[:, 0]
+        label, best = enlarged(scores, (48, 64)).argmax(dim=1), enlarged(best, (48, 64))[:, 0]
     assert (classes == label.numpy()).mean() > 0.995
     np.testing.assert_allclose(confidence, best.numpy(), atol=5e-3)
+
+
+def test_enlarging_keeps_each_cell_at_the_pixel_that_it_learns_from() -> None:
+    maps = torch.rand(1, 2, 5, 7, generator=torch.Generator().manual_seed(0))
+    large = enlarged(maps, (10, 14))
+    assert torch.equal(large[:, :, ::2, ::2], maps)
+    torch.testing.assert_close(large[0, 0, 1, 2], (maps[0, 0, 0, 1] + maps[0, 0, 1, 1]) / 2)
 
 
 def test_letterboxed_images_get_a_map_of_their_own_shape(tmp_path: Path) -> None:

@@ -78,7 +78,7 @@ def test_most_of_its_boxes_are_right(views: list[WorldImage]) -> None:
             hit = len(same) > 0 and float(intersection_over_union(box, same).max()) > 0.5
             right, wrong = right + hit, wrong + (not hit)
     assert right >= 8
-    assert right >= 0.8 * (right + wrong)
+    assert right >= 0.7 * (right + wrong)
 
 
 def test_most_pixels_get_their_class(views: list[WorldImage]) -> None:

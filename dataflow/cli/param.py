@@ -1,0 +1,207 @@
+"""`dataflow param`: the parameters of a graph that runs."""
+
+from __future__ import annotations
+
+import json as json_module
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from dataflow.cli.arguments import FLAG, Json
+from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, say, table
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
+    from dataflow.runtime.inquiry import Parameter
+
+Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="Wait so long for an answer.")]
+
+
+def set_(
+    parameter: Annotated[str, typer.Argument(metavar="OPERATOR.NAME", help="Such as detector.score_threshold.")],
+    value: Annotated[str, typer.Argument(metavar="VALUE", help="A YAML value: 0.3, true, near, [1, 2].")],
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    timeout: Timeout = 5.0,
+    json: Json = False,
+) -> None:
+    """Change a parameter of an operator that runs.
+
+    It changes between two firings; the value that the operator took is printed. The change stands in the recording at
+    its place, and `verify` repeats it there. `dataflow param list` tells which parameters can change.
+
+    Exit codes: 0 changed; 1 refused, or nobody answered; 2 no such graph or operator.
+
+    Examples:
+
+      dataflow param set detector.score_threshold 0.5
+      dataflow param set front/cloud.stride 4 --graph two_cameras
+    """
+    from dataflow.runtime.inquiry import NoAnswer, Refused, hosts_of
+
+    _check(timeout)
+    with friendly_errors():
+        found = running_graph(graph, wait)
+        operator, name = _split(parameter, _graph(found))
+        if not name:
+            raise fail(f"{parameter!r} names no parameter: write {operator}.NAME")
+        wanted = _value(value)
+        with hosts_of(found) as hosts:
+            try:
+                taken = hosts.set_parameter(operator, name, wanted, timeout)
+            except (Refused, NoAnswer) as error:
+                raise fail(str(error), code=DIFFERENT) from None
+    if json:
+        print_json({"operator": operator, "name": name, "value": taken})
+    else:
+        out.print(Text(f"{operator}.{name} = {_text(taken)}"), soft_wrap=True)
+
+
+def get(
+    parameter: Annotated[
+        str | None, typer.Argument(metavar="OPERATOR[.NAME]", help="One parameter, or all of an operator.")
+    ] = None,
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    timeout: Timeout = 5.0,
+    json: Json = False,
+) -> None:
+    """Print the values that parameters have now.
+
+    Exit codes: 0 all answered; 1 an operator did not; 2 no such graph, operator or parameter.
+
+    Examples:
+
+      dataflow param get
+      dataflow param get cloud
+      dataflow param get cloud.stride
+    """
+    from dataflow.graph.problems import did_you_mean
+
+    with friendly_errors():
+        operators, name, values = _asked(parameter, graph, wait, timeout)
+    if name:
+        for operator, parameters in values.items():
+            if name not in parameters:
+                known = did_you_mean(name, parameters, "its parameters")
+                raise fail(f"{operator!r} has no parameter {name!r}: {known}")
+            shown = parameters[name].value
+            print(json_module.dumps(jsonable(shown), ensure_ascii=False) if json else _text(shown))
+    elif json:
+        print_json({op: {n: p.value for n, p in parameters.items()} for op, parameters in values.items()})
+    else:
+        for operator, parameters in values.items():
+            for n, p in parameters.items():
+                out.print(Text.assemble(f"{operator}.{n}  ", (_text(p.value), "bold")), soft_wrap=True)
+    _say_who_is_missing(operators, values, timeout)
+
+
+def list_(
+    every: Annotated[
+        bool, typer.Option("--all", metavar=FLAG, help="Also those that cannot change while the graph runs.")
+    ] = False,
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    timeout: Timeout = 5.0,
+    json: Json = False,
+) -> None:
+    """List the parameters that can change while the graph runs, with their values and bounds.
+
+    Examples:
+
+      dataflow param list
+      dataflow param list --all --json
+    """
+    with friendly_errors():
+        found = running_graph(graph, wait)
+        resolved = _graph(found)
+        operators, _, values = _asked(None, graph, wait, timeout)
+    rows = [
+        {"parameter": f"{op}.{name}", "value": p.value, "live": p.live, **_declared(resolved, op, name)}
+        for op, parameters in values.items()
+        for name, p in parameters.items()
+        if p.live or every
+    ]
+    if json:
+        print_json(rows)
+    elif rows:
+        shown = table("parameter", "value", *(("changes while running",) if every else ()), "bounds", "meaning")
+        for row in rows:
+            cells = [row["parameter"], _text(row["value"]), *((("yes" if row["live"] else ""),) if every else ())]
+            shown.add_row(*(Text(cell) for cell in (*cells, row["bounds"], row["doc"])))
+        out.print(shown)
+    else:
+        say(f"no parameter of {found.name} can change while it runs")
+    _say_who_is_missing(operators, values, timeout)
+
+
+def _check(timeout: float) -> None:
+    if not 0 < timeout < 1e6:
+        raise fail(f"--timeout {timeout:g}: expected seconds, more than 0")
+
+
+def _graph(found: Any) -> Graph:
+    from dataflow.runtime.attach import graph_of
+
+    return graph_of(found)
+
+
+def _split(word: str, graph: Graph) -> tuple[str, str]:
+    """The operator and the parameter that are meant. The names of operators hold no dot."""
+    from dataflow.graph.problems import did_you_mean
+
+    operator, _, name = word.partition(".")
+    if operator not in graph.nodes:
+        raise fail(f"no operator {operator!r} runs: {did_you_mean(operator, graph.nodes, 'there are')}")
+    return operator, name
+
+
+def _value(text: str) -> Any:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        raise fail(f"{text!r} is no YAML value: {str(error).splitlines()[0]}") from None
+
+
+def _asked(
+    word: str | None, name: str | None, wait: float, timeout: float
+) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
+    """The operators that were asked, the parameter (or none), and what they answered."""
+    from dataflow.runtime.inquiry import hosts_of
+
+    _check(timeout)
+    found = running_graph(name, wait)
+    graph = _graph(found)
+    operator, parameter = ("", "") if word is None else _split(word, graph)
+    operators = [operator] if operator else list(graph.nodes)
+    with hosts_of(found) as hosts:
+        return operators, parameter, hosts.parameters(operators, timeout)
+
+
+def _say_who_is_missing(operators: list[str], values: dict[str, Any], timeout: float) -> None:
+    missing = [op for op in operators if op not in values]
+    if missing:
+        raise fail(f"nobody answered for {', '.join(missing)} within {timeout:g} s", code=DIFFERENT)
+
+
+def _declared(graph: Graph, operator: str, name: str) -> dict[str, str]:
+    """Bounds and meaning of a parameter; empty where its class cannot be imported here."""
+    from dataflow.graph.catalogue import parameters
+    from dataflow.graph.model import OperatorImportError
+
+    try:
+        rows = parameters(graph.nodes[operator].operator)
+    except OperatorImportError:
+        return {"bounds": "", "doc": ""}
+    row = next((row for row in rows if row["name"] == name), {"bounds": "", "unit": "", "doc": ""})
+    bounds = row["bounds"] + (f" {row['unit']}" if row["bounds"] and row["unit"] else "")
+    return {"bounds": bounds, "doc": row["doc"]}
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json_module.dumps(jsonable(value), ensure_ascii=False)

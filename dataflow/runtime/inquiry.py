@@ -1,0 +1,110 @@
+"""Asking the hosts of a running graph: how far their operators are, and what their parameters are."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+
+from dataflow.transport import Bus, NetworkConfig
+from dataflow.transport.keys import runtime_key
+from dataflow.transport.registry import RunningGraph
+
+AGAIN_AFTER = 0.05
+"""Seconds until a host that is not there (yet, or again) is asked once more."""
+
+
+class NoAnswer(LookupError):
+    """No host answered for an operator in time."""
+
+
+class Refused(ValueError):
+    """The host of an operator refuses a parameter: says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class HostStatus:
+    """What one host says of its operators.
+
+    `counts`: per operator firings, messages emitted, messages dropped, nanoseconds of work, last stamp. `restarts`: how
+    often each was started again; `ended`: those that are through.
+    """
+
+    host: str
+    counts: Mapping[str, Sequence[int]]
+    restarts: Mapping[str, int]
+    ended: frozenset[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    """The value that a parameter has now, and whether it can change while the graph runs."""
+
+    value: Any
+    live: bool
+
+
+class Hosts:
+    """The hosts of one running graph. Every call waits for at most `timeout` seconds."""
+
+    def __init__(self, bus: Bus, namespace: str) -> None:
+        self._bus, self._namespace = bus, namespace
+
+    def connected(self, number: int, timeout: float) -> bool:
+        """Whether so many hosts are reached by now."""
+        deadline = time.monotonic() + timeout
+        while len(self._bus.peers()) < number:
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(AGAIN_AFTER / 5)
+        return True
+
+    def statuses(self, timeout: float) -> list[HostStatus]:
+        """Of the hosts that answer, also while their operators are at work."""
+        found = []
+        for answer in self._bus.ask(runtime_key(self._namespace, "status", "**"), timeout=timeout):
+            said = msgpack.unpackb(answer, raw=False)
+            found.append(HostStatus(said["host"], said["counts"], said["restarts"], frozenset(said["ended"])))
+        return sorted(found, key=lambda status: status.host)
+
+    def parameters(self, operators: Iterable[str], timeout: float) -> dict[str, dict[str, Parameter]]:
+        """By operator, of those whose hosts answer: between two firings."""
+        wanted = list(operators)
+        key = wanted[0] if len(wanted) == 1 else "**"
+        answers: dict[str, dict[str, Parameter]] = {}
+        for said in self._until(key, {"get": True}, timeout):
+            answers[said["operator"]] = {name: Parameter(**given) for name, given in said["value"].items()}
+            if answers.keys() >= set(wanted):
+                break
+        return {name: answers[name] for name in wanted if name in answers}
+
+    def set_parameter(self, operator: str, name: str, value: Any, timeout: float) -> Any:
+        """Changes a parameter; the value as the operator took it. Raises `Refused`, `NoAnswer`."""
+        for said in self._until(operator, {"name": name, "value": value}, timeout):
+            if not said["ok"]:
+                raise Refused(said["error"])
+            return said["value"]
+        raise NoAnswer(
+            f"nobody answered for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
+            "firing for longer than that; the change is made when it comes to it"
+        )
+
+    def _until(self, operator: str, request: Mapping[str, Any], timeout: float) -> Iterator[dict[str, Any]]:
+        """Answers to a request, which is repeated while nobody is there to take it."""
+        deadline = time.monotonic() + timeout
+        payload = msgpack.packb(request)
+        while (left := deadline - time.monotonic()) > 0:
+            for answer in self._bus.ask(runtime_key(self._namespace, "param", operator), payload, timeout=left):
+                yield msgpack.unpackb(answer, raw=False)
+            time.sleep(AGAIN_AFTER)
+
+
+@contextmanager
+def hosts_of(found: RunningGraph) -> Iterator[Hosts]:
+    """A connection to the hosts of a running graph, which are reached one after the other from now on."""
+    with Bus(NetworkConfig(connect=found.endpoints)) as bus:
+        yield Hosts(bus, found.namespace)

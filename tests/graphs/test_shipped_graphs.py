@@ -1,0 +1,67 @@
+"""The graphs that come with the project: each is sound, and those that need nothing run for a moment."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dataflow.graph import load_graph
+from operators.weights import shipped
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+GRAPHS = sorted((REPOSITORY / "graphs").rglob("*.yaml"))
+DEMO = REPOSITORY / "graphs" / "simulated_robot.yaml"
+
+needs_weights = pytest.mark.skipif(
+    not (shipped("detector.onnx").is_file() and shipped("segmenter.onnx").is_file()),
+    reason="the networks are not in operators/weights",
+)
+
+
+def dataflow(*words: object) -> str:
+    """What a command prints, in a process of its own from the root of the checkout."""
+    command = [sys.executable, "-m", "dataflow.cli.main", *map(str, words)]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True, timeout=100)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("file", [g for g in GRAPHS if g.parent.name == "graphs"], ids=lambda file: file.stem)
+def test_a_graph_passes_the_check(file: Path) -> None:
+    assert load_graph(file).nodes
+
+
+def test_the_simulated_robot_is_the_one_of_the_recording() -> None:
+    recorded = load_graph(REPOSITORY / "graphs" / "record_demo.yaml").nodes["robot"]
+    assert load_graph(DEMO).nodes["robot"].params == recorded.params
+
+
+@needs_weights
+def test_the_demo_scores_everything_against_the_truth_and_its_recording_verifies(tmp_path: Path) -> None:
+    file = tmp_path / "demo.mcap"
+    words = ["recordings/demo.mcap", "--graph", DEMO, "--end", 1.5, "--one-host", "--record", file, "--json", "-q"]
+    report = json.loads(dataflow("replay", *words))
+
+    scores: dict[str, Any] = report["summaries"]
+    assert scores["trajectory_score"]["matched"] == scores["detection_score"]["frames"] == 16
+    assert scores["trajectory_score"]["ate_rmse_m"] < 0.02
+    assert scores["detection_score"]["ap50"] > 0.5
+    assert scores["segmentation_score"]["miou"] > 0.4
+    assert report["streams"]["robot1/cloud/cloud"]["messages"] == 16
+    assert json.loads(dataflow("verify", file, "--one-host", "--json", "-q"))["identical"] is True
+
+
+@needs_weights
+def test_the_demo_runs_from_the_simulator_in_any_world() -> None:
+    words = ["--set", "world=corridor", "--set", "seed=7", "--set", "duration=500ms", "--one-host", "--json", "-q"]
+    report = json.loads(dataflow("run", DEMO, *words))
+
+    assert report["operators"]["robot"]["firings"] == 50
+    for operator in ("color", "depth", "cloud", "odometry", "detector", "segmenter"):
+        assert report["operators"][operator] == report["operators"][operator] | {"emitted": 5, "dropped": 0}
+    assert report["summaries"]["segmentation_score"]["frames"] == 5

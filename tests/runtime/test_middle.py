@@ -1,0 +1,71 @@
+"""Replay and verification that begin in the middle of a recording, with the states that operators had there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph import load_graph
+from dataflow.recording import Recording
+from dataflow.runtime.execute import replay, run
+from dataflow.runtime.replay import ReplayError
+from dataflow.runtime.verify import verify
+
+HERE = Path(__file__).resolve().parent
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("middle") / "run.mcap"
+    run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_host", record=path)
+    return path
+
+
+def messages(path: Path) -> dict[str, dict[int, bytes]]:
+    with Recording(path) as recording:
+        return {
+            name: {item.message.stamp: item.message.digest() for item in recording.messages([name])}
+            for name, stream in recording.streams.items()
+            if not stream.static and "/@/" not in name
+        }
+
+
+def test_a_replay_from_the_middle_makes_what_the_whole_one_makes_there(recorded: Path, tmp_path: Path) -> None:
+    again = tmp_path / "again.mcap"
+
+    replay(recorded, start=0.5, placement="host_each", record=again)
+
+    whole, part = messages(recorded), messages(again)
+    assert part["test/tuned/y"]
+    for stream, found in part.items():
+        assert found.items() <= whole[stream].items(), stream
+        assert len(found) < len(whole[stream])
+
+
+def test_verification_from_the_middle_takes_up_recorded_states(recorded: Path) -> None:
+    whole = {v.operator: v for v in verify(recorded, placement="one_host").operators}
+
+    report = verify(recorded, start=0.5)
+
+    assert report.identical, report.as_json()
+    found = {v.operator: v for v in report.operators}
+    assert found["tuned"].began == "snapshot"
+    assert 0 < found["tuned"].verified < whole["tuned"].verified
+    assert found["smooth"].began == "start"  # it has a state and gives no snapshot
+    assert found["smooth"].verified == whole["smooth"].verified
+
+
+def test_a_state_that_restores_to_something_else_is_found(recorded: Path, tmp_path: Path) -> None:
+    text = (HERE / "chaos.yaml").read_text().replace("runtime_operators:Tuned", "runtime_operators:TunedForgetful")
+    changed = tmp_path / "changed.yaml"
+    changed.write_text(text)
+
+    report = verify(recorded, graph=load_graph(changed, settings=["count=120"]), start=0.5, only="tuned")
+
+    assert report.culprits == ("tuned",)
+
+
+def test_a_start_beyond_the_end_is_refused(recorded: Path) -> None:
+    with pytest.raises(ReplayError, match="s long"):
+        verify(recorded, start=1e9)
