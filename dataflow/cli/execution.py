@@ -87,6 +87,14 @@ Rate = Annotated[
     float | None,
     typer.Option("--rate", metavar="RATE", help="Pace: 1 is real time. Default: as fast as the graph goes."),
 ]
+Patience = Annotated[
+    float,
+    typer.Option(
+        "--patience",
+        metavar="SECONDS",
+        help="Give up after so long without any progress, and when the operators take longer to be set up.",
+    ),
+]
 Live = Annotated[
     bool,
     typer.Option(
@@ -117,6 +125,7 @@ def run(
     graph: GraphFile,
     settings: Settings = None,
     rate: Rate = None,
+    patience: Patience = 120.0,
     live: Live = False,
     paranoid: Paranoid = False,
     chaos: Annotated[
@@ -161,7 +170,8 @@ def run(
         live = live or chaos is not None
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
         outputs = _outputs(record, view, open_view, overwrite)
-        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid) | {"live": live}
+        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid, patience)
+        options["live"] = live
         if chaos is not None:
             options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
         _execute(lambda watch: run_graph(loaded, watch=watch, **options), loaded, outputs, None, json=json, quiet=quiet)
@@ -177,6 +187,7 @@ def replay(
     start: Start = None,
     end: End = None,
     rate: Rate = None,
+    patience: Patience = 120.0,
     paranoid: Paranoid = False,
     quiet: Quiet = False,
     one_host: OneHost = False,
@@ -250,10 +261,12 @@ def replay(
                 return
             whole = span(opened, plan_replay(opened, loaded).streams)
             begin, finish = window(whole, start, end, recording)
+            if opened.torn:
+                say(f"[yellow]{recording} has no proper end:[/] what its writer had not stored when it died is missing")
             if begin is not None:
                 _say_what_begins_fresh(opened, loaded)
         outputs = _outputs(record, view, open_view, overwrite)
-        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid)
+        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid, patience)
         shown = None
         if whole is not None:
             shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
@@ -320,7 +333,10 @@ def _options(
     place: list[str] | None,
     rate: float | None,
     paranoid: bool,
+    patience: float,
 ) -> dict[str, Any]:
+    if not 0 < patience < float("inf"):
+        raise fail(f"--patience {patience:g}: expected seconds, more than 0")
     if rate is not None and not 0 < rate < float("inf"):
         raise fail(f"--rate {rate:g}: expected a number above 0; 1 is real time")
     return {
@@ -330,6 +346,8 @@ def _options(
         "view_file": outputs.view_file,
         "rate": rate,
         "paranoid": paranoid,
+        "stall_timeout": patience,
+        "start_timeout": patience,
     }
 
 
@@ -362,12 +380,13 @@ def _execute(
     from dataflow.cli.viewing import attached_viewer, open_saved
     from dataflow.runtime.supervisor import RunFailed
 
+    before = {file: _written(file) for file in (outputs.record, outputs.view_file) if file is not None}
     display = RunDisplay(err, sources=[node.name for node in graph.sources()], span=shown_span)
     try:
         with attached_viewer(outputs.live_view), shown(err, display, quiet=quiet) as watch:
             report = start(watch)
     except RunFailed:
-        _say_what_is_left(outputs)
+        _say_what_is_left(before)
         raise
     if json:
         print_json(report_json(report))
@@ -379,8 +398,13 @@ def _execute(
         raise typer.Exit(INTERRUPTED)
 
 
-def _say_what_is_left(outputs: _Outputs) -> None:
-    """After a failure: which files hold what came before it."""
-    for file in (outputs.record, outputs.view_file):
-        if file is not None and file.exists():
+def _written(file: Path) -> tuple[int, int] | None:
+    """Tells one content of a file from another; None where there is no such file."""
+    return (found.st_ino, found.st_mtime_ns) if file.exists() and (found := file.stat()) else None
+
+
+def _say_what_is_left(before: dict[Path, tuple[int, int] | None]) -> None:
+    """After a failure: which files hold what came before it, other than those that were there already."""
+    for file, earlier in before.items():
+        if file.exists() and _written(file) != earlier:
             say(f"[dim]{file} ({size(file.stat().st_size)}) holds what came before the failure[/]")

@@ -44,6 +44,11 @@ def print_one(console: Console, checked: Checked) -> None:
     for judged in checked.judged:
         for line in explain(checked, judged):
             console.print(Text(line), soft_wrap=True)
+    if report.torn:
+        console.print(
+            Text("the recording has no proper end: verified is what its writer had stored when it died", style="yellow"),
+            soft_wrap=True,
+        )
     if not report.identical:
         for line in fact_lines(report):
             console.print(Text(line, style="dim"), soft_wrap=True)

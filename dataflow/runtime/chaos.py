@@ -19,7 +19,7 @@ from ruamel.yaml.error import MarkedYAMLError
 
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
-from dataflow.operator import Duration
+from dataflow.operator import Duration, is_live
 
 SECOND = 1_000_000_000
 TO_OPERATORS = ("raise", "hang", "slow", "leak")
@@ -146,6 +146,13 @@ def _check(entry: Any, graph: Graph, place: str) -> None:
         raise ChaosError(f"{place}: {entry.kind!r} is for sources ({sources}); {entry.operator!r} is none")
     if entry.kind in TO_OPERATORS and node.source:
         raise ChaosError(f"{place}: {entry.kind!r} is for operators with inputs; {entry.operator!r} is a source")
+    if entry.kind == "param":
+        able = [name for name, field in node.spec.parameters.model_fields.items() if is_live(field)]
+        if entry.name not in able:
+            raise ChaosError(
+                f"{place}: {entry.name!r} of {entry.operator!r} cannot change while the graph runs; "
+                f"those that can: {', '.join(able) or 'none'}"
+            )
     needs_restart = entry.kind in ("kill", "raise", "hang")
     if needs_restart and node.live.restart.max < 1:
         raise ChaosError(

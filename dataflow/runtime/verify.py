@@ -32,6 +32,7 @@ class VerifyReport:
     `comparisons` hold, for culprits (with a `tolerance`: for all that differ), how their messages compare with the
     recorded ones. `digests` are (messages, stream digest) of what was made here, by stream; `outputs` the streams of
     each operator, `producers` those that it takes from. `start`: seconds into the recording, where it began there.
+    `torn`: the recording has no proper end, so what is verified is what had been stored.
     """
 
     operators: tuple[Verification, ...]
@@ -47,6 +48,7 @@ class VerifyReport:
     outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
     start: float | None = None
+    torn: bool = False
 
     @property
     def identical(self) -> bool:
@@ -93,6 +95,7 @@ class VerifyReport:
             "within_tolerance": None if self.tolerance is None else self.within_tolerance,
             "culprits": list(self.culprits),
             "start_s": self.start,
+            "torn": self.torn,
             "messages": self.messages,
             "streams": self.streams,
             "wall_s": self.wall,
@@ -136,6 +139,7 @@ def verify(
         log = None if start is not None else plan_replay(recording, played, replaced=feeding)
         facts = _differing_facts(recording.metadata, played)
         begin, last = _span(recording, start)
+        torn = recording.torn
     if start is not None:
         results, wall = verify_from(path, played, chosen, begin)
         return VerifyReport(
@@ -147,6 +151,7 @@ def verify(
             wall=wall,
             span=(last - begin) * 1e-9,
             start=start,
+            torn=torn,
         )
     report = execute(RunPlan(played, log=log, verify=frozenset(chosen), **options), mode="verify", watch=watch)
     found = {v["operator"]: Verification.from_wire(v) for v in report.verifications}
@@ -164,6 +169,7 @@ def verify(
         tolerance=tolerance,
         comparisons=_compare(path, played, differing, tolerance),
         digests=report.streams,
+        torn=torn,
         outputs={v.operator: tuple(played.nodes[v.operator].outputs.values()) for v in compared},
         producers={
             v.operator: frozenset(

@@ -1,0 +1,126 @@
+"""A fault plan is the same timeline for the same seed, and refuses what could not be done."""
+
+from __future__ import annotations
+
+from itertools import islice, takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.graph import Graph, load_graph
+from dataflow.messages import FeatureVector, Message
+from dataflow.runtime.chaos import ChaosError, Fault, SourceFaults, load_plan, plan_of
+
+HERE = Path(__file__).resolve().parent
+KILL = {"kind": "kill", "operator": "smooth", "every": "700ms"}
+TUNE = {"kind": "param", "operator": "tuned", "name": "factor", "values": [0.5, 1.0, 2.0], "every": "200ms"}
+SLOW = {"kind": "slow", "operator": "mix", "by": "30ms", "for": "200ms", "at": "1s"}
+
+
+@pytest.fixture(scope="module")
+def graph() -> Graph:
+    return load_graph(HERE / "chaos.yaml", live=True)
+
+
+def timeline(graph: Graph, *entries: dict[str, Any], seed: int = 1, until: float = 20.0) -> list[Fault]:
+    return list(takewhile(lambda fault: fault.at < until, plan_of({"faults": list(entries)}, graph, seed=seed)))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 7])
+def test_a_seed_is_a_timeline_and_another_seed_another(graph: Graph, seed: int) -> None:
+    assert timeline(graph, KILL, TUNE, SLOW, seed=seed) == timeline(graph, KILL, TUNE, SLOW, seed=seed)
+    assert timeline(graph, KILL, TUNE, SLOW, seed=seed) != timeline(graph, KILL, TUNE, SLOW, seed=seed + 1)
+
+
+def test_the_timeline_is_in_the_order_of_time_and_as_dense_as_asked(graph: Graph) -> None:
+    faults = timeline(graph, KILL, TUNE, SLOW, until=200.0)
+
+    assert [f.at for f in faults] == sorted(f.at for f in faults)
+    kills = [f.at for f in faults if f.kind == "kill"]
+    assert np.mean(np.diff(kills)) == pytest.approx(0.7, rel=0.2)
+    assert {f.fields["value"] for f in faults if f.kind == "param"} == {0.5, 1.0, 2.0}
+    assert [f for f in faults if f.kind == "slow"] == [Fault(1.0, "slow", "mix", {"by": 0.03, "span": 0.2})]
+
+
+def test_what_an_entry_does_does_not_depend_on_the_entries_after_it(graph: Graph) -> None:
+    alone = timeline(graph, KILL)
+    together = timeline(graph, KILL, TUNE, SLOW)
+
+    assert [f for f in together if f.kind == "kill"] == alone
+    assert timeline(graph, {**KILL, "until": "5s"}) == [f for f in alone if f.at <= 5.0]
+
+
+def test_a_plan_file_has_a_seed_of_its_own_which_may_be_replaced(graph: Graph, tmp_path: Path) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_text("seed: 3\nfaults:\n  - {kind: kill, operator: smooth, every: 700ms}\n")
+
+    first = list(islice(load_plan(path, graph), 5))
+    assert first == list(islice(plan_of({"seed": 3, "faults": [KILL]}, graph), 5))
+    assert first != list(islice(load_plan(path, graph, seed=4), 5))
+
+
+@pytest.mark.parametrize(
+    ("entry", "words"),
+    [
+        ({**KILL, "operator": "smoth"}, "faults.0: no operator 'smoth'; there are left, right, mix"),
+        ({**KILL, "kind": "burn"}, "burn"),
+        ({**KILL, "at": "1s"}, "give either 'at' (once) or 'every' (again and again)"),
+        ({**KILL, "every": "soon"}, "faults.0.kill.every"),
+        ({**SLOW, "operator": "left"}, "'slow' is for operators with inputs; 'left' is a source"),
+        ({"kind": "stop", "operator": "mix", "for": "1s", "at": "1s"}, "'stop' is for sources (left, right)"),
+        ({"kind": "hang", "operator": "mix", "at": "1s"}, "nothing would notice that 'mix' hangs: give it live: {dead"),
+        ({"kind": "flood", "operator": "left", "factor": 1, "for": "1s", "at": "1s"}, "greater than or equal to 2"),
+        ({**TUNE, "name": "factr"}, "'factr' of 'tuned' cannot change while the graph runs; those that can: factor"),
+        ({"kind": "malformed", "operator": "left", "at": "1s", "size": 3}, "Extra inputs are not permitted"),
+    ],
+)
+def test_a_plan_that_cannot_be_followed_says_which_entry_and_why(graph: Graph, entry: Any, words: str) -> None:
+    with pytest.raises(ChaosError) as caught:
+        plan_of({"faults": [entry]}, graph)
+    assert words in str(caught.value)
+
+
+def test_what_nothing_would_outlive_is_refused() -> None:
+    fragile = load_graph(HERE / "live.yaml", live=True)
+
+    with pytest.raises(ChaosError, match="'kill' would end the run: give 'smooth' a restart policy"):
+        plan_of({"faults": [KILL]}, fragile)
+
+
+def test_a_file_that_is_no_plan_is_named(graph: Graph, tmp_path: Path) -> None:
+    with pytest.raises(ChaosError, match=r"nowhere\.yaml"):
+        load_plan(tmp_path / "nowhere.yaml", graph)
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("faults: [")
+    with pytest.raises(ChaosError, match=r"broken\.yaml"):
+        load_plan(broken, graph)
+
+
+def step(stamp: int) -> dict[str, Message]:
+    return {"fast": FeatureVector(stamp=stamp, vectors=np.zeros((1, 1), np.float32), model="test")}
+
+
+def stamps(faults: SourceFaults, stamp: int, now: float) -> list[int]:
+    return [made["fast"].stamp for made in faults.apply(step(stamp), now)]
+
+
+@given(st.integers(0, 10**12), st.floats(0, 1e6))
+def test_a_source_that_nothing_is_done_to_is_left_alone(stamp: int, now: float) -> None:
+    assert stamps(SourceFaults(), stamp, now) == [stamp]
+
+
+def test_what_is_done_to_a_source_ends_when_it_should() -> None:
+    faults = SourceFaults()
+    faults.begin("stop", {"span": 1.0}, 10.0)
+    assert [stamps(faults, 5, t) for t in (10.0, 10.9, 11.1)] == [[], [], [5]]
+    faults.begin("flood", {"factor": 3, "span": 1.0}, 20.0)
+    assert [stamps(faults, 5, t) for t in (20.5, 21.5)] == [[5, 6, 7], [5]]
+    faults.begin("past", {"by": 2e-9, "back": True}, 30.0)
+    assert [stamps(faults, 5, 30.0), stamps(faults, 6, 30.0)] == [[3, 5], [6]]
+    faults.begin("jump", {"by": 3e-9, "back": True}, 40.0)
+    faults.begin("jump", {"by": 1e-9, "back": False}, 40.0)
+    assert [stamps(faults, k, 40.0) for k in (7, 1)] == [[5], [0]]  # never before the epoch

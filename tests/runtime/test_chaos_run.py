@@ -1,0 +1,82 @@
+"""A live run under a fault plan ends in order, records what was done to it, and is repeated bit for bit, faults too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from dataflow.graph import load_graph
+from dataflow.messages import Diagnostics
+from dataflow.recording import Recording
+from dataflow.runtime.chaos import plan_of
+from dataflow.runtime.execute import run
+from dataflow.runtime.keys import diagnostics_key
+from dataflow.runtime.reexecute import recorded_firings
+from dataflow.runtime.verify import verify
+
+HERE = Path(__file__).resolve().parent
+
+PLAN = {
+    "faults": [
+        {"kind": "kill", "operator": "smooth", "every": "700ms"},
+        {"kind": "raise", "operator": "merge", "every": "300ms"},
+        {"kind": "raise", "operator": "tuned", "every": "500ms"},
+        {"kind": "hang", "operator": "slow", "every": "900ms"},
+        {"kind": "slow", "operator": "mix", "by": "30ms", "for": "150ms", "every": "600ms"},
+        {"kind": "leak", "operator": "sum", "megabytes": 1, "every": "500ms"},
+        {"kind": "freeze", "operator": "right", "for": "100ms", "every": "900ms"},
+        {"kind": "stop", "operator": "right", "for": "100ms", "every": "900ms"},
+        {"kind": "flood", "operator": "left", "factor": 5, "for": "50ms", "every": "600ms"},
+        {"kind": "jump", "operator": "left", "by": "300ms", "every": "800ms"},
+        {"kind": "past", "operator": "right", "by": "300ms", "every": "300ms"},
+        {"kind": "malformed", "operator": "mix", "every": "400ms"},
+        {"kind": "param", "operator": "tuned", "name": "factor", "values": [0.5, 1.0, 2.0], "every": "100ms"},
+    ]
+}
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("placement", ["one_host", "host_each"])
+def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
+    placement: str, seed: int, tmp_path: Path
+) -> None:
+    path = tmp_path / "chaos.mcap"
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=150"], live=True)
+
+    report = run(graph, live=True, placement=placement, record=path, faults=plan_of(PLAN, graph, seed=seed), rate=1.0)
+
+    assert not report.interrupted
+    assert report.restarts
+    with Recording(path) as recording:
+        assert not recording.torn
+        assert recording.metadata["dataflow:outcome"]["outcome"] == "complete"
+        faults = [event.data for event in recording.events() if event.name == "fault"]
+        assert faults
+        tuned = list(recorded_firings(recording, "tuned"))
+        diagnosed = [r.message for r in recording.messages([diagnostics_key("test")])]
+    verified = verify(path, placement="one_host" if placement == "host_each" else "host_each")
+    assert verified.identical, verified.as_json()
+    assert {v.operator for v in verified.operators} == {"mix", "slow", "smooth", "merge", "tuned", "sum"}
+    assert len({r.detail["value"] for r in tuned if r.kind == "param"}) > 1  # so they were changed, and repeated
+    assert all(isinstance(m, Diagnostics) and set(m.names) <= set(graph.nodes) for m in diagnosed)
+    assert diagnosed
+
+
+def test_a_parameter_that_is_changed_changes_what_comes_after_and_is_repeated(tmp_path: Path) -> None:
+    path = tmp_path / "tuned.mcap"
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=60"], live=True)
+    plan = {"faults": [{"kind": "param", "operator": "tuned", "name": "factor", "values": [0.0], "at": "200ms"}]}
+
+    run(graph, live=True, placement="one_host", record=path, faults=plan_of(plan, graph))
+
+    with Recording(path) as recording:
+        records = list(recorded_firings(recording, "tuned"))
+        (change,) = [k for k, r in enumerate(records) if r.kind == "param"]
+        numbers = [float(r.message.vectors[0, 0]) for r in recording.messages(["test/tuned/y"])]
+    assert records[change].detail == {"name": "factor", "value": 0.0}
+    before = sum(any(records[k].outputs) for k in range(change))
+    assert 0 < before < len(numbers)
+    assert len(set(numbers[: before - 1])) > 1
+    assert set(numbers[before:]) == {numbers[before - 1]}  # nothing is added with a weight of nothing
+    assert verify(path, placement="host_each").identical

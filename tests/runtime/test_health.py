@@ -1,0 +1,95 @@
+"""Health follows from counts alone."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataflow.messages import Diagnostics, Level
+from dataflow.runtime.health import SILENT_AFTER, Health, HealthMonitor, diagnostics_fields
+from dataflow.runtime.sink import _diagnostics
+
+Counts = dict[str, tuple[int, int, int, int]]
+
+
+def only(healths: list[Health]) -> Health:
+    (health,) = healths
+    return health
+
+
+def after(*samples: tuple[float, int, int, float]) -> Health:
+    """The health at the last of (time s, firings, dropped, work s)."""
+    monitor = HealthMonitor()
+    found = [monitor.update({"op": (n, n, lost, round(busy * 1e9))}, at) for at, n, lost, busy in samples]
+    return only(found[-1])
+
+
+def test_rates_and_load_are_those_since_the_last_update() -> None:
+    health = after((10.0, 100, 4, 1.0), (12.0, 140, 4, 2.0))
+
+    assert health.state == "running"
+    assert health.rate == pytest.approx(20.0)
+    assert health.load == pytest.approx(0.5)
+    assert health.drop_rate == 0.0
+    assert health.level == Level.OK
+
+
+def test_an_operator_that_drops_says_how_many() -> None:
+    health = after((10.0, 100, 4, 1.0), (12.0, 140, 10, 2.0))
+
+    assert (health.state, health.drop_rate, health.note) == ("dropping", 3.0, "6 dropped in 2.0 s")
+    assert health.level == Level.WARN
+
+
+def test_an_operator_that_has_not_fired_is_starting() -> None:
+    assert after((10.0, 0, 0, 0.0), (20.0, 0, 0, 0.0)).state == "starting"
+
+
+def test_an_operator_that_stops_is_silent_after_a_moment() -> None:
+    quick = [(t * 0.5, t * 5, 0, 0.0) for t in range(10)]
+
+    assert after(*quick, (4.5 + 0.9 * SILENT_AFTER, 45, 0, 0.0)).state == "running"
+    silent = after(*quick, (4.5 + 2.0 * SILENT_AFTER, 45, 0, 0.0))
+    assert (silent.state, silent.note, silent.level) == ("silent", "nothing for 2.0 s", Level.STALE)
+
+
+def test_one_that_is_slow_by_nature_is_given_longer() -> None:
+    slow = [(t * 2.0, t, 0, 0.0) for t in range(1, 8)]
+
+    assert after(*slow, (14.0 + 8.0, 7, 0, 0.0)).state == "running"
+    assert after(*slow, (14.0 + 11.0, 7, 0, 0.0)).state == "silent"
+
+
+def test_one_that_is_away_or_through_says_so_before_anything_else() -> None:
+    monitor = HealthMonitor()
+    counts: Counts = {"gone": (5, 5, 0, 0), "through": (5, 5, 0, 0)}
+    monitor.update(counts, 0.0)
+    gone, through = monitor.update(
+        counts, 60.0, away={"gone": "was killed by SIGKILL"}, ended=frozenset({"through"}), restarts={"gone": 3}
+    )
+
+    assert (gone.state, gone.note, gone.restarts, gone.level) == ("restarting", "was killed by SIGKILL", 3, Level.ERROR)
+    assert (through.state, through.level) == ("ended", Level.OK)
+
+
+def test_counts_that_begin_anew_with_a_new_process_are_no_negative_rates() -> None:
+    health = after((0.0, 100, 50, 9.0), (1.0, 3, 0, 0.1), (2.0, 13, 0, 0.2))
+
+    assert health.rate == pytest.approx(10.0)
+    assert after((0.0, 100, 50, 9.0), (1.0, 3, 0, 0.1)).rate == 0.0
+
+
+def test_the_diagnostics_stream_says_the_same() -> None:
+    healths = [
+        Health("camera", "silent", 7, 7, 0, 0.0, 0.0, 0.0, 0, "nothing for 3.0 s"),
+        Health("detector", "dropping", 9, 9, 4, 5.0, 2.0, 0.9, 1, "4 dropped in 2.0 s"),
+    ]
+
+    message = _diagnostics(diagnostics_fields(healths, 123))
+
+    assert isinstance(message, Diagnostics)
+    assert message.stamp == 123
+    assert message.names == ("camera", "detector")
+    assert message.messages == ("nothing for 3.0 s", "4 dropped in 2.0 s")
+    assert np.array_equal(message.levels, [Level.STALE, Level.WARN])
+    assert message.pairs(1) == {"state": "dropping", **healths[1].values()}

@@ -1,0 +1,92 @@
+"""Operator states travel unchanged, and equal states have equal bytes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import hypothesis.extra.numpy as hnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dataflow.runtime.states import StateError, pack_state, unpack_state
+
+arrays = hnp.arrays(
+    st.one_of(
+        hnp.boolean_dtypes(), hnp.integer_dtypes(endianness="<"), hnp.floating_dtypes(endianness="<", sizes=(32, 64))
+    ),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+)
+leaves = st.one_of(
+    st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(), st.binary(max_size=20), arrays
+)
+values = st.recursive(
+    leaves,
+    lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=5), inner, max_size=4)),
+    max_leaves=12,
+)
+states = st.dictionaries(st.text(max_size=8), values, max_size=5)
+
+
+def same(a: Any, b: Any) -> bool:
+    """Equal types and bits."""
+    if isinstance(a, np.ndarray):
+        return isinstance(b, np.ndarray) and (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes())
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return isinstance(b, list) and len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, float):
+        return isinstance(b, float) and np.float64(a).tobytes() == np.float64(b).tobytes()
+    return type(a) is type(b) and bool(a == b)
+
+
+@settings(max_examples=150)
+@given(states)
+def test_a_state_comes_back_bit_by_bit(state: dict[str, Any]) -> None:
+    assert same(unpack_state(pack_state(state)), state)
+
+
+@settings(max_examples=60)
+@given(states)
+def test_equal_states_have_equal_bytes_whatever_the_order_of_their_keys(state: dict[str, Any]) -> None:
+    assert pack_state(dict(reversed(state.items()))) == pack_state(state)
+
+
+def test_an_array_of_any_layout_comes_back_and_can_be_written_to() -> None:
+    state = {"columns": np.asfortranarray(np.arange(6.0).reshape(2, 3)), "part": np.arange(10)[::3]}
+
+    restored = unpack_state(pack_state(state))
+
+    assert np.array_equal(restored["columns"], state["columns"])
+    assert restored["part"].tolist() == [0, 3, 6, 9]
+    restored["part"][0] = 1
+
+
+def test_numbers_of_numpy_come_back_as_arrays_without_dimensions() -> None:
+    restored = unpack_state(pack_state({"x": np.float32(0.1)}))
+
+    assert restored["x"].shape == ()
+    assert restored["x"].dtype == np.float32
+    assert restored["x"] == np.float32(0.1)
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        ({"tracks": [{"box": object()}]}, r"state.tracks\[0\].box is a object"),
+        ({"seen": {1, 2}}, "state.seen is a set"),
+        ({"by_id": {3: "cup"}}, "state.by_id: key 3 is no string"),
+        ({"names": np.array(["a", None], object)}, "state.names is a ndarray"),
+    ],
+)
+def test_what_cannot_be_kept_is_named_with_its_place(state: dict[str, Any], words: str) -> None:
+    with pytest.raises(StateError, match=words):
+        pack_state(state)
+
+
+@pytest.mark.parametrize("data", [b"", b"\xc1", b"\x81\xa1x"])
+def test_bytes_that_are_no_state_are_refused(data: bytes) -> None:
+    with pytest.raises(StateError, match="not an operator's state"):
+        unpack_state(data)
