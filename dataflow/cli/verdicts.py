@@ -46,7 +46,9 @@ def print_one(console: Console, checked: Checked) -> None:
             console.print(Text(line), soft_wrap=True)
     if report.torn:
         console.print(
-            Text("the recording has no proper end: verified is what its writer had stored when it died", style="yellow"),
+            Text(
+                "the recording has no proper end: verified is what its writer had stored when it died", style="yellow"
+            ),
             soft_wrap=True,
         )
     if not report.identical:

@@ -81,7 +81,9 @@ class HealthMonitor:
             past = self._past.get(name)
             if past is None:
                 past = self._past[name] = _Past(firings, dropped, busy_ns, now)
-            fired, lost = max(0, firings - past.firings), max(0, dropped - past.dropped)
+            if firings < past.firings:  # a new process counts from nothing
+                past.firings = past.dropped = past.busy_ns = 0
+            fired, lost = firings - past.firings, max(0, dropped - past.dropped)
             if fired:
                 period = (now - past.moved) / fired
                 past.period = period if not past.period else 0.7 * past.period + 0.3 * period

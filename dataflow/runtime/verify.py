@@ -17,7 +17,7 @@ from dataflow.runtime.outputs import OutputComparison, compare_outputs
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import Verification, recorded_firings
 from dataflow.runtime.replay import ReplayError, plan_replay, recorded_graph
-from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.supervisor import OperatorCounts, RunFailed
 from dataflow.runtime.threads import environment
 
 Verdict = Literal["identical", "within tolerance", "culprit", "downstream", "unverifiable"]
@@ -33,6 +33,7 @@ class VerifyReport:
     recorded ones. `digests` are (messages, stream digest) of what was made here, by stream; `outputs` the streams of
     each operator, `producers` those that it takes from. `start`: seconds into the recording, where it began there.
     `torn`: the recording has no proper end, so what is verified is what had been stored.
+    `work` tells how long each operator worked.
     """
 
     operators: tuple[Verification, ...]
@@ -49,6 +50,7 @@ class VerifyReport:
     producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
     start: float | None = None
     torn: bool = False
+    work: Mapping[str, OperatorCounts] = field(default_factory=dict)
 
     @property
     def identical(self) -> bool:
@@ -169,6 +171,7 @@ def verify(
         tolerance=tolerance,
         comparisons=_compare(path, played, differing, tolerance),
         digests=report.streams,
+        work={v.operator: report.operators[v.operator] for v in compared},
         torn=torn,
         outputs={v.operator: tuple(played.nodes[v.operator].outputs.values()) for v in compared},
         producers={

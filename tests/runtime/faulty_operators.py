@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator, Mapping
 
+import numpy as np
 from runtime_operators import number, value
 
 from dataflow.messages import FeatureVector, Message
@@ -61,3 +62,15 @@ class Doomed(Operator):
 
     def process(self, x: FeatureVector) -> None:
         raise RuntimeError("no calibration")
+
+
+class Noise(Source):
+    """16 kB a message that no compression makes smaller; the first number counts."""
+
+    fast: Out[FeatureVector]
+    count: int = Param(100, ge=1, doc="how many")
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for k in range(self.count):
+            noise = np.random.default_rng(k).random(4096, np.float32)
+            yield {"fast": value(10**9 + k * 10**7, k, *noise.tolist())}

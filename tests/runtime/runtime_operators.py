@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -147,7 +149,7 @@ class Broken(Operator):
     x: In[FeatureVector]
     y: Out[FeatureVector]
     at: int = Param(20, doc="the number at which it fails")
-    how: str = Param("raise", doc="raise, die, hang, stamp, type, mutate or chatter")
+    how: str = Param("raise", doc="raise, die, hang, stamp, type, mutate, chatter, exit or children")
 
     def process(self, x: FeatureVector) -> FeatureVector:
         if number(x) == self.at:
@@ -167,6 +169,11 @@ class Broken(Operator):
                     x.vectors[0, 0] += 1
                 case "chatter":
                     print("still here", flush=True)
+                case "exit":
+                    raise SystemExit("enough")
+                case "children":
+                    left = subprocess.Popen(["sleep", "300"])
+                    print(f"left behind: {left.pid}", flush=True)
         return value(x.stamp, number(x))
 
 
@@ -231,3 +238,18 @@ class TunedForgetful(Tuned):
 
     def restore(self, state: Mapping[str, float]) -> None:
         self.total = state["total"] + 1
+
+
+class Tidy(Source):
+    """Goes on for ever, and releases its device at the end."""
+
+    y: Out[FeatureVector]
+    note: str = Param(doc="file to write at the end")
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        try:
+            for k in range(10**9):
+                time.sleep(0.005)
+                yield {"y": value(1_000_000_000 + k * 5_000_000, k)}
+        finally:
+            Path(self.note).write_text("device released")

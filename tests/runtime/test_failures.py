@@ -60,6 +60,42 @@ def test_a_broken_contract_is_named(how: str, words: str) -> None:
     assert words in str(failure)
 
 
+def test_an_operator_that_exits_is_named_as_one_that_raises() -> None:
+    failure = fails(broken("exit"), placement="host_each")
+
+    assert failure.operator == "bad"
+    assert "in fire at stamp 1200000000: SystemExit: enough" in str(failure)
+
+
+def test_what_operators_start_ends_with_their_host_and_holds_nobody_up() -> None:
+    lines: list[str] = []
+
+    Supervisor(RunPlan(broken("children")), on_output=lambda label, line: lines.append(line)).run()
+
+    left = int(next(line for line in lines if "left behind" in line).rpartition(" ")[2])
+    deadline = time.monotonic() + 5.0
+    while psutil.pid_exists(left) and psutil.Process(left).status() != psutil.STATUS_ZOMBIE:
+        assert time.monotonic() < deadline, "a child of an operator outlived the run"
+        time.sleep(0.02)
+
+
+def test_a_source_that_is_stopped_runs_its_finally(tmp_path: Path) -> None:
+    note = tmp_path / "note"
+    graph = chain(f"tidy: {{use: runtime_operators:Tidy, params: {{note: {note}}}}}")
+    supervisor = Supervisor(RunPlan(graph, placement="host_each"))
+
+    def stop() -> None:
+        while supervisor.status.phase == "starting":
+            time.sleep(0.02)
+        time.sleep(0.2)
+        supervisor.stop()
+
+    threading.Thread(target=stop, daemon=True).start()
+
+    assert supervisor.run().interrupted
+    assert note.read_text() == "device released"
+
+
 def test_a_host_that_dies_is_named_with_the_signal_and_how_far_it_was() -> None:
     failure = fails(broken("die"), placement="host_each")
 

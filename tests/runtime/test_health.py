@@ -76,7 +76,8 @@ def test_counts_that_begin_anew_with_a_new_process_are_no_negative_rates() -> No
     health = after((0.0, 100, 50, 9.0), (1.0, 3, 0, 0.1), (2.0, 13, 0, 0.2))
 
     assert health.rate == pytest.approx(10.0)
-    assert after((0.0, 100, 50, 9.0), (1.0, 3, 0, 0.1)).rate == 0.0
+    again = after((0.0, 100, 50, 9.0), (1.0, 3, 0, 0.1))
+    assert (again.state, again.rate, again.drop_rate, round(again.load, 6)) == ("running", 3.0, 0.0, 0.1)
 
 
 def test_the_diagnostics_stream_says_the_same() -> None:

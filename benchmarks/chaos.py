@@ -1,0 +1,81 @@
+"""Live runs under fault plans with different seeds, each verified in another placement than it ran in.
+
+usage: python benchmarks/chaos.py [--runs 50] [--first 1] [--duration 8s]
+
+Every run: graphs/chaos/robot.yaml live, in one host or a host each by turns, with the faults of graphs/chaos/plan.yaml.
+Then `verify` of its recording, placed the other way. Prints a row per run and a summary; exit code 1 unless all are
+identical.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from dataflow.graph import load_graph
+from dataflow.runtime.chaos import load_plan
+from dataflow.runtime.execute import run
+from dataflow.runtime.verify import verify
+
+ROOT = Path(__file__).resolve().parent.parent
+GRAPH, PLAN = ROOT / "graphs" / "chaos" / "robot.yaml", ROOT / "graphs" / "chaos" / "plan.yaml"
+COLUMNS = "seed  placement  faults  restarts  drops  timeouts  messages  verdict      x real time  limit"
+
+
+def one(seed: int, placement: str, duration: str, folder: Path) -> tuple[bool, int, int, int]:
+    """Runs and verifies; prints the row. Returns whether it is identical, drops, timeouts and restarts."""
+    graph = load_graph(GRAPH, settings=[f"duration={duration}"], live=True)
+    path = folder / f"{seed}.mcap"
+    report = run(
+        graph, live=True, placement=placement, record=path, overwrite=True, faults=load_plan(PLAN, graph, seed=seed)
+    )
+    other = "host_each" if placement == "one_host" else "one_host"
+    verified = verify(path, placement=other)
+    path.unlink()
+    counted = [(why, n) for drops in report.drops.values() for _, why, n in drops]
+    timeouts = sum(n for why, n in counted if why == "timeout")
+    drops = sum(n for why, n in counted if why != "timeout")
+    faults = sum(note.startswith("planned fault") for note in report.notes)
+    restarts = sum(report.restarts.values())
+    busy = [c.busy_ns * 1e-9 for name, c in verified.work.items()]
+    slowest = max(busy) if other == "host_each" else sum(busy)
+    factor, limit = verified.span / verified.wall, verified.span / slowest
+    verdict = "identical" if verified.identical else "DIFFERENT"
+    print(
+        f"{seed:4}  {placement:9}  {faults:6}  {restarts:8}  {drops:5}  {timeouts:8}  {verified.messages:8}  "
+        f"{verdict:11}  {factor:11.2f}  {limit:5.2f}",
+        flush=True,
+    )
+    if not verified.identical:
+        for v in verified.operators:
+            print(f"      {v.operator}: {v.verdict} {v.verified}/{v.firings} {v.missing} {v.first}", flush=True)
+    return verified.identical, drops, timeouts, restarts
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--runs", type=int, default=50, help="how many seeds")
+    parser.add_argument("--first", type=int, default=1, help="the first seed")
+    parser.add_argument("--duration", default="8s", help="event time of a run")
+    arguments = parser.parse_args()
+    started = time.monotonic()
+    print(COLUMNS)
+    with tempfile.TemporaryDirectory() as folder:
+        results = [
+            one(seed, "one_host" if seed % 2 else "host_each", arguments.duration, Path(folder))
+            for seed in range(arguments.first, arguments.first + arguments.runs)
+        ]
+    identical = sum(same for same, *_ in results)
+    drops, timeouts, restarts = (sum(column) for column in list(zip(*results, strict=True))[1:])
+    print(
+        f"\n{identical} of {len(results)} identical; {drops:,} drops, {timeouts:,} timeouts, {restarts:,} restarts; "
+        f"{time.monotonic() - started:.0f} s"
+    )
+    return 0 if identical == len(results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

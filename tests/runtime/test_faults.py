@@ -1,0 +1,293 @@
+"""Each fault on its own: what a live run does about it, that it says so, and that the recording repeats it."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from dataflow.graph import Graph, load_graph
+from dataflow.messages import Diagnostics
+from dataflow.recording import Recording
+from dataflow.runtime.chaos import plan_of
+from dataflow.runtime.execute import run
+from dataflow.runtime.keys import diagnostics_key
+from dataflow.runtime.reexecute import recorded_firings
+from dataflow.runtime.supervisor import RunFailed, RunReport
+from dataflow.runtime.verify import verify
+
+AGAIN = "restart: {max: 5, backoff: 20ms}"
+
+
+def graph_of(*operators: str) -> Graph:
+    """A graph for a live run, of operators given as YAML lines."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "robot.yaml"
+        path.write_text("\n  ".join(("graph: robot\nnamespace: test\noperators:", *operators)))
+        return load_graph(path, live=True)
+
+
+def robot(*operators: str, count: int = 100) -> Graph:
+    """A counter named `left` at 100 Hz, and operators after it."""
+    left = f"left: {{use: runtime_operators:Counter, params: {{count: {count}}}, live: {{{AGAIN}}}}}"
+    return graph_of(left, *operators)
+
+
+class Ran:
+    """A recorded live run, and what its recording says."""
+
+    def __init__(self, graph: Graph, path: Path, *faults: Mapping[str, Any], **options: Any) -> None:
+        self.path = path
+        plan = plan_of({"faults": list(faults)}, graph) if faults else None
+        self.report: RunReport = run(
+            graph, live=True, record=path, **{"placement": "host_each", "faults": plan} | options
+        )
+
+    def events(self, name: str) -> list[str]:
+        with Recording(self.path) as recording:
+            return [str(event.data["text"]) for event in recording.events() if event.name == name]
+
+    def kinds(self, operator: str) -> list[tuple[int, str]]:
+        with Recording(self.path) as recording:
+            return [(r.incarnation, r.kind) for r in recorded_firings(recording, operator)]
+
+    def numbers(self, stream: str) -> list[Sequence[float]]:
+        with Recording(self.path) as recording:
+            return [r.message.vectors[0].tolist() for r in recording.messages([stream])]
+
+    def states(self, operator: str) -> list[str]:
+        with Recording(self.path) as recording:
+            found = [r.message for r in recording.messages([diagnostics_key("test")])]
+        assert all(isinstance(m, Diagnostics) for m in found)
+        return [m.pairs(m.names.index(operator))["state"] for m in found]
+
+    def dropped(self, operator: str) -> dict[str, int]:
+        return {reason: n for _, reason, n in self.report.drops.get(operator, ())}
+
+    def is_repeated(self) -> bool:
+        return verify(self.path, placement="one_host").identical
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+SMOOTH = f"smooth: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{{AGAIN}}}}}"
+
+
+def test_a_crash_is_outlived_by_a_new_process_while_the_rest_goes_on(path: Path) -> None:
+    graph = robot(
+        SMOOTH,
+        "other: {use: faulty_operators:Fallback, inputs: {x: left/fast, other: smooth/mean}}",
+    )
+
+    ran = Ran(graph, path, {"kind": "kill", "operator": "smooth", "at": "300ms"})
+
+    assert ran.report.restarts == {"smooth": 1}
+    (event,) = ran.events("restart")
+    assert "host 'smooth' was killed by SIGKILL; started again in 0.02 s" in event
+    assert ran.events("restarted") == ["host 'smooth' is back"]
+    assert [i for i, kind in ran.kinds("smooth") if kind == "setup"] == [0, 1]
+    stale = [row[0] for row in ran.numbers("test/other/y")]
+    assert len(stale) == 100  # nobody else lost anything
+    assert stale[0] == stale[-1] == 0.0
+    assert 1.0 in stale  # and while it was away, its stream was marked
+    assert ran.is_repeated()
+
+
+def test_messages_of_a_producer_that_is_away_can_be_left_out(path: Path) -> None:
+    graph = robot(
+        SMOOTH,
+        "other: {use: faulty_operators:Fallback, inputs: {x: left/fast, other: smooth/mean}, live: {on_stale: drop}}",
+    )
+
+    ran = Ran(graph, path, {"kind": "kill", "operator": "smooth", "at": "300ms"})
+
+    rows = ran.numbers("test/other/y")
+    assert {row[1] for row in rows if row[0]} == {-1.0}  # marked, and none was given
+    assert any(row[0] for row in rows)
+    assert ran.is_repeated()
+
+
+def test_a_source_that_crashes_is_started_again_and_goes_on_from_where_time_is(path: Path) -> None:
+    ran = Ran(robot(SMOOTH, count=250), path, {"kind": "kill", "operator": "left", "at": "300ms"})
+
+    assert ran.report.restarts == {"left": 1}
+    numbers = [row[0] for row in ran.numbers("test/left/fast")]
+    assert numbers == sorted(set(numbers))
+    assert numbers[-1] == 249
+    assert 0 < len(numbers) < 250  # what was to be seen meanwhile was not
+    assert ran.is_repeated()
+
+
+def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+    ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
+
+    assert ran.report.restarts == {"smooth": 1}
+    assert "operator 'smooth' failed in fire at stamp" in ran.events("restart")[0]
+    assert not ran.events("restarted")
+    assert ran.is_repeated()
+
+
+def test_restarts_come_to_an_end_and_the_last_cause_is_named(path: Path) -> None:
+    graph = robot(
+        "doomed: {use: faulty_operators:Doomed, inputs: {x: left/fast}, live: {restart: {max: 2, backoff: 1ms}}}"
+    )
+
+    with pytest.raises(RunFailed, match=r"operator 'doomed' failed in fire .* no calibration") as caught:
+        Ran(graph, path)
+
+    assert caught.value.operator == "doomed"
+    with Recording(path) as recording:
+        assert recording.metadata["dataflow:outcome"]["outcome"].startswith("failed: operator 'doomed'")
+        outcomes = [r.outcome for r in recorded_firings(recording, "doomed") if r.kind == "fire"]
+    assert outcomes == ["error"] * 3
+
+
+HANGS = "bad: {{use: runtime_operators:Broken, params: {{how: hang}}, inputs: {{x: left/fast}}, live: {{{}}}}}"
+
+
+def test_an_operator_that_hangs_is_killed_at_its_deadline_and_started_again(path: Path) -> None:
+    ran = Ran(robot(HANGS.format(f"deadline: 200ms, {AGAIN}")), path)
+
+    assert ran.report.restarts == {"bad": 1}
+    (event,) = ran.events("restart")
+    assert "host 'bad' missed the deadline of 'bad': its firing at stamp 1200000000 has taken 0.2" in event
+    assert "(deadline 0.2 s)" in event
+    assert ran.is_repeated()
+
+
+def test_without_a_policy_a_hang_ends_the_run_and_names_operator_and_deadline(path: Path) -> None:
+    with pytest.raises(RunFailed, match=r"missed the deadline of 'bad'.*\(deadline 0.2 s\)") as caught:
+        Ran(robot(HANGS.format("deadline: 200ms")), path)
+
+    assert caught.value.operator == "bad"
+    with Recording(path) as recording:
+        assert recording.streams["test/bad/y"].count > 0
+
+
+def resident() -> float:
+    """MB that a host takes that does nothing much: more than this process's share is never needed."""
+    return psutil.Process().memory_info().rss / 1e6
+
+
+LEAK = {"kind": "leak", "operator": "smooth", "megabytes": 400, "at": "200ms"}
+
+
+def leaky(live: str) -> Graph:
+    limit = round(resident() + 200)
+    return robot(
+        f"smooth: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{memory: {limit}MB, {live}}}}}",
+        count=200,
+    )
+
+
+def test_a_host_that_leaks_past_its_limit_is_started_again(path: Path) -> None:
+    ran = Ran(leaky(AGAIN), path, LEAK)
+
+    assert ran.report.restarts == {"smooth": 1}
+    assert "MB of memory (limit " in ran.events("restart")[0]
+    assert ran.is_repeated()
+
+
+def test_without_a_policy_a_leak_ends_the_run_before_the_machine_does(path: Path) -> None:
+    with pytest.raises(RunFailed, match=r"host 'smooth' took \d+ MB of memory \(limit \d+ MB\)"):
+        Ran(leaky("restart: {max: 0}"), path, LEAK)
+
+
+def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> None:
+    graph = robot(
+        "slow: {use: runtime_operators:Smooth, inputs: {x: left/fast}, live: {queue: newest, size: 1}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
+        count=150,
+    )
+
+    ran = Ran(graph, path, {"kind": "slow", "operator": "slow", "by": "50ms", "for": "1s", "at": "200ms"})
+
+    assert ran.dropped("slow")["overflow"] > 20
+    assert ran.report.summaries["sum"]["count"] == 150
+    assert "dropping" in ran.states("slow")
+    assert ran.is_repeated()
+
+
+def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
+    graph = robot(SMOOTH, "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}", count=400)
+
+    ran = Ran(graph, path, {"kind": "stop", "operator": "left", "for": "2500ms", "at": "500ms"})
+
+    assert "silent" in ran.states("left")
+    assert "silent" in ran.states("sum")
+    assert ran.states("left")[-1] != "silent"
+    assert "silent" not in ran.states("smooth")  # its timer goes on
+    assert ran.is_repeated()
+
+
+def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None:
+    graph = robot(
+        "slow: {use: runtime_operators:Smooth, params: {sleep: 0.01}, inputs: {x: left/fast}, "
+        "live: {queue: newest, size: 4}}"
+    )
+
+    ran = Ran(graph, path, {"kind": "flood", "operator": "left", "factor": 50, "for": "300ms", "at": "300ms"})
+
+    assert len(ran.numbers("test/left/fast")) > 500
+    assert ran.dropped("slow")["overflow"] > 300
+    assert ran.is_repeated()
+
+
+def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(path: Path) -> None:
+    graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
+
+    ran = Ran(graph, path, {"kind": "jump", "operator": "left", "by": "300ms", "at": "500ms"})
+
+    assert (1, "reset") in ran.kinds("left")
+    assert (1, "reset") in ran.kinds("resets")
+    assert {row[0] for row in ran.numbers("test/resets/y")} == {0.0, 1.0}
+    (event,) = ran.events("clock_jump")
+    assert event.startswith("the clock of 'left' jumped back to ")
+    assert ran.is_repeated()
+
+
+def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
+    graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
+
+    ran = Ran(graph, path, {"kind": "jump", "operator": "left", "by": "10s", "back": False, "at": "500ms"})
+
+    assert {row[0] for row in ran.numbers("test/resets/y")} == {0.0}
+    assert len(ran.numbers("test/resets/y")) == 100
+    assert ran.is_repeated()
+
+
+def test_a_message_with_a_stamp_in_the_past_is_dropped_and_counted(path: Path) -> None:
+    ran = Ran(robot(SMOOTH), path, {"kind": "past", "operator": "left", "by": "200ms", "every": "200ms"})
+
+    assert ran.dropped("left")["past"] >= 1
+    assert len(ran.numbers("test/left/fast")) == 100
+    assert not ran.events("clock_jump")
+    assert ran.is_repeated()
+
+
+def test_a_malformed_message_on_a_key_is_dropped_and_counted(path: Path) -> None:
+    ran = Ran(robot(SMOOTH), path, {"kind": "malformed", "operator": "left", "at": "300ms"})
+
+    assert ran.report.transport["smooth"]["malformed"] >= 1
+    assert len(ran.numbers("test/left/fast")) == 100
+    assert ran.is_repeated()
+
+
+def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
+    graph = graph_of(
+        f"device: {{use: faulty_operators:Device, live: {{{AGAIN}}}}}",
+        f"resets: {{use: faulty_operators:Resets, inputs: {{x: device/count}}, live: {{{AGAIN}}}}}",
+    )
+
+    ran = Ran(graph, path, {"kind": "kill", "operator": "device", "at": "300ms"})
+
+    assert ran.report.restarts == {"device": 1}
+    assert [i for i, kind in ran.kinds("device") if kind == "setup"] == [0, 1]
+    assert ran.is_repeated()

@@ -1,0 +1,273 @@
+"""Faults outside the operators: a full disk, a viewer that dies, a link between two hosts that breaks."""
+
+from __future__ import annotations
+
+import os
+import resource
+import select
+import shutil
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dataflow.graph import Graph, load_graph
+from dataflow.recording import Recording
+from dataflow.runtime.attach import find_running
+from dataflow.runtime.execute import run
+from dataflow.runtime.plan import RunPlan
+from dataflow.runtime.supervisor import RunReport, Supervisor
+from dataflow.runtime.verify import verify
+
+HERE = Path(__file__).resolve().parent
+
+GRAPH = """\
+graph: outside
+namespace: test
+network: {shared_memory: false}
+operators:
+  left: {use: "SOURCE", params: {count: COUNT}}
+  smooth: {use: runtime_operators:Smooth, inputs: {x: left/fast}}
+  sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}
+"""
+
+
+@pytest.fixture(autouse=True)
+def _registry_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+
+
+def graph_file(folder: Path, *, count: int, source: str = "runtime_operators:Counter") -> Path:
+    path = folder / "outside.yaml"
+    path.write_text(GRAPH.replace("COUNT", str(count)).replace("SOURCE", source))
+    return path
+
+
+# A disk that is full
+
+RUN = ("run", "outside.yaml", "--live", "--record", "small/run.mcap")
+
+
+def check_full_disk(command: list[str], folder: Path, words: str, **options: Any) -> None:
+    """A recording that the disk does not take ends the run, says so, and holds what came before."""
+    done = subprocess.run(
+        [*command, sys.executable, "-m", "dataflow.cli.main", *RUN],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(HERE)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        **options,
+    )
+
+    assert done.returncode == 1, done.stderr
+    assert words in done.stderr
+    assert "run.mcap" in done.stderr
+    assert "Traceback" not in done.stdout
+
+
+def check_what_is_left(path: Path) -> None:
+    with Recording(path) as recording:
+        numbers = [float(r.message.vectors[0, 0]) for r in recording.messages(["test/left/fast"])]
+    assert numbers
+    assert numbers == list(range(len(numbers)))
+
+
+def test_a_recording_that_may_not_grow_ends_the_run_and_stays_readable(tmp_path: Path) -> None:
+    graph_file(tmp_path, count=3000, source="faulty_operators:Noise")
+    (tmp_path / "small").mkdir()
+
+    check_full_disk(
+        [],
+        tmp_path,
+        "File too large",
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (4_000_000, 4_000_000)),
+    )
+
+    check_what_is_left(tmp_path / "small" / "run.mcap")
+
+
+def _may_mount() -> bool:
+    """Whether a small file system of one's own can be had."""
+    if shutil.which("unshare") is None:
+        return False
+    tried = ["unshare", "-m", "sh", "-c", "mount -t tmpfs -o size=64k tmpfs /mnt"]
+    return subprocess.run(tried, capture_output=True, timeout=10).returncode == 0
+
+
+@pytest.mark.skipif(not _may_mount(), reason="needs the right to mount a file system (unshare -m, as root)")
+def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_path: Path) -> None:
+    graph_file(tmp_path, count=3000, source="faulty_operators:Noise")
+    (tmp_path / "small").mkdir()
+    mount = 'mount -t tmpfs -o size=4000k tmpfs small; "$@"; code=$?; cp small/run.mcap kept.mcap; exit $code'
+
+    check_full_disk(["unshare", "-m", "sh", "-c", mount, "sh"], tmp_path, "No space left on device")
+
+    check_what_is_left(tmp_path / "kept.mcap")
+
+
+# A viewer that dies
+
+
+class Background:
+    """A run on a thread of its own."""
+
+    def __init__(self, graph: Graph, **options: Any) -> None:
+        self.report: RunReport | None = None
+        self.thread = threading.Thread(target=self._run, args=(graph, options))
+        self.thread.start()
+
+    def _run(self, graph: Graph, options: dict[str, Any]) -> None:
+        self.report = run(graph, **options)
+
+    def end(self) -> RunReport:
+        self.thread.join(60)
+        assert self.report is not None
+        return self.report
+
+
+def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
+    graph = load_graph(graph_file(tmp_path, count=250), live=True)
+    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="host_each")
+    find_running("outside", wait=30)
+    viewer = subprocess.Popen(
+        [sys.executable, "-m", "dataflow.cli.main", "echo", "--json"],
+        env={**os.environ, "PYTHONPATH": str(HERE)},
+        stdout=subprocess.PIPE,
+    )
+    try:
+        assert viewer.stdout is not None
+        assert viewer.stdout.readline().startswith(b"{")  # it is attached and served
+    finally:
+        viewer.send_signal(signal.SIGKILL)
+        viewer.communicate(timeout=10)
+    report = running.end()
+
+    assert report.summaries["sum"]["count"] == 250
+    assert not report.restarts
+    assert verify(tmp_path / "run.mcap", placement="one_host").identical
+
+
+# A link that is lost
+
+
+class Link:
+    """A wire between two hosts, for a test to cut: a TCP proxy on loopback in front of `endpoint`."""
+
+    def __init__(self, endpoint: str) -> None:
+        address, _, port = endpoint.removeprefix("tcp/").rpartition(":")
+        self._to = (address, int(port))
+        self._server = socket.create_server(("127.0.0.1", 0))
+        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self.whole = True
+        self.carried = 0
+        self.cuts = 0
+        self._over = False
+        self._pairs: dict[socket.socket, socket.socket] = {}
+        self._thread = threading.Thread(target=self._carry, daemon=True)
+        self._thread.start()
+
+    def _carry(self) -> None:
+        while not self._over:
+            able, _, _ = select.select([self._server, *self._pairs], [], [], 0.02)
+            if not self.whole:
+                self._drop()
+            for end in able:
+                if end is self._server:
+                    self._accept()
+                elif end in self._pairs:
+                    self._pass(end)
+
+    def _accept(self) -> None:
+        near, _ = self._server.accept()
+        if not self.whole:
+            near.close()
+            return
+        far = socket.create_connection(self._to, timeout=5)
+        self._pairs |= {near: far, far: near}
+
+    def _pass(self, end: socket.socket) -> None:
+        try:
+            data = end.recv(1 << 16)
+            if data:
+                self._pairs[end].sendall(data)
+                self.carried += len(data)
+                return
+        except OSError:
+            pass  # either end is gone: so is the connection
+        self._close(end)
+
+    def _close(self, end: socket.socket) -> None:
+        for each in (end, self._pairs.pop(end)):
+            self._pairs.pop(each, None)
+            each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset, as a lost peer is
+            each.close()
+
+    def _drop(self) -> None:
+        while self._pairs:
+            self.cuts += 1
+            self._close(next(iter(self._pairs)))
+
+    def end(self) -> None:
+        self._over = True
+        self._thread.join(5)
+        self.whole = False
+        self._drop()
+        self._server.close()
+
+
+@pytest.fixture
+def links() -> Iterator[list[Link]]:
+    made: list[Link] = []
+    yield made
+    for link in made:
+        link.end()
+
+
+def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor_the_proof(
+    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link from `left` to `smooth` is cut for half a second; everything else stays connected."""
+    spawn = Supervisor._spawn
+
+    def through_a_link(self: Supervisor, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]) -> None:
+        if label == "smooth":
+            links.extend(Link(endpoint) for endpoint in config["connect"])
+            config = {**config, "connect": [link.endpoint for link in links]}
+        spawn(self, label, nodes, kind, config)
+
+    monkeypatch.setattr(Supervisor, "_spawn", through_a_link)
+    graph = load_graph(graph_file(tmp_path, count=300), live=True)
+    supervisor = Supervisor(RunPlan(graph, live=True, placement="host_each", record=tmp_path / "run.mcap"))
+    reports: list[RunReport] = []
+    thread = threading.Thread(target=lambda: reports.append(supervisor.run()))
+    thread.start()
+    try:
+        find_running("outside", wait=30)
+        time.sleep(0.5)
+        for link in links:
+            link.whole = False
+        time.sleep(0.5)
+        for link in links:
+            link.whole = True
+    finally:
+        thread.join(60)
+
+    (report,) = reports
+    assert sum(link.cuts for link in links) >= 1
+    assert report.summaries["sum"]["count"] == 300  # whose link was whole
+    with Recording(tmp_path / "run.mcap") as recording:
+        gaps = [event.data for event in recording.events() if event.name == "gap"]
+    assert [(gap["stream"], gap["taker"]) for gap in gaps] == [("test/left/fast", "smooth")]
+    (gap,) = gaps
+    assert 0 < gap["following"] - gap["first"] < 299  # it came back
+    verified = verify(tmp_path / "run.mcap", graph=graph, placement="one_host")
+    assert verified.identical, verified.as_json()
