@@ -2,8 +2,8 @@
 
 usage: python benchmarks/chaos.py [--runs 50] [--first 1] [--duration 8s]
 
-Every run: graphs/chaos/robot.yaml live, in one host or a host each by turns, with the faults of graphs/chaos/plan.yaml.
-Then `verify` of its recording, placed the other way. Prints a row per run and a summary; exit code 1 unless all are
+Every run: graphs/chaos/robot.yaml live with cameras at 20 Hz, in one host or a host each by turns, with the faults of
+benchmarks/chaos_plan.yaml, another seed each. Then `verify` of its recording, placed the other way. Prints a row per run and a summary; exit code 1 unless all are
 identical.
 """
 
@@ -21,13 +21,17 @@ from dataflow.runtime.execute import run
 from dataflow.runtime.verify import verify
 
 ROOT = Path(__file__).resolve().parent.parent
-GRAPH, PLAN = ROOT / "graphs" / "chaos" / "robot.yaml", ROOT / "graphs" / "chaos" / "plan.yaml"
+GRAPH, PLAN = ROOT / "graphs" / "chaos" / "robot.yaml", ROOT / "benchmarks" / "chaos_plan.yaml"
+SETTINGS = (
+    "robot.color_camera={rate: 20, width: 160, height: 120, output: jpeg}",
+    "robot.depth_camera={rate: 20, output: png}",
+)
 COLUMNS = "seed  placement  faults  restarts  drops  timeouts  messages  verdict      x real time  limit"
 
 
 def one(seed: int, placement: str, duration: str, folder: Path) -> tuple[bool, int, int, int]:
     """Runs and verifies; prints the row. Returns whether it is identical, drops, timeouts and restarts."""
-    graph = load_graph(GRAPH, settings=[f"duration={duration}"], live=True)
+    graph = load_graph(GRAPH, settings=[f"duration={duration}", *SETTINGS], live=True)
     path = folder / f"{seed}.mcap"
     report = run(
         graph, live=True, placement=placement, record=path, overwrite=True, faults=load_plan(PLAN, graph, seed=seed)

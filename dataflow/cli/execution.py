@@ -158,7 +158,7 @@ def run(
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
-      dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml --record r.mcap
+      dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
     from dataflow.graph import load_graph
     from dataflow.runtime.chaos import load_plan

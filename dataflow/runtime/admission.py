@@ -237,6 +237,7 @@ class LiveRunner(OperatorRunner):
             if self.restarts.due_in() > 0:
                 return False
             self._start_again()
+        self._skip_old_ticks()
         if super().step():
             return True
         while not self.ended:
@@ -245,9 +246,17 @@ class LiveRunner(OperatorRunner):
                 self._admit(*taken)
             elif not self._give_up():
                 return False
+            self._skip_old_ticks()
             if super().step():
                 return True
         return False
+
+    def _skip_old_ticks(self) -> None:
+        """Of the ticks that came due while the operator was busy, only the newest are made up for, as many as its queue
+        holds; without this a slow operator would fall behind for ever."""
+        if self.node.every is not None and self.queue.policy != "block" and not self.ended:
+            patience = max((wait for wait in self.node.live.wait.values() if wait is not None), default=0)
+            self.aligner.skip_ticks(self._event_time() - patience - self.queue.size * self.node.every)
 
     def next_due(self) -> float | None:
         """Seconds until a decision need not wait any longer; None when nothing waits for the clock."""
@@ -286,7 +295,8 @@ class LiveRunner(OperatorRunner):
             case "slow":
                 self._delay = (fields["by"], self._clock() + fields["span"])
             case "leak":
-                self._leaked.append(bytearray(os.urandom(1 << 20) * fields["megabytes"]))
+                noise = os.urandom(1 << 20)
+                self._leaked += [bytearray(noise) for _ in range(fields["megabytes"])]  # others get a turn in between
 
     def _fire(self, firing: Firing) -> None:
         if self.absent:

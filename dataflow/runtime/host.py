@@ -34,6 +34,7 @@ from dataflow.runtime.threads import limit_threads
 from dataflow.runtime.watchdog import Watchdog
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode, encode
+from dataflow.transport.bus import BusError
 from dataflow.transport.keys import runtime_key
 
 IDLE_WAIT = 0.1
@@ -493,6 +494,8 @@ class Host:
 
     def _step_all(self) -> bool:
         """One step of every operator, last ones first, so that what is under way is done before more is begun."""
+        if self.config.live and not self._released:
+            return False  # a host that was started again is sent messages before it is told what time it is
         worked = False
         for runner in reversed(self.runners):
             worked = runner.step() or worked
@@ -818,6 +821,9 @@ class Host:
             if isinstance(feed, LogFeed):
                 feed.close()
         self.taps.close()
-        self.bus.close()
+        try:
+            self.bus.close()
+        except BusError as error:  # a neighbour that hangs takes no leave; everything that was to be done is done
+            print(f"host {self.config.label!r} leaves the network unheard: {error}", file=sys.stderr)
         if first is not None:
             raise first

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
 import msgpack
 
 from dataflow.transport import Bus, NetworkConfig
+from dataflow.transport.bus import BusError
 from dataflow.transport.keys import runtime_key
 from dataflow.transport.registry import RunningGraph
 
 AGAIN_AFTER = 0.05
 """Seconds until a host that is not there (yet, or again) is asked once more."""
+CLOSE_WITHIN = 0.5
 
 
 class NoAnswer(LookupError):
@@ -103,8 +106,18 @@ class Hosts:
             time.sleep(AGAIN_AFTER)
 
 
-@contextmanager
+@contextlib.contextmanager
 def hosts_of(found: RunningGraph) -> Iterator[Hosts]:
     """A connection to the hosts of a running graph, which are reached one after the other from now on."""
-    with Bus(NetworkConfig(connect=found.endpoints)) as bus:
+    bus = Bus(NetworkConfig(connect=found.endpoints))
+    try:
         yield Hosts(bus, found.namespace)
+    finally:
+        closing = threading.Thread(target=_close, args=(bus,), daemon=True)
+        closing.start()
+        closing.join(CLOSE_WITHIN)
+
+
+def _close(bus: Bus) -> None:
+    with contextlib.suppress(BusError):  # a host that is stopped does not take leave; who asked need not wait for it
+        bus.close()

@@ -174,6 +174,16 @@ class Aligner:
             if not lane.state.static and frontier > lane.frontier:
                 lane.frontier = frontier
 
+    def skip_ticks(self, stamp: int) -> None:
+        """Drops the ticks before `stamp` that are not decided yet, as overflow. Live only."""
+        ticks = self._ticks
+        if ticks is None or self._finished:
+            return
+        self._settle()
+        if ticks.confirmed and ticks.stamp < stamp:
+            for skipped in ticks.skip(stamp):
+                self._drop_log.tick(skipped, "overflow", "")
+
     def waiting(self) -> Waiting | None:
         """The first undecided stamp and what it waits for; None if the next message decides.
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 FiringKind = Literal["fire", "tick", "finish"]
-DropReason = Literal["unmatched", "no_sample", "stale", "unused", "late"]
+DropReason = Literal["unmatched", "no_sample", "stale", "unused", "late", "overflow"]
 
 TICK = "@tick"
 """The input named by the drop of a tick, which belongs to no declared input."""

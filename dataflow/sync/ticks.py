@@ -50,6 +50,12 @@ class Ticks:
         self._next = self.stamp = self._grid_from(stamp)
         self.started = True
 
+    def skip(self, stamp: int) -> range:
+        """Leaves out the ticks from the next one, which is confirmed, to `stamp`; they are what it returns."""
+        skipped = range(self.stamp, min(stamp, self.reach + 1), self._period)
+        self.begin_at(skipped.stop)
+        return skipped
+
     def needs(self) -> dict[str, int]:
         """The frontiers with which `stamp` would be decided to be a tick, or not."""
         if self.confirmed:

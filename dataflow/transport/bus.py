@@ -31,7 +31,7 @@ from dataflow.transport.shared import (
     machine,
 )
 
-CLOSE_WITHIN = 5.0
+CLOSE_WITHIN = 20.0
 MAPPED_WITHIN = 1.0
 
 Receive = Callable[[Buffer], object]

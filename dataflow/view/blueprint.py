@@ -13,7 +13,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
 from dataflow.view.canvas import TIMELINE, Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
-from dataflow.view.scene import FRAMES, SCENE, VIEWER_LOG, Outlook, entity_of
+from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, entity_of
 
 _BACKGROUND = (24, 27, 33)
 _PLOT_SECONDS = 10.0
@@ -85,7 +85,7 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
         eye = rrb.EyeControls3D(position=outlook.position, look_target=outlook.target, eye_up=outlook.up)
     return rrb.Spatial3DView(
         origin=SCENE,
-        contents=[f"+ {SCENE}/**", f"+ {FRAMES}/**", *contents],
+        contents=[f"+ {SCENE}/**", *contents],
         name="World",
         background=_BACKGROUND,
         eye_controls=eye,

@@ -233,7 +233,7 @@ class SceneState:
             lower, upper = np.percentile(np.concatenate(self._around), [3, 97], axis=0)
             middle = (lower + upper) / 2
             size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
-            return Outlook(up, middle - level * (1.05 * size) + up * (1.15 * size) + side * (0.4 * size), middle)
+            return Outlook(up, middle - level * (0.97 * size) + up * (1.05 * size) + side * (0.4 * size), middle)
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
 

@@ -2,5 +2,6 @@
 
 from operators.detection.custom_detector import CustomDetector
 from operators.detection.onnx_detector import OnnxDetector
+from operators.detection.score_filter import ScoreFilter
 
-__all__ = ["CustomDetector", "OnnxDetector"]
+__all__ = ["CustomDetector", "OnnxDetector", "ScoreFilter"]

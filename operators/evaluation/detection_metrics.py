@@ -75,6 +75,10 @@ class DetectionMetrics(Operator):
         self._known.update(detections.class_names)
         self._detections[detections.stamp] = _objects(detections, np.zeros(detections.count, np.bool_))
 
+    def on_reset(self, input: str) -> None:
+        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
+        self.setup()
+
     def finish(self) -> None:
         """Computes the figures and writes the file."""
         frames = self._frames()

@@ -52,6 +52,10 @@ class SegmentationMetrics(Operator):
         self._known.update(segmentation.class_names)
         self._count(self._pairing.settle(segmentation.stamp - self.lateness))
 
+    def on_reset(self, input: str) -> None:
+        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
+        self.setup()
+
     def finish(self) -> None:
         """Computes the figures and writes the file."""
         self._count(self._pairing.finish())

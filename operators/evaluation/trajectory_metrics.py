@@ -58,6 +58,10 @@ class TrajectoryMetrics(Operator):
         else:
             self._not_finite += 1
 
+    def on_reset(self, input: str) -> None:
+        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
+        self.setup()
+
     def finish(self) -> None:
         """Computes the figures and writes the files."""
         matches = match(self._estimate, self._truth, self.tolerance)

@@ -1,4 +1,4 @@
-"""What the README tells people to type can be typed, in its order: values parse, files are there, settings and streams exist."""
+"""Every command line of the README names a command, options and files that there are (or that it would make)."""
 
 from __future__ import annotations
 
@@ -111,5 +111,5 @@ def test_streams_that_are_followed_belong_to_the_graph_that_was_started(quoted: 
     "line", ["replay a.mcap --rate fast", "replay", "run graphs/simulated_robot.yaml --sideways", "train pilot DATA"]
 )
 def test_a_command_that_cannot_be_typed_is_found(line: str) -> None:
-    with pytest.raises(Exception, match=r"(?i)fast|missing|sideways|pilot"):
+    with pytest.raises(Exception, match=r"(?i)number|missing|sideways|pilot"):
         parsed(line.split())

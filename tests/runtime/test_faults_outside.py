@@ -188,11 +188,14 @@ class Link:
 
     def _accept(self) -> None:
         near, _ = self._server.accept()
-        if not self.whole:
+        try:
+            if not self.whole:
+                raise ConnectionError("the wire is cut")
+            far = socket.create_connection(self._to, timeout=5)
+        except OSError:  # nobody is there (any more)
             near.close()
-            return
-        far = socket.create_connection(self._to, timeout=5)
-        self._pairs |= {near: far, far: near}
+        else:
+            self._pairs |= {near: far, far: near}
 
     def _pass(self, end: socket.socket) -> None:
         try:

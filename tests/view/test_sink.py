@@ -36,6 +36,8 @@ from dataflow.view import (
     parse_target,
     visualizer,
 )
+from dataflow.view.frames import Rank
+from dataflow.view.scene import SceneState
 from dataflow.view.sink import Bounds
 
 STAMP = 1_700_000_000_000_000_000
@@ -198,6 +200,42 @@ def test_the_viewer_finds_out_which_way_is_up(optical_world: bool, tmp_path: Pat
     assert up == ([3, 2, 5] if optical_world else [3, 5, 1])  # right, down, forward; or right, forward, up
     (eye,) = [row.values[0] for row in blueprint_rows(path) if row.component == "EyeControls3D:position"]
     assert (eye[1] < 0 and eye[2] < 0) if optical_world else (eye[2] > 0 and eye[0] < 0)  # above and behind
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_a_stream_gets_its_view_with_its_first_message(late: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    pixels = np.zeros((4, 4, 3), np.uint8)
+    with ViewerSink(Save(path)) as sink:
+        sink.open({"r/front/image": Image, "r/rear/image": Image})
+        for t in range(4):
+            sink.log("r/front/image", Image(stamp=STAMP + t * SECOND, frame="front", data=pixels))
+        if late:
+            sink.log("r/rear/image", Image(stamp=STAMP + 4 * SECOND, frame="rear", data=pixels))
+    named = {row.values[0] for row in blueprint_rows(path) if row.component == "ViewBlueprint:display_name"}
+    assert "front/image" in named
+    assert ("rear/image" in named) == late
+
+
+def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
+    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    room = np.column_stack([3 + 5 * np.cos(turn), 4 * np.sin(turn), np.linspace(-0.5, 2, 64)])
+    ahead = np.abs(room)
+    around, before = SceneState(), SceneState()
+    for scene, points in ((around, room - [1, 0, 0]), (before, ahead)):
+        scene.tree.place("world", "lidar", np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
+                         owner="r/base", rank=Rank.TREE, stamp=0)  # fmt: skip
+        scene.saw_points("lidar", points)
+
+    looked = around.outlook()
+    assert looked.position is not None
+    assert looked.target is not None
+    assert np.allclose(looked.target[:2], [3, 0], atol=0.3)  # the middle of the room, in the world
+    assert looked.position[2] > 4
+    assert np.linalg.norm(looked.position - looked.target) > 5
+    nearer = before.outlook().position
+    assert nearer is not None
+    assert nearer[2] < looked.position[2]
 
 
 def test_hidden_and_unknown_streams_are_passed_over(tmp_path: Path) -> None:
