@@ -99,9 +99,12 @@ def _wait(tree: Tree, default: int | None, fields: Fields) -> int | None:
 def default_wait(spec: OperatorSpec, port: InputPort, devices: bool) -> int | None:
     """How long (ns) a live decision waits for an input; None, for ever, where every source upstream can wait.
 
-    Fed by a device: 0 for Sampled and Batch and for a single trigger, `JOIN_WAIT` for joined and merged triggers.
+    Fed by a device: 0 for Sampled and Batch and for a single trigger, `JOIN_WAIT` for joined and merged triggers, and
+    for a trigger beside a timer the timer's period, if that is less: else a tick would shut out messages of its stamp.
     """
     if not devices:
         return None
+    if spec.every is not None and port.kind == "in":
+        return min(JOIN_WAIT, spec.every)
     joined = port.kind == "in" and (len(spec.triggers) > 1 or port.many)
     return JOIN_WAIT if joined else 0

@@ -32,6 +32,10 @@ HANG = 3600.0
 """Seconds that a planned hang lasts, unless somebody ends it."""
 
 
+OWN_CLOCK = 1_000_000_000
+"""A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
+
+
 class _Arrival(NamedTuple):
     """One thing that a stream said: a message, a frontier or its end."""
 
@@ -209,6 +213,8 @@ class LiveRunner(OperatorRunner):
             if entry.incarnation > incarnation and entry.stamp <= last and not self.ended:
                 self._reset(stream, entry.stamp)
             self._seen[stream] = (entry.incarnation, entry.stamp)
+            if self._newest == NEVER and abs(entry.stamp - self._event_time()) > OWN_CLOCK:
+                self._shift = entry.stamp - self._event_clock()  # a device whose clock is not this machine's
             self._newest = max(self._newest, entry.stamp)
         if self.restarts.pending:
             self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away

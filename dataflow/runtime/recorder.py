@@ -35,6 +35,8 @@ class RecorderSink:
         self._ends: dict[str, dict[str, Any]] = {}
         self.messages = 0
         self._diagnosed = 0
+        self._clock = 0
+        self._early: list[tuple[str, bytes]] = []
         for stream in streams:
             types = stream_types(graph, stream)
             if len(types) == 1:
@@ -47,13 +49,26 @@ class RecorderSink:
         self._added.add(stream)
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
+        if message.stamp > 0:
+            self._clock = message.stamp
+            self._write_early()
         if stream not in self._added:
             self._add(stream, type(message))
         self.messages += 1
         self.writer.write(stream, message, seq=seq, incarnation=incarnation)
 
     def firings(self, operator: str, stamp: int, payload: bytes) -> None:
-        self.writer.write_firings(operator, stamp, payload)
+        """`setup()` has no stamp; its record is stored at the stamp of the first message, so that viewers of the file
+        show no long nothing before it."""
+        if stamp > 0 or self._clock > 0:
+            self.writer.write_firings(operator, stamp if stamp > 0 else self._clock, payload)
+        else:
+            self._early.append((operator, payload))
+
+    def _write_early(self) -> None:
+        early, self._early = self._early, []
+        for operator, payload in early:
+            self.writer.write_firings(operator, max(self._clock, 0), payload)
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._ends[stream] = {"final": final_stamp, "reason": reason}
@@ -73,6 +88,7 @@ class RecorderSink:
         self.writer.flush()
 
     def close(self, outcome: str) -> Mapping[str, Any]:
+        self._write_early()
         self.writer.flush()  # an outcome is said of what is there already
         self.writer.add_metadata(ENDS, {stream: json.dumps(end) for stream, end in sorted(self._ends.items())})
         self.writer.add_metadata(OUTCOME, {"outcome": outcome})
