@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.recording import Recording
     from dataflow.runtime.execute import Watch
-    from dataflow.runtime.supervisor import RunReport
+    from dataflow.runtime.report import RunReport
 
 _PLACEMENT, _OUTPUT = "Placement", "Results"
 
@@ -378,7 +378,7 @@ def _execute(
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.report import print_report, report_json
     from dataflow.cli.viewing import attached_viewer, open_saved
-    from dataflow.runtime.supervisor import RunFailed
+    from dataflow.runtime.report import RunFailed
 
     before = {file: _written(file) for file in (outputs.record, outputs.view_file) if file is not None}
     display = RunDisplay(err, sources=[node.name for node in graph.sources()], span=shown_span)

@@ -107,7 +107,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.recording import RecordingError
     from dataflow.runtime.attach import NotRunning
     from dataflow.runtime.replay import ReplayError
-    from dataflow.runtime.supervisor import RunFailed
+    from dataflow.runtime.report import RunFailed
     from dataflow.transport.registry import RegistryError
 
     known = (

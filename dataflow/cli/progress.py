@@ -14,7 +14,7 @@ from rich.text import Text
 
 from dataflow.cli.output import count, seconds
 from dataflow.runtime.execute import Watch
-from dataflow.runtime.supervisor import OperatorCounts, Status
+from dataflow.runtime.report import OperatorCounts, Status
 from dataflow.sync import FOREVER, NEVER
 
 RATE_OVER = 0.8

@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import IO, Any
 
 from dataflow.runtime.control import Channel, ChannelClosed, ready
-from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.report import RunFailed
 from dataflow.runtime.threads import environment
 
 Tell = Callable[[Mapping[str, Any]], None]

@@ -25,7 +25,7 @@ from dataflow.runtime.recompute import Feeding, Recomputation
 from dataflow.runtime.recorder import ENDS, OUTCOME, RecorderSink
 from dataflow.runtime.reexecute import Verification
 from dataflow.runtime.replay import ReplayError, plan_replay, recorded_graph
-from dataflow.runtime.supervisor import OperatorCounts, Status
+from dataflow.runtime.report import OperatorCounts, Status
 from dataflow.runtime.verify import require_records
 from dataflow.sync import Entry
 

@@ -15,9 +15,11 @@ from typing import Any
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
+from dataflow.runtime.live import supervisor_of
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.replay import graph_metadata, plan_replay, recorded_graph
-from dataflow.runtime.supervisor import RunReport, Status, Supervisor
+from dataflow.runtime.report import RunReport, Status
+from dataflow.runtime.supervisor import Supervisor
 from dataflow.runtime.threads import environment
 
 Watch = Callable[[Status], None]
@@ -55,7 +57,7 @@ def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunRepor
             file.parent.mkdir(parents=True, exist_ok=True)
     if plan.record is not None:
         plan = replace(plan, metadata=_metadata(plan, mode))
-    supervisor = Supervisor(plan)
+    supervisor = supervisor_of(plan)
     with _interrupts(supervisor.stop), _watching(supervisor, watch):
         return supervisor.run()
 

@@ -17,7 +17,7 @@ from dataflow.recording import RecordingError
 from dataflow.runtime.firings import FiringRecordError
 from dataflow.runtime.reexecute import Verification
 from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.report import RunFailed
 from dataflow.runtime.verify import VerifyReport
 
 FORMAT = 1

@@ -11,19 +11,14 @@ import signal
 import sys
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataflow.graph.model import Node, Restart
-from dataflow.runtime.chaos import Fault
 from dataflow.runtime.control import Channel, ChannelClosed, ready
-from dataflow.runtime.firings import WITHHELD, decode_batch
-from dataflow.runtime.health import Health, HealthMonitor, diagnostics_fields
-from dataflow.runtime.keys import firings_key
 from dataflow.runtime.nursery import Child, Nursery, NurseryFailed
-from dataflow.runtime.plan import HostPlan, RunPlan, expected_probes, host_plans
+from dataflow.runtime.plan import RunPlan, expected_probes, host_plans
+from dataflow.runtime.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.runtime.restarts import Restarts
 from dataflow.runtime.threads import environment
 from dataflow.sync import FOREVER, NEVER
@@ -32,10 +27,6 @@ from dataflow.transport.network import Reservation
 
 TICK = 0.05
 QUIET = 0.3
-DIAGNOSE_EVERY = 1.0
-HELD_RECORDS = 4096
-EDGES_WITHIN = 5.0
-BEAT_WITHIN = 3.0
 LEAVE_TIMEOUT = 10.0
 LEAVE_AT_ONCE = 1.0
 CLOSE_TIMEOUT = 60.0
@@ -43,89 +34,10 @@ CLOSE_TIMEOUT = 60.0
 MAX_WINDOW_DOUBLINGS = 12
 
 
-@dataclass(frozen=True, slots=True)
-class OperatorCounts:
-    """Progress of one operator: counts so far, nanoseconds of work, and the stamp it has reached."""
-
-    firings: int = 0
-    emitted: int = 0
-    dropped: int = 0
-    busy_ns: int = 0
-    done: int = NEVER
-
-    def after(self, base: OperatorCounts) -> OperatorCounts:
-        """These counts and those of the process before."""
-        return OperatorCounts(
-            self.firings + base.firings,
-            self.emitted + base.emitted,
-            self.dropped + base.dropped,
-            self.busy_ns + base.busy_ns,
-            self.done,
-        )
-
-
 @dataclass(slots=True)
-class Status:
-    """What a progress display needs; updated in place while the graph runs."""
+class Supervised:
+    """One process, as its supervisor sees it."""
 
-    phase: str = "starting"
-    started: float = 0.0
-    operators: dict[str, OperatorCounts] = field(default_factory=dict)
-    host_of: dict[str, str] = field(default_factory=dict)
-    first: int | None = None
-    steps: int | None = None
-    notes: list[str] = field(default_factory=list)
-    health: list[Health] = field(default_factory=list)
-    restarts: dict[str, int] = field(default_factory=dict)
-
-    @property
-    def covered(self) -> int:
-        return min((c.done for c in self.operators.values()), default=NEVER)
-
-
-@dataclass(frozen=True, slots=True)
-class RunReport:
-    """What a run came to.
-
-    `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples;
-    `summaries` holds what metrics sinks report; `wall` is in seconds from the release of the sources; `restarts` counts
-    by operator.
-    """
-
-    graph: str
-    streams: Mapping[str, tuple[int, str]]
-    operators: Mapping[str, OperatorCounts]
-    drops: Mapping[str, tuple[tuple[str, str, int], ...]]
-    summaries: Mapping[str, Mapping[str, Any]]
-    transport: Mapping[str, Mapping[str, int]]
-    files: Mapping[str, Mapping[str, Any]]
-    verifications: tuple[Mapping[str, Any], ...]
-    first: int | None
-    last: int | None
-    wall: float
-    interrupted: bool
-    notes: tuple[str, ...]
-    restarts: Mapping[str, int] = field(default_factory=dict)
-
-    def digests(self) -> dict[str, str]:
-        return {stream: digest for stream, (_, digest) in sorted(self.streams.items())}
-
-
-class RunFailed(RuntimeError):
-    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words.
-
-    `interrupted`: it was asked to end.
-    """
-
-    def __init__(
-        self, message: str, details: str = "", operator: str | None = None, *, interrupted: bool = False
-    ) -> None:
-        super().__init__(message)
-        self.details, self.operator, self.interrupted = details, operator, interrupted
-
-
-@dataclass(slots=True)
-class _Process:
     label: str
     nodes: tuple[str, ...]
     child: Child
@@ -171,7 +83,7 @@ class Supervisor:
         self.status = Status()
         self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
         self._plans = host_plans(plan)
-        self._processes: dict[str, _Process] = {}
+        self._processes: dict[str, Supervised] = {}
         self._covered = NEVER
         self._heard = time.monotonic()
         self._round = 0
@@ -184,16 +96,7 @@ class Supervisor:
         self._nursery: Nursery | None = None
         self._reserved: Reservation | None = None
         self._endpoints: dict[str, str] = {}
-        self._records: dict[str, deque[bytes]] = {}
-        self._base: dict[str, OperatorCounts] = {}
-        self._away: dict[str, str] = {}
-        self._ended_streams: dict[str, str] = {}
-        self._restarted = False
         self._released: dict[str, Any] = {}
-        self._monitor = HealthMonitor()
-        self._diagnose_due = 0.0
-        self._next_fault = next(plan.faults, None) if plan.faults is not None else None
-        self._thaws: list[tuple[float, _Process]] = []
 
     def stop(self) -> None:
         """Asks for an orderly end: sources stop, everything drains. A second call ends at once."""
@@ -289,13 +192,13 @@ class Supervisor:
     def _spawn(self, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]) -> None:
         assert self._nursery is not None
         child = self._nursery.spawn()
-        spawned = _Process(label, nodes, child, config, kind)
+        spawned = Supervised(label, nodes, child, config, kind)
         self._processes[label] = spawned
         spawned.reader = threading.Thread(target=self._read_words, args=(spawned,), daemon=True)
         spawned.reader.start()
         self._send(spawned, kind, **config)
 
-    def _read_words(self, process: _Process) -> None:
+    def _read_words(self, process: Supervised) -> None:
         for text in process.child.lines(process.over):
             process.words.append(text)
             del process.words[:-50]
@@ -346,8 +249,7 @@ class Supervisor:
     def _watch(self) -> None:
         while not all(p.report is not None for p in self._processes.values()):
             self._receive(TICK)
-            if self.plan.live:
-                self._watch_live()
+            self._watch_more()
             if self._stop_asked and not self._stop_sent:
                 self._stop_sent = True
                 self.status.phase = "stopping"
@@ -357,196 +259,19 @@ class Supervisor:
             quiet = time.monotonic() - self._heard
             if quiet > self.plan.stall_timeout:
                 self._fail_stalled()
-            if quiet > QUIET and not self._restarted:
+            if quiet > QUIET and self._counts_agree():
                 self._poll_quiescence()
 
-    def _watch_live(self) -> None:
-        """What only a live run needs: restarts, heartbeats, planned faults, diagnostics."""
-        now = time.monotonic()
-        for process in list(self._processes.values()):
-            if process.rejoining is not None:
-                self._rejoin(process, now)
-            elif process.gone and process.restarts is not None and process.restarts.pending:
-                if process.restarts.due_in() <= 0 and not self._stop_asked:
-                    self._respawn(process)
-                elif self._stop_asked:
-                    raise RunFailed(f"interrupted while {process.describe()} was to be started again", interrupted=True)
-            elif (
-                process.beat is not None
-                and self.plan.live
-                and now - process.beat > BEAT_WITHIN
-                and process.report is None
-                and not process.gone
-                and self._may_restart(process)
-            ):
-                self._kill(process, f"gave no sign of life for {now - process.beat:.1f} s")
-        self._do_faults(now)
-        if now >= self._diagnose_due:
-            self._diagnose_due = now + DIAGNOSE_EVERY
-            self._diagnose(now)
+    def _watch_more(self) -> None:
+        """What else is to be done every now and then while the graph runs; nothing, unless the run is live."""
 
-    def _diagnose(self, now: float) -> None:
-        counts = {
-            name: (c.firings, c.emitted, c.dropped, c.busy_ns, c.done)
-            for name, c in self.status.operators.items()
-            if not name.startswith("@")
-        }
-        ended = frozenset(n for p in self._processes.values() if p.report is not None for n in p.nodes)
-        self.status.health = self._monitor.update(
-            counts, now, away=self._away, ended=ended, restarts=self.status.restarts
-        )
-        self._tell_recorder("diagnostics", **diagnostics_fields(self.status.health, self._event_time()))
-
-    def _event_time(self) -> int:
-        """Event time now, as far as the supervisor can tell."""
-        first = self.status.first
-        if first is None:
-            return time.time_ns()
-        since = time.time() - float(self._released["at"])
-        return first + round(since * 1e9 * (self.plan.rate or 1.0))
-
-    def _tell_recorder(self, kind: str, /, **fields: Any) -> None:
-        for process in self._processes.values():
-            if process.kind == "sink" and process.config["kind"] == "record":
-                self._send(process, kind, **fields)
-
-    def _event(self, name: str, text: str, **data: Any) -> None:
-        """Something that the user and the recording must know."""
-        self.status.notes.append(text)
-        self._tell_recorder("event", name=name, stamp=self._event_time(), data={"text": text, **data})
-
-    # Planned faults
-
-    def _do_faults(self, now: float) -> None:
-        since = now - self._released_at
-        while self._next_fault is not None and self._next_fault.at <= since:
-            fault, self._next_fault = self._next_fault, next(self.plan.faults or iter(()), None)
-            self._do_fault(fault, now)
-        for due, process in list(self._thaws):
-            if now >= due:
-                self._thaws.remove((due, process))
-                process.child.signal(signal.SIGCONT)
-
-    def _do_fault(self, fault: Fault, now: float) -> None:
-        process = next(p for p in self._processes.values() if fault.operator in p.nodes)
-        if process.gone or not process.back or process.report is not None:
-            return  # it is away already
-        self._event(
-            "fault",
-            f"planned fault at {fault.at:.2f} s: {fault.kind} {fault.operator}",
-            kind=fault.kind,
-            operator=fault.operator,
-            fields=dict(fault.fields),
-        )
-        match fault.kind:
-            case "kill":
-                process.child.signal(signal.SIGKILL)
-            case "freeze":
-                process.child.signal(signal.SIGSTOP)
-                self._thaws.append((now + fault.fields["span"], process))
-            case _:
-                self._send(process, "fault", fault=fault.kind, operator=fault.operator, fields=dict(fault.fields))
-
-    # Restarts
-
-    def _may_restart(self, process: _Process) -> bool:
-        running = self.plan.live and self.status.phase == "running" and process.kind == "host"
-        policies = [self.plan.graph.nodes[n].live.restart for n in process.nodes]
-        return running and bool(policies) and min(p.max for p in policies) > 0
-
-    def _kill(self, process: _Process, cause: str) -> None:
-        if not process.cause:
-            process.cause = cause
-            process.child.kill()
-
-    def _plan_restart(self, process: _Process, how: str) -> bool:
-        """Notes that a host died and is to be started again; False where its policy does not allow it (any more)."""
-        if not self._may_restart(process):
-            return False
-        if process.restarts is None:
-            policies = [self.plan.graph.nodes[n].live.restart for n in process.nodes]
-            process.restarts = Restarts(
-                Restart(min(p.max for p in policies), max(p.backoff for p in policies)), time.monotonic
-            )
-        if not process.restarts.failed():
-            return False
-        self._restarted = True
-        process.back, process.rejoining = False, None
-        self._thaws = [(due, p) for due, p in self._thaws if p is not process]
-        pause = process.restarts.due_in()
-        for name in process.nodes:
-            self._away[name] = how
-            self.status.restarts[name] = self.status.restarts.get(name, 0) + 1
-            if name in self.status.operators:
-                self._base[name] = self.status.operators[name]
-        held = {n: list(self._records.get(n, ())) for n in process.nodes}
-        for batches in held.values():
-            self._tell_recorder("records", batches=batches)
-        self._tell_consumers(process, absent=True)
-        self._cover()
-        self._event(
-            "restart",
-            f"{process.describe()} {how}; started again in {pause:.2g} s",
-            operators=list(process.nodes),
-            cause=how,
-        )
+    def _counts_agree(self) -> bool:
+        """Whether what was sent and what was received can be compared."""
         return True
 
-    def _tell_consumers(self, process: _Process, *, absent: bool) -> None:
-        made = set(self._plans[process.label].publish)
-        for other in self._processes.values():
-            taken = made & _taken(self.plan, self._plans[other.label])
-            if other is process or not taken or other.gone:
-                continue
-            if other.kind == "host":
-                self._send(other, "absent", streams=sorted(taken), absent=absent)
-            elif not absent:
-                self._send(other, "expect", streams=sorted(taken))
-            if not absent:
-                other.unseen |= taken
-
-    def _respawn(self, old: _Process) -> None:
-        """A new process in the place of one that died: the same operators, streams and endpoint."""
-        assert old.restarts is not None
-        old.restarts.begun()
-        self._close_process(old)
-        resume = {
-            name: resumed(self._records.get(name, ()), self.plan.graph.nodes[name])
-            | {"restarts": self.status.restarts.get(name, 0)}
-            for name in old.nodes
-        }
-        self._spawn(old.label, old.nodes, old.kind, {**old.config, "resume": resume})
-        new = self._processes[old.label]
-        new.restarts, new.back, new.rejoining = old.restarts, False, time.monotonic()
-        new.done = dict(old.done)
-
-    def _rejoin(self, process: _Process, now: float) -> None:
-        """Lets a host that was started again take part once its edges are known to work."""
-        assert process.rejoining is not None
-        if process.gone:
-            return
-        consumers = [p for p in self._processes.values() if p is not process and not p.gone]
-        made = set(self._plans[process.label].publish)
-        if process.ready and not process.probing:
-            process.probing, process.rejoining = True, now
-            self._tell_consumers(process, absent=False)
-            self._send(process, "probe")
-            return
-        unproven = {s for p in consumers for s in p.unseen & made}
-        if process.probing and (not unproven or now - process.rejoining > EDGES_WITHIN):
-            if unproven:
-                self.status.notes.append(f"{process.describe()} goes on without: {', '.join(sorted(unproven))}")
-            taken = set(self._plans[process.label].subscribe)
-            self._send(process, "go", **self._released)
-            for reason in set(self._ended_streams.values()):
-                over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
-                self._send(process, "ended_elsewhere", streams=over, reason=reason)
-            process.rejoining, process.back, process.beat = None, True, None
-            for name in process.nodes:
-                self._away.pop(name, None)
-            self._event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
-        elif not process.probing and now - process.rejoining > self.plan.start_timeout:
-            self._kill(process, f"was not ready again within {self.plan.start_timeout:g} s")
+    def _outlives(self, process: Supervised, how: str) -> bool:
+        """Whether the run goes on although a process died."""
+        return False
 
     def _fail_stalled(self) -> None:
         """Names the hosts that do not answer and kills them: they could not leave in order."""
@@ -581,7 +306,7 @@ class Supervisor:
     def _awaiting(self) -> bool:
         return time.monotonic() - self._asked_at < 1.0
 
-    def _on_quiescence(self, processes: list[_Process]) -> None:
+    def _on_quiescence(self, processes: list[Supervised]) -> None:
         full = [p for p in processes if p.state is not None and p.state["full"]]
         if full and self._doublings < MAX_WINDOW_DOUBLINGS:
             self._doublings += 1
@@ -611,7 +336,7 @@ class Supervisor:
             else:
                 self._on_message(process, kind, fields)
 
-    def _on_message(self, process: _Process, kind: str, fields: dict[str, Any]) -> None:
+    def _on_message(self, process: Supervised, kind: str, fields: dict[str, Any]) -> None:
         match kind:
             case "joined":
                 process.joined = True
@@ -629,44 +354,9 @@ class Supervisor:
                 process.done |= fields["done"]
                 self._count(fields["counts"])
                 self._cover()
-            case "record":
-                held = self._records.setdefault(fields["operator"], deque(maxlen=HELD_RECORDS))
-                held.append(fields["data"])
             case "beat":
                 process.beat = time.monotonic()
                 process.work = fields["work"]
-                self._check_memory(process, fields["memory"])
-            case "overdue":
-                stamp, spent = fields["stamp"], fields["seconds"]
-                self._overdue(process, fields["operator"], f"its firing at stamp {stamp} has taken {spent:.2f} s")
-            case "restarting":
-                name = fields["operator"]
-                self.status.restarts[name] = self.status.restarts.get(name, 0) + 1
-                self._event(
-                    "restart",
-                    f"operator {name!r} failed in {fields['when']}: {fields['summary']}; "
-                    f"made anew in {fields['pause']:.2g} s",
-                    operators=[name],
-                    cause=fields["summary"],
-                )
-            case "gap":
-                stream, first, following = fields["stream"], fields["first"], fields["following"]
-                self._event(
-                    "gap",
-                    f"{process.label} did not get {stream} {first} to {following - 1}",
-                    taker=process.label,
-                    stream=stream,
-                    first=first,
-                    following=following,
-                )
-            case "stream_ended":
-                self._ended_streams[fields["stream"]] = fields["reason"]
-            case "jumped":
-                name, stamp = fields["operator"], fields["stamp"]
-                self._covered = NEVER
-                for other in self._processes.values():
-                    other.done = {n: min(f, stamp - 1) for n, f in other.done.items() if f != FOREVER}
-                self._event("clock_jump", f"the clock of {name!r} jumped back to {stamp}", operator=name, stamp=stamp)
             case "state":
                 process.state = fields
             case "ended":
@@ -689,24 +379,7 @@ class Supervisor:
 
     def _count(self, counts: Mapping[str, list[int]]) -> None:
         for name, values in counts.items():
-            now, base = OperatorCounts(*values), self._base.get(name)
-            self.status.operators[name] = now if base is None else now.after(base)
-
-    def _check_memory(self, process: _Process, taken: int) -> None:
-        limits = [m for n in process.nodes if (m := self.plan.graph.nodes[n].live.memory) is not None]
-        if limits and taken > min(limits):
-            cause = f"took {taken / 1e6:.0f} MB of memory (limit {min(limits) / 1e6:.0f} MB)"
-            if not self._may_restart(process):
-                raise RunFailed(f"{process.describe()} {cause}", self._last_words(), process.nodes[0])
-            self._kill(process, cause)
-
-    def _overdue(self, process: _Process, operator: str, what: str) -> None:
-        deadline = self.plan.graph.nodes[operator].live.deadline or 0
-        cause = f"missed the deadline of {operator!r}: {what} (deadline {deadline * 1e-9:g} s)"
-        if not self._may_restart(process):
-            process.child.kill()
-            raise RunFailed(f"{process.describe()} {cause}", self._last_words(), operator)
-        self._kill(process, cause)
+            self.status.operators[name] = OperatorCounts(*values)
 
     def _cover(self) -> None:
         """Tells the feeds how far everything is done."""
@@ -723,12 +396,12 @@ class Supervisor:
                 if process.kind == "host" and process.report is None:
                     self._send(process, "covered", frontier=covered)
 
-    def _consumers(self, process: _Process) -> tuple[str, ...]:
+    def _consumers(self, process: Supervised) -> tuple[str, ...]:
         if process.kind == "sink":
             return (process.label,)
         return tuple(n for n in process.nodes if not self.plan.graph.nodes[n].source)
 
-    def _on_death(self, process: _Process) -> None:
+    def _on_death(self, process: Supervised) -> None:
         process.gone = True
         code = process.child.wait(timeout=LEAVE_TIMEOUT)
         if code is None:
@@ -745,7 +418,7 @@ class Supervisor:
             how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"exited with code {code}"
         if process.cause:
             how = process.cause
-        if self._plan_restart(process, how):
+        if self._outlives(process, how):
             return
         at = [f"{n} had reached stamp {f}" for n, f in process.done.items() if f not in (NEVER, FOREVER)]
         phase = f" while {self.status.phase}" + (f" ({'; '.join(at)})" if at else "")
@@ -813,7 +486,7 @@ class Supervisor:
             self._nursery.close()
 
     @staticmethod
-    def _close_process(process: _Process) -> None:
+    def _close_process(process: Supervised) -> None:
         process.child.kill()
         process.child.wait(timeout=LEAVE_TIMEOUT)
         process.over.set()
@@ -823,7 +496,7 @@ class Supervisor:
 
     # Talking
 
-    def _send(self, process: _Process, kind: str, /, **fields: Any) -> None:
+    def _send(self, process: Supervised, kind: str, /, **fields: Any) -> None:
         if not process.gone:
             with contextlib.suppress(ChannelClosed):  # its death is noticed, with its cause, by _receive
                 process.channel.send(kind, **fields)
@@ -834,30 +507,3 @@ class Supervisor:
 
     def _last_words(self) -> str:
         return "\n".join(f"[{p.label}] {line}" for p in self._processes.values() for line in p.words[-5:])
-
-
-def _taken(plan: RunPlan, host: HostPlan) -> set[str]:
-    """The keys that a process takes from others."""
-    if host.sink is None:
-        return set(host.subscribe)
-    firings = {firings_key(plan.graph.namespace, node) for node in plan.graph.nodes} if host.sink == "record" else set()
-    return set(host.streams) | firings
-
-
-def resumed(batches: Iterable[bytes], node: Node) -> dict[str, Any]:
-    """Where an operator had got to by its last firing records: what `host.Resumed` holds, as plain values."""
-    incarnation = 0
-    last: dict[str, int] = {}
-    changed: dict[str, Any] = {}
-    ports = list(node.outputs)
-    for data in batches:
-        for record in decode_batch(data).records:
-            if record.kind == "reset":
-                last.clear()
-            if record.kind == "param":
-                changed[record.detail["name"]] = record.detail["value"]
-            incarnation = max(incarnation, record.incarnation)
-            for port, emission in zip(ports, record.outputs, strict=False):
-                if emission is not None and emission.seq != WITHHELD and record.kind != "setup":
-                    last[port] = emission.stamp
-    return {"incarnation": incarnation + 1, "last": last, "changed": changed}

@@ -17,7 +17,7 @@ from dataflow.runtime.outputs import OutputComparison, compare_outputs
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import Verification, recorded_firings
 from dataflow.runtime.replay import ReplayError, plan_replay, recorded_graph
-from dataflow.runtime.supervisor import OperatorCounts, RunFailed
+from dataflow.runtime.report import OperatorCounts, RunFailed
 from dataflow.runtime.threads import environment
 
 Verdict = Literal["identical", "within tolerance", "culprit", "downstream", "unverifiable"]

@@ -16,7 +16,7 @@ from rich.console import Console
 from dataflow.cli.arguments import chosen_streams, existing, output_file, window
 from dataflow.cli.output import figure, jsonable, plural, seconds, size
 from dataflow.cli.report import print_report
-from dataflow.runtime.supervisor import OperatorCounts, RunReport
+from dataflow.runtime.report import OperatorCounts, RunReport
 
 
 @pytest.mark.parametrize(

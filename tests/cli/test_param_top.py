@@ -18,9 +18,10 @@ from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.runtime.attach import find_running
 from dataflow.runtime.inquiry import HostStatus
+from dataflow.runtime.live import LiveSupervisor
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.supervisor import RunReport, Supervisor
+from dataflow.runtime.report import RunReport
 from dataflow.sync import NEVER
 
 GRAPH = """\
@@ -42,7 +43,7 @@ class Background:
         path.write_text(GRAPH)
         self.recording = folder / "run.mcap"
         graph = load_graph(path, live=True)
-        self.supervisor = Supervisor(RunPlan(graph, live=True, record=self.recording))
+        self.supervisor = LiveSupervisor(RunPlan(graph, live=True, record=self.recording))
         self.reports: list[RunReport] = []
         self.thread = threading.Thread(target=lambda: self.reports.append(self.supervisor.run()))
         self.thread.start()

@@ -18,7 +18,8 @@ from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.supervisor import RunFailed, Supervisor
+from dataflow.runtime.report import RunFailed
+from dataflow.runtime.supervisor import Supervisor
 
 HERE = Path(__file__).resolve().parent
 

@@ -16,7 +16,7 @@ from dataflow.runtime.chaos import plan_of
 from dataflow.runtime.execute import run
 from dataflow.runtime.keys import diagnostics_key
 from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.supervisor import RunFailed, RunReport
+from dataflow.runtime.report import RunFailed, RunReport
 from dataflow.runtime.verify import verify
 
 AGAIN = "restart: {max: 5, backoff: 20ms}"

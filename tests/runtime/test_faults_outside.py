@@ -23,8 +23,9 @@ from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
 from dataflow.runtime.attach import find_running
 from dataflow.runtime.execute import run
+from dataflow.runtime.live import LiveSupervisor
 from dataflow.runtime.plan import RunPlan
-from dataflow.runtime.supervisor import RunReport, Supervisor
+from dataflow.runtime.report import RunReport
 from dataflow.runtime.verify import verify
 
 HERE = Path(__file__).resolve().parent
@@ -239,17 +240,19 @@ def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor
     tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The link from `left` to `smooth` is cut for half a second; everything else stays connected."""
-    spawn = Supervisor._spawn
+    spawn = LiveSupervisor._spawn
 
-    def through_a_link(self: Supervisor, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]) -> None:
+    def through_a_link(
+        self: LiveSupervisor, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]
+    ) -> None:
         if label == "smooth":
             links.extend(Link(endpoint) for endpoint in config["connect"])
             config = {**config, "connect": [link.endpoint for link in links]}
         spawn(self, label, nodes, kind, config)
 
-    monkeypatch.setattr(Supervisor, "_spawn", through_a_link)
+    monkeypatch.setattr(LiveSupervisor, "_spawn", through_a_link)
     graph = load_graph(graph_file(tmp_path, count=300), live=True)
-    supervisor = Supervisor(RunPlan(graph, live=True, placement="host_each", record=tmp_path / "run.mcap"))
+    supervisor = LiveSupervisor(RunPlan(graph, live=True, placement="host_each", record=tmp_path / "run.mcap"))
     reports: list[RunReport] = []
     thread = threading.Thread(target=lambda: reports.append(supervisor.run()))
     thread.start()

@@ -19,7 +19,7 @@ from dataflow.runtime.gate import (
 from dataflow.runtime.outputs import OutputComparison
 from dataflow.runtime.reexecute import Difference, Verification
 from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.report import RunFailed
 from dataflow.runtime.verify import VerifyReport
 
 Outcomes = dict[str, str | None]

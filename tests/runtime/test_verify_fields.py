@@ -14,7 +14,7 @@ from dataflow.runtime.apart import apart
 from dataflow.runtime.execute import run
 from dataflow.runtime.outputs import compare_outputs
 from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.supervisor import RunFailed
+from dataflow.runtime.report import RunFailed
 from dataflow.runtime.verify import VerifyReport, verify
 
 HERE = Path(__file__).resolve().parent

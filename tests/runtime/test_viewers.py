@@ -16,7 +16,7 @@ from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.runtime.attach import NotRunning, find_running, graph_of, still_runs, tap
 from dataflow.runtime.execute import run
-from dataflow.runtime.supervisor import RunReport
+from dataflow.runtime.report import RunReport
 
 HERE = Path(__file__).resolve().parent
 
