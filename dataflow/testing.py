@@ -14,7 +14,8 @@ from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator, Source
 from dataflow.runtime.firings import FiringRecord
-from dataflow.runtime.runner import OperatorRunner, SourceRunner
+from dataflow.runtime.runner import OperatorRunner
+from dataflow.runtime.source import SourceRunner
 from dataflow.sync import Entry
 
 NAMESPACE = "test"

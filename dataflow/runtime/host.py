@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,161 +24,29 @@ from dataflow.runtime.admission import LiveRunner
 from dataflow.runtime.chaos import TO_SOURCES, SourceFaults
 from dataflow.runtime.control import Channel, ChannelClosed
 from dataflow.runtime.feed import Feed, LogFeed, Window
-from dataflow.runtime.firings import FiringRecord, encode_batch
-from dataflow.runtime.keys import firings_key
+from dataflow.runtime.host_config import HostConfig, Resumed
 from dataflow.runtime.network import network_config
+from dataflow.runtime.outlet import Outlet
 from dataflow.runtime.reexecute import RecordedRunner, recorded_digests, recorded_firings
-from dataflow.runtime.runner import OperatorFailure, OperatorRunner, SourceRunner, step_stamp, summary_of
+from dataflow.runtime.runner import OperatorFailure, OperatorRunner, summary_of
+from dataflow.runtime.source import SourceRunner, step_stamp
 from dataflow.runtime.threads import limit_threads
 from dataflow.runtime.watchdog import Watchdog
 from dataflow.sync import NEVER, Entry
-from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode, encode
+from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode
 from dataflow.transport.bus import BusError
 from dataflow.transport.keys import runtime_key
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.004
 PROBE_EVERY = 0.01
-BATCH_RECORDS = 64
-BATCH_SECONDS = 0.25
 PROMISE_EVERY = 8
 STATICS_WITHIN = 5.0
 MISSED_AFTER = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class HostConfig:
-    """What the supervisor tells a host to be. Travels as plain values.
-
-    `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
-    are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is
-    (messages, bytes). `firings`: whether a recorder takes the firing records. `verify` names a recording by whose
-    firing records the operators are driven. `live`: sources do not wait for the graph, and operators not for their
-    inputs. `resume` is given to a host that takes the place of one that died: for each operator, where it had got to
-    (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the operators'
-    states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
-    """
-
-    label: str
-    graph: dict[str, Any]
-    nodes: list[str]
-    publish: dict[str, int]
-    subscribe: list[str]
-    listen: list[str]
-    connect: list[str]
-    replay: dict[str, Any] | None = None
-    window: tuple[int, int] = (256, 64 << 20)
-    rate: float | None = None
-    paranoid: bool = False
-    firings: bool = False
-    verify: str | None = None
-    live: bool = False
-    resume: dict[str, Any] | None = None
-    snapshots: int | None = None
-    warm: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Resumed:
-    """Where an operator had got to when its process died: the next incarnation, the last stamp of each port, the
-    parameters that were changed, and how often it has been started again."""
-
-    incarnation: int = 0
-    last: Mapping[str, int] = field(default_factory=dict)
-    changed: Mapping[str, Any] = field(default_factory=dict)
-    restarts: int = 0
-
-    def apply(self, runner: SourceRunner | LiveRunner) -> None:
-        if self.incarnation:
-            runner.resume(self.incarnation, self.last, self.changed)
-
-
 class HostFailure(RuntimeError):
     """A failure of the host itself, not of one of its operators."""
-
-
-class Outlet:
-    """The emitter of all operators of a host: to local aligners by reference, to other hosts and taps as envelopes."""
-
-    def __init__(self, host: Host) -> None:
-        self.host = host
-        self.sent = 0
-        self._held: list[tuple[str, Envelope | bytes]] | None = []
-        self._logs: dict[str, list[FiringRecord]] = {}
-        self._flushed = time.monotonic()
-
-    def release(self) -> None:
-        """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
-        held, self._held = self._held or [], None
-        for stream, envelope in held:
-            self._send(stream, envelope)
-
-    def _send(self, stream: str, envelope: Envelope | bytes) -> None:
-        publisher = self.host.remote.get(stream)
-        if publisher is None:
-            return
-        if self._held is not None:
-            self._held.append((stream, envelope))
-            return
-        self.sent += self.host.config.publish[stream]
-        if isinstance(envelope, bytes):
-            publisher.put_bytes(envelope)
-        else:
-            publisher.put(envelope)
-
-    def message(self, stream: str, entry: Entry) -> None:
-        for runner in self.host.consumers.get(stream, ()):
-            runner.push(stream, entry)
-        message: Message = entry.value
-        envelope = Envelope(
-            Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
-        )
-        if stream in self.host.static:
-            self.host.bus.declare_static(stream, encode(envelope))
-        self._send(stream, envelope)
-        if self.host.taps.active:
-            self.host.taps.offer(stream, envelope)
-
-    def frontier(self, stream: str, frontier: int) -> None:
-        for runner in self.host.consumers.get(stream, ()):
-            runner.advance(stream, frontier)
-        if stream in self.host.remote:
-            self._send(stream, Envelope(Kind.FRONTIER, stream, 0, 0, frontier))
-
-    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        for runner in self.host.consumers.get(stream, ()):
-            runner.end(stream, final_stamp, reason)
-        if self.host.config.live and stream not in self.host.static:
-            self.host.channel.send("stream_ended", stream=stream, reason=reason)
-        final = NEVER if final_stamp is None else final_stamp
-        self._send(stream, Envelope(Kind.END, stream, 0, 0, final, reason=reason))
-
-    def record(self, record: FiringRecord) -> None:
-        if self.host.config.live:  # ahead of its messages, to where it survives this process
-            self.host.channel.send("record", operator=record.operator, data=encode_batch([record]))
-        if self.host.config.firings:
-            log = self._logs.setdefault(record.operator, [])
-            if log and log[-1].incarnation != record.incarnation:
-                self.flush(record.operator)
-            log.append(record)
-            if len(log) >= BATCH_RECORDS or record.kind == "finish":
-                self.flush(record.operator, last=record.kind == "finish")
-
-    def flush(self, operator: str, *, last: bool = False) -> None:
-        log = self._logs.get(operator)
-        if log:
-            self._send(firings_key(self.host.graph.namespace, operator), encode_batch(log, last=last))
-            log.clear()
-
-    def flush_due(self) -> None:
-        """Sends the batches that have waited long enough."""
-        if time.monotonic() - self._flushed >= BATCH_SECONDS:
-            self.flush_all()
-
-    def flush_all(self) -> None:
-        self._flushed = time.monotonic()
-        for operator in self._logs:
-            self.flush(operator)
 
 
 class Host:

@@ -35,7 +35,8 @@ def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: queue.Simp
 
         sink = SinkConfig(**config)
         return SinkHost(sink, channel, inbox, SINKS[sink.kind])
-    from dataflow.runtime.host import Host, HostConfig
+    from dataflow.runtime.host import Host
+    from dataflow.runtime.host_config import HostConfig
 
     return Host(HostConfig(**config), channel, inbox)
 
