@@ -309,7 +309,7 @@ def _encode_cloud(message: PointCloud) -> tuple[Parts, tuple[str, ...]]:
 
 
 def _decode_cloud(proto: PointCloudProto) -> Fields:
-    offsets = {f.name: (f.offset, f.type) for f in proto.fields}
+    offsets = {f.name: (f.offset, int(f.type)) for f in proto.fields}
     stride = proto.point_stride
     if not stride or len(proto.data) % stride:
         raise RecordingError(f"PointCloud data of {len(proto.data)} bytes is no multiple of its stride {stride}")
