@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +14,8 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.cloud_builder import transform_between
 from operators.odometry.camera import RgbdCamera
-from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig
+from operators.odometry.memory import from_plain, to_plain
+from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, State
 from operators.odometry.se3 import Matrix
 from operators.odometry.surface import DepthNoise
 
@@ -56,6 +59,7 @@ class VisualOdometry(Operator):
     give_up: float = Param(2.0, ge=0, doc="and until it begins anew at the predicted pose", unit="s")
 
     _tracker: _Tracker | None = None
+    _restored: State | None = None
 
     def process(
         self,
@@ -81,7 +85,16 @@ class VisualOdometry(Operator):
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._tracker = None
+        self._tracker = self._restored = None
+
+    def snapshot(self) -> Mapping[str, Any]:
+        """The motion and the keyframes."""
+        state = self._restored if self._tracker is None else self._tracker.odometry.snapshot()
+        return {} if state is None else to_plain(state)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Taken up with the first frame, which brings the calibration."""
+        self._restored = from_plain(state) if state else None
 
     def _tracking(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdOdometry:
         """The tracker, made once for each calibration."""
@@ -90,6 +103,9 @@ class VisualOdometry(Operator):
             T_image_depth = transform_between(extrinsics, depth_info.frame, image_info.frame)
             camera = RgbdCamera(image_info.K, depth_info.K, invert(T_image_depth))
             self._tracker = _Tracker(given, RgbdOdometry(camera, self._config()))
+            if self._restored is not None:
+                self._tracker.odometry.restore(self._restored)
+                self._restored = None
         return self._tracker.odometry
 
     def _config(self) -> RgbdOdometryConfig:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, DepthImage, Image
 from dataflow.messages.geometry import invert
+from dataflow.runtime.states import pack_state, unpack_state
 from operators.odometry import VisualOdometry, se3
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, Status, TrackResult
@@ -415,6 +416,33 @@ def test_operator_gives_the_core_poses_in_named_frames() -> None:
         assert (out.stamp, out.frame, out.child_frame) == (stamp, "start", "depth")
         np.testing.assert_allclose(out.matrix(), core[i].T_world_camera, atol=1e-12)
     assert out.pose_covariance is not None
+
+
+def test_operator_goes_on_alike_from_a_recorded_state() -> None:
+    frames, _ = sequence(40)
+
+    def given(i: int) -> tuple[Image, DepthImage, CameraInfo, CameraInfo]:
+        image, depth = frames[i]
+        stamp = i * 33_000_000
+        return (
+            Image(stamp=stamp, frame="color", data=image),
+            DepthImage(stamp=stamp, frame="depth", data=depth),
+            info("color", K_COLOR),
+            info("depth", K_DEPTH),
+        )
+
+    one, other = VisualOdometry(), VisualOdometry()
+    assert one.snapshot() == {}
+    for i in range(20):
+        one.process(*given(i))
+    recorded = pack_state(one.snapshot())
+
+    other.restore(unpack_state(recorded))
+
+    assert pack_state(other.snapshot()) == recorded
+    for i in range(20, 30):
+        assert one.process(*given(i)).digest() == other.process(*given(i)).digest()
+    assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 
 def test_operator_refuses_an_image_that_its_calibration_does_not_describe() -> None:
