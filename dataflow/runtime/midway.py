@@ -11,30 +11,25 @@ from dataflow.recording import Recording
 from dataflow.runtime.apart import Tell, apart
 from dataflow.runtime.recompute import Recomputation, plan_feeding
 from dataflow.runtime.reexecute import Verification
-from dataflow.runtime.replay import ReplayError
 from dataflow.sync import Entry
 
 
 def verify_from(
     path: Path, graph: Graph, operators: Collection[str], begin: int, *, told: Tell | None = None
 ) -> tuple[list[Verification], float]:
-    """Re-executes operators from the stamp `begin` (ns) on, each fed by the recording; and the seconds it took.
+    """Re-executes operators from the stamp `begin` (ns) on, fed by the recording; and the seconds it took.
 
     An operator takes up its last recorded state at or before `begin`; one that has no state begins there; any other is
-    repeated from its beginning, and its result says so. In a process of its own.
-    Raises `ReplayError` where a stream that an operator takes was not recorded, `RunFailed` when it cannot run.
+    repeated from its beginning, and its result says so. What makes streams that were not recorded is repeated too, as
+    far back as needed. In a process of its own.
+    Raises `ReplayError` where a source's stream was not recorded, `RunFailed` when an operator cannot run.
     """
     with Recording(path) as recording:
-        feeding = plan_feeding(recording, graph, operators)
-        for extra in sorted(set(feeding.operators) - set(operators)):
-            raise ReplayError(
-                f"{path}: the streams of {extra!r} were not recorded, and to begin in the middle they must be; "
-                f"make the recording complete first: dataflow replay {path} --complete FILE.mcap"
-            )
+        plan_feeding(recording, graph, operators)
     request = {"path": str(path), "graph": graph.to_json(), "operators": sorted(operators), "begin": begin}
     answer = apart(f"{__name__}:answer", request, threads=graph.threads, told=told)
     found = {v["operator"]: Verification.from_wire(v) for v in answer["operators"]}
-    return [found[name] for name in graph.nodes if name in found], answer["wall"]
+    return [found[name] for name in graph.nodes if name in operators], answer["wall"]
 
 
 def answer(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:

@@ -6,14 +6,23 @@ one differs, and to store them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
 from dataflow.runtime.feed import LogFeed
 from dataflow.runtime.firings import FiringRecord
-from dataflow.runtime.reexecute import CALLS, RecordedRunner, Verification, recorded_digests, recorded_firings
+from dataflow.runtime.reexecute import (
+    CALLS,
+    RecordedRunner,
+    Verification,
+    beginning,
+    needed_from,
+    recorded_digests,
+    recorded_firings,
+    whole,
+)
 from dataflow.runtime.replay import ReplayError, check_type, final_stamps
 from dataflow.runtime.threads import limit_threads
 from dataflow.sync import Entry
@@ -85,8 +94,9 @@ class Recomputation:
         self._consumers: dict[str, list[RecordedRunner]] = {}
         self.records = {name: list(_until(recorded_firings(recording, name), end)) for name in feeding.operators}
         outlet = _Outlet(self._consumers, self._fed, made, ended)
+        begins = {} if begin is None else _begins(graph, self.records, self._fed, begin)
         self.runners = {
-            name: _runner(recording, graph, graph.nodes[name], self.records[name], outlet, begin)
+            name: _runner(recording, graph, graph.nodes[name], self.records[name], outlet, begins.get(name))
             for name in feeding.operators
         }
         for runner in self.runners.values():
@@ -159,6 +169,37 @@ def _runner(
         seed=graph.seed,
         begin=begin,
     )
+
+
+def _begins(
+    graph: Graph, records: Mapping[str, Sequence[FiringRecord]], fed: frozenset[str], begin: int
+) -> dict[str, int]:
+    """From which stamp on each operator is to be repeated: `begin`, or before what those need that take its messages,
+    where the recording does not hold them."""
+    begins = dict.fromkeys(records, begin)
+    moved = list(records)
+    while moved:
+        node = graph.nodes[moved.pop()]
+        kept, _ = whole(records[node.name])
+        repeated = beginning(kept, begins[node.name], stateless=node.operator.stateless)[1]
+        for stream, place in needed_from(repeated).items():
+            maker = graph.streams[stream].node
+            if stream in fed or maker not in begins:
+                continue
+            made = _stamp_of(records[maker], list(graph.nodes[maker].outputs.values()).index(stream), place)
+            if made is not None and made <= begins[maker]:
+                begins[maker] = made - 1
+                moved.append(maker)
+    return begins
+
+
+def _stamp_of(records: Iterable[FiringRecord], port: int, place: tuple[int, int]) -> int | None:
+    """The stamp of the call that emitted a message; None for `setup`, which is always repeated."""
+    for record in records:
+        emission = record.outputs[port] if record.outputs else None
+        if emission is not None and (record.incarnation, emission.seq) == place:
+            return record.stamp if record.kind in CALLS else None
+    return None
 
 
 def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringRecord]:

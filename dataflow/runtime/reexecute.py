@@ -107,6 +107,16 @@ def first_places(ref: InputRef) -> Iterator[tuple[str, tuple[int, int]]]:
                 yield one.stream, (one.incarnation, one.seq)
 
 
+def needed_from(records: Iterable[FiringRecord]) -> dict[str, tuple[int, int]]:
+    """By stream, the first message (incarnation, number) that the calls of `records` took."""
+    needed: dict[str, tuple[int, int]] = {}
+    for record in records:
+        for ref in record.inputs.values():
+            for stream, place in first_places(ref):
+                needed[stream] = min(place, needed.get(stream, place))
+    return needed
+
+
 def messages_of(ref: InputRef) -> Iterator[MessageRef]:
     """Every message that a reference names."""
     match ref:
@@ -174,7 +184,7 @@ def beginning(
     place = max((k + 1 for k, r in enumerate(records) if r.kind == "snapshot" and r.stamp <= begin), default=0)
     if stateless:
         place = next((k for k, r in enumerate(records) if r.kind in CALLS and r.stamp >= begin), len(records))
-    found = "start" if not place else "stateless" if stateless else "snapshot"
+    found = "stateless" if stateless else "snapshot" if place else "start"
     return records[:place], records[place:], found
 
 
@@ -361,12 +371,7 @@ class RecordedRunner:
 
     def needs_from(self) -> dict[str, tuple[int, int]]:
         """By stream, the first message (incarnation, number) that is needed to repeat what is to be repeated."""
-        needed: dict[str, tuple[int, int]] = {}
-        for record in self._records:
-            for ref in record.inputs.values():
-                for stream, place in first_places(ref):
-                    needed[stream] = min(place, needed.get(stream, place))
-        return needed
+        return needed_from(self._records)
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:

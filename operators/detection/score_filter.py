@@ -18,7 +18,8 @@ class ScoreFilter(Operator):
     detections: In[Detections2D] = In(doc="what a detector found")
     sure: Out[Detections2D] = Out(doc="those of at least `min_score`, in the same order; one message for each")
 
-    min_score: float = Param(0.4, ge=0, le=1, doc="detections below are left out")
+    stateless = True
+    min_score: float = Param(0.4, ge=0, le=1, live=True, doc="detections below are left out")
 
     def process(self, detections: Detections2D) -> Detections2D:
         kept = detections.scores >= np.float32(self.min_score)
