@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -23,15 +24,13 @@ class MaskedImage:
     image: Path
     mask: Path
 
+    def pixels(self) -> NDArray[np.uint8]:
+        """Pixels (H, W, 3), RGB. Raises DataError."""
+        return _read(self.image, cv2.IMREAD_COLOR_RGB)
+
     def read(self, classes: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Pixels (H, W, 3), RGB, and class ids (H, W). Raises DataError."""
-        pixels = cv2.imread(str(self.image), cv2.IMREAD_COLOR_RGB)
-        mask = cv2.imread(str(self.mask), cv2.IMREAD_UNCHANGED)
-        for file, found in ((self.image, pixels), (self.mask, mask)):
-            if found is None:
-                raise DataError(f"{file} cannot be read as an image")
-        assert pixels is not None
-        assert mask is not None
+        pixels, mask = self.pixels(), _read(self.mask, cv2.IMREAD_UNCHANGED)
         if mask.ndim != 2 or mask.dtype != np.uint8:
             raise DataError(f"{self.mask} is {mask.dtype}{list(mask.shape)}; a mask is an 8-bit grey PNG of class ids")
         if mask.shape != pixels.shape[:2]:
@@ -42,7 +41,7 @@ class MaskedImage:
                 f"{self.mask}: class id {wrong[0]} in {wrong.size} pixels; there are {classes} classes (0 to "
                 f"{classes - 1}), and 255 is void"
             )
-        return pixels.astype(np.uint8, copy=False), mask.astype(np.uint8, copy=False)
+        return pixels, mask
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,13 @@ def read_segmentation_data(folder: Path, seed: int = 0) -> SegmentationData:
     if not names or not pairs:
         raise DataError(f"{folder} has {len(names)} classes in classes.txt and {len(pairs)} images in images/")
     return _divided(folder, names, pairs, seed)
+
+
+def _read(file: Path, how: int) -> NDArray[Any]:
+    found = cv2.imread(str(file), how)
+    if found is None:
+        raise DataError(f"{file} cannot be read as an image")
+    return found
 
 
 def _mask(place: Path) -> Path:

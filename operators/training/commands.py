@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json as jsonlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -237,6 +237,37 @@ def train_pair(
     _finish(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json)
 
 
+@train.command("quantize")
+def quantize(
+    weights: Annotated[Path, typer.Argument(help="The network file that training wrote (.onnx).", show_default=False)],
+    data: Data,
+    out: Annotated[Path | None, typer.Option(help="The file to write. Default: WEIGHTS, as .int8.onnx.")] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
+    images: Annotated[int, typer.Option(min=1, help="Training images on which ranges are measured.")] = 32,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Write a trained network in 8-bit integers: half the time on a CPU, at nearly the same score.
+
+    Ranges are measured on training images of DATA; both files are then scored on its validation images.
+    """
+    with _friendly():
+        out = weights.with_suffix(".int8.onnx") if out is None else out
+        if out.exists() and not overwrite:
+            raise FileExistsError(f"{out} exists already: give --overwrite or another --out")
+        from operators.training.quantization import quantize_with
+
+        compared = quantize_with(weights, data, out, images, seed)
+    if json:
+        typer.echo(jsonlib.dumps({"weights": str(out), "files": compared}))
+        return
+    table = Table("file", "kB", "score", "ms an image", box=None)
+    for file, scores in compared.items():
+        kilobytes, said = f"{Path(file).stat().st_size / 1000:.0f}", _said(scores, ("ap50", "ap", "miou"))
+        table.add_row(file, kilobytes, said, f"{scores['ms']:.1f}")
+    _out.print(table)
+
+
 @evaluate.command("detector")
 def evaluate_detector(
     data: Data,
@@ -346,9 +377,13 @@ def _finish(outcome: Outcome, operator: str, json: bool) -> None:
             )
         )
         return
-    scores = ", ".join(f"{name} {value:.3f}" for name, value in outcome.best.items() if name != "score")
+    scores = _said(outcome.best, [name for name in outcome.best if name != "score"])
     _out.print(f"[green]{outcome.file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False)
     _out.print(f"use it: `use: {operator}` with `params: {{weights: {outcome.file}}}`", highlight=False)
+
+
+def _said(scores: Mapping[str, Any], names: Sequence[str]) -> str:
+    return ", ".join(f"{name} {scores[name]:.3f}" for name in names if name in scores)
 
 
 def _size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import json
-import os
 import tempfile
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from operators.training.files import whole
 from operators.weights.network_file import KEY
 
 _OPSET = 17
@@ -49,13 +49,8 @@ def export_network(
     model.producer_name = "dataflow"
     onnx.helper.set_model_props(model, {KEY: json.dumps(dict(facts), sort_keys=True)})
     onnx.checker.check_model(model)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    partial = file.with_name(f".{file.name}.{os.getpid()}.partial")
-    try:
+    with whole(file) as partial:
         partial.write_bytes(model.SerializeToString())
-        partial.replace(file)
-    finally:
-        partial.unlink(missing_ok=True)
 
 
 def _store_as_half(model: Any) -> None:

@@ -1,9 +1,10 @@
-"""Checkpoints that are written whole or not at all, and read without running anything they contain."""
+"""Files that are written whole or not at all, and checkpoints read without running anything they contain."""
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,24 @@ class TrainingFileError(ValueError):
     """A file that training or evaluation cannot use: names it, what is wrong, and what would be right."""
 
 
-def save_atomically(state: Mapping[str, Any], file: Path) -> None:
-    """Writes a checkpoint; a crash at any moment leaves the previous one or the new one, never a part."""
+@contextlib.contextmanager
+def whole(file: Path) -> Iterator[Path]:
+    """A path to write to, which takes the place of `file` when the block ends without an error."""
     file.parent.mkdir(parents=True, exist_ok=True)
     partial = file.with_name(f".{file.name}.{os.getpid()}.partial")
     try:
-        with partial.open("wb") as handle:
-            torch.save(dict(state), handle)
-            handle.flush()
-            os.fsync(handle.fileno())
+        yield partial
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def save_atomically(state: Mapping[str, Any], file: Path) -> None:
+    """Writes a checkpoint; a crash at any moment leaves the previous one or the new one, never a part."""
+    with whole(file) as partial, partial.open("wb") as handle:
+        torch.save(dict(state), handle)
+        handle.flush()
+        os.fsync(handle.fileno())
 
 
 def load_safely(file: Path) -> dict[str, Any]:

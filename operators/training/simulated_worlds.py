@@ -2,7 +2,7 @@
 
 Each world is drawn from a seed of its own; a few images are taken from each, far apart in time, with varied cameras.
 
-python -m operators.training.simulated_worlds DATA [--worlds 150] [--validation 10] [--frames 16] [--processes 1]
+python -m operators.training.simulated_worlds DATA [--worlds 480] [--validation 10] [--frames 10] [--processes 1]
 """
 
 from __future__ import annotations
@@ -26,11 +26,10 @@ from operators.sources.simulated_robot import SimulatedRobot
 from operators.sources.simulator.classes import CLASSES, THINGS
 from operators.sources.simulator.worlds import NAMES
 
-STORED = (320, 240)
-"""Width and height of what is stored; what the networks take."""
-VGA = (640, 480)
+VGA, QVGA = (640, 480), (320, 240)
+"""Width and height of the images: of worlds with even seeds, of the others."""
 LEAST_VISIBLE, LEAST_PIXELS = 0.3, 30
-"""Objects shown less, or smaller in the stored image, are to be ignored in training."""
+"""Objects shown less, or smaller in an image of 320x240, are to be ignored in training."""
 TRAINING, VALIDATION, HELD_OUT = 10_000, 20_000, 30_000
 """First seeds; every world has the next one. Networks are judged on worlds that nothing was chosen by."""
 KINDS = ("office", "table_top", "corridor", "office", "table_top")
@@ -92,9 +91,9 @@ def write_data(
 ) -> Iterator[tuple[int, int]]:
     """Renders worlds into a data folder; yields (worlds done, images written) after each.
 
-    Worlds of even seeds are rendered at VGA and stored at half the size, as the operators shrink a VGA image; the
-    others at the stored size. Worlds that are already there are kept, so an interrupted rendering goes on. The files
-    are the same for any number of processes.
+    Half of the worlds are rendered at VGA, half at 320x240, and stored so: networks meet images that they shrink and
+    images that they enlarge. Worlds that are already there are kept, so an interrupted rendering goes on. The files are
+    the same for any number of processes.
     """
     for name in ("images", "masks", "boxes", "annotations"):
         (folder / name).mkdir(parents=True, exist_ok=True)
@@ -117,7 +116,7 @@ def _write_world(folder: Path, frames: int, chosen: tuple[str, int]) -> int:
     if not rows.is_file():
         images = [
             _store(folder, f"{world}_{seed}_{i:02d}", taken)
-            for i, taken in enumerate(render(world, seed, frames, STORED if seed % 2 else VGA, varied=True))
+            for i, taken in enumerate(render(world, seed, frames, QVGA if seed % 2 else VGA, varied=True))
         ]
         partial_file = rows.with_suffix(".partial")
         partial_file.write_text(json.dumps(images), encoding="utf-8")
@@ -127,10 +126,6 @@ def _write_world(folder: Path, frames: int, chosen: tuple[str, int]) -> int:
 
 def _store(folder: Path, stem: str, taken: WorldImage) -> dict[str, Any]:
     pixels, classes = taken.image.data, taken.masks.classes.astype(np.uint8)
-    scale = STORED[0] / taken.image.width
-    if scale != 1:
-        pixels = np.asarray(cv2.resize(pixels, STORED, interpolation=cv2.INTER_LINEAR), np.uint8)
-        classes = np.asarray(cv2.resize(classes, STORED, interpolation=cv2.INTER_NEAREST), np.uint8)
     cv2.imwrite(
         str(folder / "images" / f"{stem}.jpg"),
         cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR),
@@ -140,21 +135,22 @@ def _store(folder: Path, stem: str, taken: WorldImage) -> dict[str, Any]:
     found = taken.objects
     visible = found.visible if found.visible is not None else np.ones(found.count, np.float32)
     pixel_counts = found.pixel_counts if found.pixel_counts is not None else np.zeros(found.count, np.int64)
+    least = LEAST_PIXELS * taken.image.width * taken.image.height / (QVGA[0] * QVGA[1])
     annotations = []
     for box, label, share, pixel_count in zip(
-        (found.boxes * scale).tolist(), found.class_ids.tolist(), visible.tolist(), pixel_counts.tolist(), strict=True
+        found.boxes.tolist(), found.class_ids.tolist(), visible.tolist(), pixel_counts.tolist(), strict=True
     ):
-        count = pixel_count * scale**2
         annotations.append(
             {
                 "category_id": label,
                 "bbox": [box[0], box[1], box[2] - box[0], box[3] - box[1]],
-                "ignore": int(share < LEAST_VISIBLE or count < LEAST_PIXELS),
+                "ignore": int(share < LEAST_VISIBLE or pixel_count < least),
                 "visible": round(share, 3),
-                "pixels": round(count, 1),
+                "pixels": pixel_count,
             }
         )
-    return {"file_name": f"{stem}.jpg", "annotations": annotations}
+    size = {"width": taken.image.width, "height": taken.image.height}
+    return {"file_name": f"{stem}.jpg", **size, "annotations": annotations}
 
 
 def _images(folder: Path, world: str, seed: int) -> list[dict[str, Any]]:
@@ -166,7 +162,7 @@ def _write_annotations(folder: Path, split: str, chosen: Sequence[tuple[str, int
     annotations: list[dict[str, Any]] = []
     for world, seed in chosen:
         for image in _images(folder, world, seed):
-            images.append({"id": len(images), "file_name": image["file_name"], "width": STORED[0], "height": STORED[1]})
+            images.append({"id": len(images), **{k: image[k] for k in ("file_name", "width", "height")}})
             for row in image["annotations"]:
                 annotations.append({"id": len(annotations), "image_id": images[-1]["id"], **row})
     content = {
@@ -184,9 +180,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description="Render a data folder for `dataflow train pair`, `detector` and `segmenter`.",
     )
     parser.add_argument("data", type=Path, help="the folder to write")
-    parser.add_argument("--worlds", type=int, default=150, help=f"worlds to train on, of seeds from {TRAINING}")
+    parser.add_argument("--worlds", type=int, default=480, help=f"worlds to train on, of seeds from {TRAINING}")
     parser.add_argument("--validation", type=int, default=10, help=f"worlds to score on, of seeds from {VALIDATION}")
-    parser.add_argument("--frames", type=int, default=16, help="images of each world")
+    parser.add_argument("--frames", type=int, default=10, help="images of each world")
     parser.add_argument("--processes", type=int, default=1, help="worlds rendered at once")
     options = parser.parse_args(arguments)
     chosen = worlds(TRAINING, options.worlds, KINDS), worlds(VALIDATION, options.validation, KINDS)

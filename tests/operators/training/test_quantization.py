@@ -1,0 +1,95 @@
+"""Networks in 8 bits: they answer as the float ones do."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+pytest.importorskip("torch", reason="training needs the extra [train]")
+
+from dataflow.cli.main import app
+from operators.detection.custom.dataset import read_detection_data
+from operators.segmentation.dataset import read_segmentation_data
+from operators.training import simulated_worlds
+from operators.training.loop import Settings, train
+from operators.training.pair import PairTask
+from operators.training.quantization import quantize_network
+from operators.weights import NetworkFileError, open_network, read_facts
+
+SIZE = (160, 128)
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data") / "worlds"
+    simulated_worlds.main([str(folder), "--worlds", "1", "--validation", "1", "--frames", "4"])
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with detector.onnx and segmenter.onnx."""
+    folder = tmp_path_factory.mktemp("networks")
+    task = PairTask(read_detection_data(data), read_segmentation_data(data), SIZE, width=0.25)
+    train(task, Settings(epochs=2, batch=4, threads=1), folder / "pair.onnx")
+    return folder
+
+
+def views(data: Path) -> list[NDArray[np.uint8]]:
+    return [image.read() for image in read_detection_data(data).training]
+
+
+@pytest.mark.parametrize("kind", ["detector", "segmenter"])
+def test_the_answers_differ_little_and_keep_their_precision(
+    trained: Path, data: Path, tmp_path: Path, kind: str
+) -> None:
+    file, out = trained / f"{kind}.onnx", tmp_path / "small.onnx"
+    quantize_network(file, views(data), out)
+    assert out.stat().st_size < file.stat().st_size
+    assert read_facts(out) == read_facts(file) | {"arithmetic": "int8", "calibration_images": 4}
+    image = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
+    for before, after in zip(open_network(file, kind).run(image), open_network(out, kind).run(image), strict=True):
+        assert before.dtype == after.dtype
+        if before.dtype == np.float32:
+            assert np.abs(before - after).mean() < 0.1 * before.std() + 0.01
+            assert len(np.unique(after)) > 256
+        else:
+            assert (before == after).mean() > 0.9
+
+
+def test_the_same_images_give_the_same_bytes(trained: Path, data: Path, tmp_path: Path) -> None:
+    for name in ("a.onnx", "b.onnx"):
+        quantize_network(trained / "detector.onnx", views(data), tmp_path / name)
+    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+
+
+def test_what_cannot_be_done_is_said_and_leaves_no_file(trained: Path, data: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.onnx"
+    with pytest.raises(ValueError, match="measured on images, and there is none"):
+        quantize_network(trained / "detector.onnx", [], small)
+    with pytest.raises(FileNotFoundError, match=r"absent\.onnx"):
+        quantize_network(tmp_path / "absent.onnx", views(data), small)
+    assert not list(tmp_path.iterdir())
+    quantize_network(trained / "detector.onnx", views(data), small)
+    with pytest.raises(NetworkFileError, match="in 8 bits already; give the file that training wrote"):
+        quantize_network(small, views(data), tmp_path / "smaller.onnx")
+    assert list(tmp_path.iterdir()) == [small]
+
+
+@pytest.mark.parametrize(("kind", "score"), [("detector", "ap50"), ("segmenter", "miou")])
+def test_the_command_scores_both_files(trained: Path, data: Path, tmp_path: Path, kind: str, score: str) -> None:
+    arguments = ["train", "quantize", str(trained / f"{kind}.onnx"), str(data), "--out", str(tmp_path / "small.onnx")]
+    result = CliRunner().invoke(app, [*arguments, "--images", "2", "--json"])
+    assert result.exit_code == 0, result.output
+    compared = json.loads(result.stdout)["files"]
+    assert list(compared) == [str(trained / f"{kind}.onnx"), str(tmp_path / "small.onnx")]
+    assert all(0 <= scores[score] <= 1 and scores["images"] == 4 for scores in compared.values())
+    assert read_facts(tmp_path / "small.onnx")["calibration_images"] == 2
+    again = CliRunner().invoke(app, arguments)
+    assert again.exit_code == 1
+    assert "exists already" in again.output
