@@ -117,6 +117,9 @@ def print_completion(console: Console, made: Completion) -> None:
         ),
         soft_wrap=True,
     )
+    if made.kept:
+        told = f"{plural(made.kept, 'message')} could not be made again and were taken over as recorded"
+        console.print(Text(told, style="yellow"), soft_wrap=True)
     console.print(Text(f"computed again: {', '.join(made.added) or 'nothing that was not recorded'}"), soft_wrap=True)
 
 
@@ -155,14 +158,22 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
 
 
 def _left_out(v: Verification) -> Iterator[str]:
-    """What could not be repeated."""
+    """What could not be repeated, and what the recording lacks."""
     if v.lost_records:
         yield f"{v.operator}: {plural(v.lost_records, 'firing')} could not be repeated (records before them are lost)"
+    if v.unaccounted:
+        yield f"{v.operator}: {plural(v.unaccounted, 'message')} that no firing record accounts for: records are lost"
+    elif v.unfinished:
+        yield f"{v.operator}: its firing records end before the run did: records are lost"
     if v.unverifiable:
         missing = v.missing or "input"
-        yield f"{v.operator}: {plural(v.unverifiable, 'firing')} could not be repeated (missing {missing})"
-    if v.after_cut:
-        yield f"{v.operator}: {plural(v.after_cut, 'message')} after its last record"
+        after = ", after the cut" if v.cut and v.beyond else ""
+        yield f"{v.operator}: {plural(v.unverifiable, 'firing')} could not be repeated (missing {missing}{after})"
+    if v.cut:
+        rest = f"; {plural(v.after_cut, 'message')} lie after it" if v.after_cut else ""
+        yield f"{v.operator}: verified up to a cut: the recording ends before its run did{rest}"
+    if v.not_stored:
+        yield f"{v.operator}: {plural(v.not_stored, 'message')} it made again are missing from the recording"
 
 
 def fact_lines(report: VerifyReport) -> Iterator[str]:

@@ -209,6 +209,14 @@ class Recording:
             counts[name] = counts.get(name, 0) + len(self._entries(channel.id))
         return dict(sorted(counts.items()))
 
+    def counts(self, stream: str) -> Mapping[int, int]:
+        """Stored messages of a stream by incarnation; empty for a stream that the file does not hold."""
+        found: dict[int, int] = {}
+        if stream in self._streams:
+            for channel in self._streams[stream].channels:
+                found[channel.incarnation] = found.get(channel.incarnation, 0) + len(channel.entries)
+        return found
+
     def events(self) -> Iterator[Event]:
         """Events of the run, in file order."""
         for raw in self._in_file_order([c.id for c in self._channels_of(Kind.EVENTS)]):

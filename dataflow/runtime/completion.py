@@ -21,6 +21,7 @@ from dataflow.recording.layout import RESERVED_METADATA
 from dataflow.runtime.apart import Tell, apart
 from dataflow.runtime.execute import Watch
 from dataflow.runtime.firings import decode_batch
+from dataflow.runtime.ledger import read_ledger
 from dataflow.runtime.recompute import Feeding, Recomputation
 from dataflow.runtime.recorder import ENDS, OUTCOME, RecorderSink
 from dataflow.runtime.reexecute import Verification
@@ -37,14 +38,16 @@ COMPLETED = "dataflow:completed"
 class Completion:
     """What completing a recording came to.
 
-    `added`: streams that the thin recording did not hold. `messages` of all streams. Nothing is left at `path` when an
-    operator made anything other than recorded; where firings could not be made again, what they made is missing.
+    `added`: streams that the thin recording did not hold. `messages` of all streams; `kept` of them were recorded, but
+    no firing could be made again that made them, so they were taken over. Nothing is left at `path` when an operator
+    made anything other than recorded; where firings could not be made again, what was not recorded is missing.
     """
 
     path: Path
     operators: tuple[Verification, ...]
     added: tuple[str, ...]
     messages: int
+    kept: int
     nbytes: int
     wall: float
 
@@ -55,8 +58,8 @@ class Completion:
 
     @property
     def whole(self) -> bool:
-        """Every recorded firing was made again, and made what it had made."""
-        return all(v.verdict == "identical" for v in self.operators)
+        """Every firing of the run was made again, and made what it had made."""
+        return not self.kept and all(v.verdict == "identical" and not v.cut for v in self.operators)
 
     def as_json(self) -> dict[str, Any]:
         return {
@@ -65,6 +68,7 @@ class Completion:
             "whole": self.whole,
             "added": list(self.added),
             "messages": self.messages,
+            "kept": self.kept,
             "bytes": self.nbytes,
             "wall_s": self.wall,
             "operators": [v.to_wire() | {"verdict": v.verdict} for v in self.operators],
@@ -94,6 +98,7 @@ def complete(
             operators=tuple(Verification.from_wire(v) for v in found["operators"]),
             added=tuple(found["added"]),
             messages=found["messages"],
+            kept=found["kept"],
             nbytes=part.stat().st_size,
             wall=found["wall"],
         )
@@ -140,12 +145,17 @@ def answer(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
             return any(runner.result.first for runner in work.runners.values())
 
         results = work.run(until=progress)
+        ledger = read_ledger(recording, graph, feeding.operators)
+        for result in results.values():
+            ledger.enter(result)
+        kept = store.keep(recording)
         messages = store.close()
         added = sorted(s for s in store.streams if s not in recording.streams)
     return {
         "operators": [results[name].to_wire() for name in feeding.operators],
         "added": added,
         "messages": messages,
+        "kept": kept,
         "wall": time.monotonic() - started,
     }
 
@@ -173,6 +183,7 @@ class _Store:
         for operator, payload in recording.firings():
             self.sink.firings(operator, decode_batch(payload).records[-1].stamp, payload)
         self._copied = 0
+        self._taken: dict[str, set[tuple[int, int]]] = {stream: set() for stream in self.streams}
         for stream in sorted(recording.streams.keys() - graph.streams.keys()):
             self._copy(recording, stream)
 
@@ -188,7 +199,20 @@ class _Store:
             self._copied += 1
 
     def take(self, stream: str, entry: Entry) -> None:
+        self._taken[stream].add((entry.incarnation, entry.seq))
         self.sink.message(stream, entry.value, entry.seq, entry.incarnation)
+
+    def keep(self, recording: Recording) -> int:
+        """Takes over the recorded messages that were not made again; how many."""
+        kept = 0
+        for stream, taken in self._taken.items():
+            if sum(recording.counts(stream).values()) <= len(taken):
+                continue
+            for found in recording.messages([stream]):
+                if (found.incarnation, found.seq) not in taken:
+                    self.sink.message(stream, found.message, found.seq, found.incarnation)
+                    kept += 1
+        return kept
 
     def close(self) -> int:
         self.sink.close(self._outcome)

@@ -17,9 +17,9 @@ from dataflow.sync import FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
 Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot"]
-Outcome = Literal["ok", "error", "torn"]
+Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
-OUTCOMES: tuple[Outcome, ...] = ("ok", "error", "torn")
+OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
 
 
 WITHHELD = -1
@@ -59,7 +59,8 @@ class FiringRecord:
     `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
     decided since the previous record. `detail` holds what is particular to the kind: parameters and file hashes for
-    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, the error's text for the
+    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, what the operator sums up
+    for `finish`, the error's text for the
     outcome `error` (with `injected` where no call was made at all).
     `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
     """

@@ -63,7 +63,8 @@ class OutputComparison:
 
     `equal` have the recorded digest, `within` differ by no more than the tolerance, `beyond` by more or in what no
     tolerance applies to. `otherwise` counts what is no pair of messages: nothing where there was a message, a message
-    where there was nothing, an error. `unverifiable` firings could not be made. `first` are the outputs of the first
+    where there was nothing, an error. `unverifiable` firings could not be made. `own`: the first difference came while
+    all that the operator had been given was as recorded. `first` are the outputs of the first
     firing that differs beyond the tolerance. `got` is the digest of the first that differs at all, in firing `index`.
     `note` says why nothing was compared.
     """
@@ -74,6 +75,7 @@ class OutputComparison:
     beyond: int = 0
     otherwise: int = 0
     unverifiable: int = 0
+    own: bool = True
     max_difference: float = 0.0
     first: list[OutputDifference] = field(default_factory=list)
     index: int | None = None
@@ -165,8 +167,9 @@ class _Comparer:
         results = self.work.run(until=self._until(tell))
         for name, comparison in self.found.items():
             result = results[name]
-            comparison.otherwise = result.differing - comparison.within - comparison.beyond
+            comparison.otherwise = result.differing - result.states - comparison.within - comparison.beyond
             comparison.unverifiable = result.unverifiable + result.lost_records
+            comparison.own = result.first is None or result.own_fault
             if result.first is not None:
                 comparison.index, comparison.got = result.first.index, result.first.got
         return self.found

@@ -7,6 +7,7 @@ until then was as recorded (*culprit*); otherwise it follows from another's (*do
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
@@ -18,13 +19,27 @@ from dataflow.operator import Operator, OperatorSpec, outputs_of
 from dataflow.recording import Recording
 from dataflow.runtime.align import align_spec
 from dataflow.runtime.firings import WITHHELD, Emission, FiringRecord, decode_batch
-from dataflow.runtime.runner import Emitter, OperatorFailure, OutputPorts, call_operator, changed_input, entries_of
+from dataflow.runtime.runner import (
+    Emitter,
+    OperatorFailure,
+    OutputPorts,
+    call_operator,
+    changed_input,
+    entries_of,
+    readable,
+    summary_of,
+)
 from dataflow.runtime.seeding import firing_seed, seed_generators
 from dataflow.runtime.states import pack_state, unpack_state
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, InputRef, MessageRef, RecordedAligner
 
 CALLS = ("fire", "tick", "finish")
 """The kinds of records that stand for a call with messages."""
+
+RAISED = (Exception, SystemExit, KeyboardInterrupt)
+"""What an operator may raise; a live run records all of it as the operator's error."""
+
+_ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
 
 Verdict = Literal["identical", "culprit", "downstream", "unverifiable"]
 Digests = Mapping[str, Mapping[tuple[int, int], bytes]]
@@ -50,8 +65,12 @@ class Verification:
 
     `verified` firings were repeated and compared; `unverifiable` ones could not be, because a message they were given
     is not to be had; `lost_records` are missing between others, so the firings that follow them in their incarnation
-    cannot be repeated either; `after_cut` messages lie after the operator's last record. `tainted` is the index of the
-    first firing that was given anything other than recorded, `own_fault` says that the first difference came before.
+    cannot be repeated either. `beyond` of the unverifiable ones wait for a message after the last one of its stream.
+    `unaccounted` messages were made by no record, `unfinished` says that the records end before the run did: records
+    are lost. `cut` says that the recording itself ends before the run did, and before this operator; `after_cut` are
+    then the messages without a record. `not_stored` messages were made again, but are not in the recording.
+    `tainted` is the index of the first firing that was given anything other than recorded, `own_fault` says that the
+    first difference came before; `states` of the differences are in snapshots, not in messages.
     `began` says from where it was repeated: "start", "snapshot" (its recorded state) or "stateless".
     """
 
@@ -60,10 +79,15 @@ class Verification:
     verified: int = 0
     outputs: int = 0
     differing: int = 0
+    states: int = 0
     unverifiable: int = 0
-    after_cut: int = 0
+    beyond: int = 0
     lost_records: int = 0
-    complete: bool = False
+    unaccounted: int = 0
+    unfinished: bool = False
+    cut: bool = False
+    after_cut: int = 0
+    not_stored: int = 0
     began: str = "start"
     own_fault: bool = False
     tainted: int | None = None
@@ -75,7 +99,16 @@ class Verification:
     def verdict(self) -> Verdict:
         if self.first is not None:
             return "culprit" if self.own_fault else "downstream"
-        return "unverifiable" if self.unverifiable or self.lost_records else "identical"
+        return "identical" if self.whole else "unverifiable"
+
+    @property
+    def whole(self) -> bool:
+        """Everything that was recorded before the cut, if there is one, was repeated, and there was anything."""
+        if self.lost_records or self.unaccounted or self.unfinished:
+            return False
+        if self.cut:
+            return self.unverifiable == self.beyond and (self.verified > 0 or not (self.beyond or self.after_cut))
+        return not self.unverifiable
 
     def to_wire(self) -> dict[str, Any]:
         return asdict(self)
@@ -216,14 +249,12 @@ class RecordedRunner:
         calls = [r for r in self._records if r.kind in CALLS]
         self.result.firings = len(calls) + lost
         self.result.lost_records = lost
-        self.result.complete = any(r.kind == "finish" for r in calls)
         self.aligner_spec = align_spec(node, self.spec, static)
         self.aligner = RecordedAligner(self.aligner_spec, (r.firing() for r in calls))
         self._position = 0
         self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
         self._open = {s for streams in node.inputs.values() for s in streams}
-        self._static = static
         self.firings = 0
         self.done = NEVER
         self.ended = False
@@ -245,16 +276,36 @@ class RecordedRunner:
                 state.promised = FOREVER
                 self.emitter.end(state.stream, None, "static")
 
+    def _change(self, values: Mapping[str, Any]) -> None:
+        """Sets parameters to values that they had when the recording was made."""
+        for name, value in values.items():
+            self._changed[name] = value
+            try:
+                self.operator.set_parameter(name, value)
+            except Exception as error:
+                raise OperatorFailure(
+                    self.node.name, f"taking the recorded value of parameter {name!r}", error
+                ) from error
+
     def _take_up(self) -> None:
-        """Where re-execution begins in the middle: the parameters and the state of that moment."""
+        """Where re-execution begins in the middle: the last restart, the parameters and the state of that moment."""
+        changes: dict[str, Any] = {}
         for record in self._before:
             if record.kind == "param":
-                self._changed[record.detail["name"]] = record.detail["value"]
+                changes[record.detail["name"]] = record.detail["value"]
+            elif record.kind == "setup":
+                self._changed |= changes
+                changes = {}
+        again = [record for record in self._before if record.kind == "setup"]
+        if again:
+            self._start_again(again[-1])
+        self._change(changes)
+        if self._before and self._before[-1].kind == "snapshot":
+            self._restore_from(self._before[-1].detail["state"])
+
+    def _restore_from(self, state: bytes) -> None:
         try:
-            for name, value in self._changed.items():
-                self.operator.set_parameter(name, value)
-            if self._before and self._before[-1].kind == "snapshot":
-                self.operator.restore(unpack_state(self._before[-1].detail["state"]))
+            self.operator.restore(unpack_state(state))
         except Exception as error:
             raise OperatorFailure(self.node.name, "restore()", error) from error
 
@@ -263,15 +314,13 @@ class RecordedRunner:
             self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, NEVER))
             self.operator.setup()
             return dict(self.operator.static_outputs())
-        except Exception as error:
+        except RAISED as error:
             raise OperatorFailure(self.node.name, "setup()", error) from error
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
         if self._position < len(self._records) and not self.ended:
             self.aligner.push(stream, entry)
-        elif not self.result.complete:
-            self.result.after_cut += stream not in self._static
 
     def advance(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""
@@ -319,8 +368,7 @@ class RecordedRunner:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
         self.operator.close()
         self.operator = self.node.make()
-        for name, value in self._changed.items():
-            self.operator.set_parameter(name, value)
+        self._change(self._changed)
         statics = self._set_up()
         for (name, _), expected in zip(self.ports.states.items(), record.outputs, strict=True):
             if expected is not None and (name not in statics or statics[name].digest() != expected.digest):
@@ -329,12 +377,17 @@ class RecordedRunner:
     def _attempt(self, record: FiringRecord, change: Callable[[Mapping[str, Any]], object]) -> None:
         try:
             change(record.detail)
-        except Exception as error:
-            if record.outcome != "error":
-                self._differ(record, "", "no error", f"{type(error).__name__}: {error}")
+        except RAISED as error:
+            self._compare_error(record, error)
         else:
-            if record.outcome == "error":
-                self._differ(record, "", f"error: {record.detail.get('error', '')}", "no error")
+            self._compare_error(record, None)
+
+    def _compare_error(self, record: FiringRecord, error: BaseException | None) -> None:
+        """Compares what a call raised, if anything; addresses in memory, which texts may hold, are left out."""
+        expected = f"error: {record.detail.get('error', '')}" if record.outcome == "error" else "no error"
+        got = "no error" if error is None else f"error: {readable(error)}"
+        if _ADDRESS.sub("", expected) != _ADDRESS.sub("", got):
+            self._differ(record, "", expected, got)
 
     def _restore(self, record: FiringRecord) -> None:
         """A replay that began in the middle: with this state, or with one that cannot be had again."""
@@ -345,15 +398,13 @@ class RecordedRunner:
             del self._records[self._position :]
             self.aligner = RecordedAligner(self.aligner_spec, ())
             return
-        try:
-            self.operator.restore(unpack_state(state))
-        except Exception as error:
-            raise OperatorFailure(self.node.name, "restore()", error) from error
+        self._restore_from(state)
 
     def _compare_state(self, record: FiringRecord) -> None:
         state = self.operator.snapshot()
         packed = b"" if state is None else pack_state(state)
         if packed != record.detail["state"]:
+            self.result.states += 1
             self._differ(record, "", "the recorded state", "another state")
 
     def _is_lost(self, missing: MessageRef | None) -> bool:
@@ -388,16 +439,18 @@ class RecordedRunner:
         self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, firing.stamp))
         try:
             messages = outputs_of(self.operator, call_operator(self.operator, firing))
-        except Exception as error:
-            if record.outcome != "error":
-                self._differ(record, "", record.outcome, f"{type(error).__name__}: {error}")
+            if record.outcome == "error":
+                self.ports.check(messages, firing.stamp)
+        except RAISED as error:
+            self._compare_error(record, error)
             messages = {}
         else:
-            if record.outcome == "error":
-                self._differ(record, "", f"error: {record.detail.get('error', '')}", "no error")
+            self._compare_error(record, None)
             if self.paranoid and (problem := changed_input(self.node, firing)) is not None:
                 raise OperatorFailure(self.node.name, f"{record.kind} at stamp {record.stamp}", problem)
         self._compare(record, messages)
+        if "summary" in record.detail:
+            self._compare_summary(record)
         self.firings += record.kind != "finish"
         self.result.verified += 1
         self.busy_ns += time.time_ns() - started
@@ -429,6 +482,13 @@ class RecordedRunner:
                 state.last = state.promised = max(state.promised, got.stamp)
                 self.emitter.message(state.stream, entry)
 
+    def _compare_summary(self, record: FiringRecord) -> None:
+        """What the operator sums up at its end: all that a sink makes."""
+        expected, got = record.detail["summary"], summary_of(self.operator, self.node.name)
+        name = next((n for n in (*expected, *got) if repr(expected.get(n)) != repr(got.get(n))), None)
+        if name is not None:
+            self._differ(record, "", *(f"summary {name}: {values.get(name, 'nothing')}" for values in (expected, got)))
+
     def _differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
         self.result.differing += 1
         if self.result.first is None:
@@ -442,6 +502,8 @@ class RecordedRunner:
         self.result.unverifiable = sum(r.kind in CALLS for r in self._records[self._position :])
         if self.result.unverifiable and (lost := self.aligner.missing()) is not None:
             self.result.missing = f"{lost.stream} #{lost.seq}"
+            if (lost.incarnation, lost.seq) > self._latest.get(lost.stream, (-1, -1)):
+                self.result.beyond = self.result.unverifiable
         self.ports.end(None, "end of records")
 
 

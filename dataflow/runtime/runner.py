@@ -114,19 +114,7 @@ class OutputPorts:
         Raises `OutputError` for a stamp that the port may not carry. With `lossy`, a stamp that does not increase is
         no error: the message is not sent, and its emission is marked `withheld`.
         """
-        for name, message in messages.items():
-            state = self.states[name]
-            earliest = firing - state.port.lag
-            if message.stamp < earliest:
-                allowed = f"at or after the firing's {firing}" + (
-                    f" less its lag of {state.port.lag} ns" if state.port.lag else ""
-                )
-                raise OutputError(f"{self.node.name}.{name} emitted stamp {message.stamp}; it must lie {allowed}")
-            if message.stamp <= state.last and not self.lossy:
-                raise OutputError(
-                    f"{self.node.name}.{name} emitted stamp {message.stamp} after {state.last}: "
-                    "the stamps of a stream strictly increase"
-                )
+        self.check(messages, firing)
         emissions: list[Emission | None] = []
         for name, state in self.states.items():
             emitted = messages.get(name)
@@ -147,6 +135,22 @@ class OutputPorts:
             state.seq += 1
             self.emitted += 1
         return tuple(emissions)
+
+    def check(self, messages: Mapping[str, Message], firing: int) -> None:
+        """Raises `OutputError` for a stamp that the port may not carry."""
+        for name, message in messages.items():
+            state = self.states[name]
+            earliest = firing - state.port.lag
+            if message.stamp < earliest:
+                allowed = f"at or after the firing's {firing}" + (
+                    f" less its lag of {state.port.lag} ns" if state.port.lag else ""
+                )
+                raise OutputError(f"{self.node.name}.{name} emitted stamp {message.stamp}; it must lie {allowed}")
+            if message.stamp <= state.last and not self.lossy:
+                raise OutputError(
+                    f"{self.node.name}.{name} emitted stamp {message.stamp} after {state.last}: "
+                    "the stamps of a stream strictly increase"
+                )
 
     def publish(self) -> None:
         """Sends what was prepared, in order."""
@@ -404,6 +408,11 @@ class OperatorRunner:
         *,
         injected: bool = False,
     ) -> None:
+        detail: dict[str, Any] = {}
+        if error is not None:
+            detail = {"error": error, **({"injected": True} if injected else {})}
+        elif kind == "finish" and (summary := summary_of(self.operator, self.node.name)):
+            detail = {"summary": summary}
         self.records.add(
             kind,
             firing.stamp,
@@ -415,7 +424,7 @@ class OperatorRunner:
             outputs=outputs,
             outcome="ok" if error is None else "error",
             drops=tuple(self.take_drops()),
-            detail={} if error is None else {"error": error, **({"injected": True} if injected else {})},
+            detail=detail,
         )
 
 

@@ -12,6 +12,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.runtime.execute import Watch, execute
+from dataflow.runtime.ledger import read_ledger
 from dataflow.runtime.midway import verify_from
 from dataflow.runtime.outputs import OutputComparison, compare_outputs
 from dataflow.runtime.plan import RunPlan
@@ -54,8 +55,13 @@ class VerifyReport:
 
     @property
     def identical(self) -> bool:
-        """True only when every recorded firing was repeated and every output was the same, bit for bit."""
-        return all(v.verdict == "identical" for v in self.operators)
+        """True only when every firing of the run was repeated and every output was the same, bit for bit."""
+        return not self.cut and all(v.verdict == "identical" for v in self.operators)
+
+    @property
+    def cut(self) -> bool:
+        """The recording ends before its run did: what it was verified up to is all that can be said of it."""
+        return any(v.cut for v in self.operators)
 
     @property
     def within_tolerance(self) -> bool:
@@ -71,7 +77,7 @@ class VerifyReport:
         compared = self.comparisons.get(verification.operator)
         if self.tolerance is None or verification.first is None or compared is None or compared.note:
             return verification.verdict
-        return "within tolerance" if compared.tolerated else "culprit"
+        return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
 
     def repeats(self, operator: str) -> bool | None:
         """Whether an operator that differs did so twice alike; None where it was not run twice."""
@@ -98,6 +104,7 @@ class VerifyReport:
             "culprits": list(self.culprits),
             "start_s": self.start,
             "torn": self.torn,
+            "cut": self.cut,
             "messages": self.messages,
             "streams": self.streams,
             "wall_s": self.wall,
@@ -122,9 +129,10 @@ def verify(
     """Re-executes a recording by its firing records and compares.
 
     `first`: verify that operator and what follows from it; `only`: that one alone. What feeds them is then taken from
-    the recording. Operators marked `external` always are. Operators that differ are run once more, alone and given the
-    recorded inputs, and their messages compared field by field: the culprits as far as the first difference, with a
-    `tolerance` (absolute, in the unit of each floating-point field) all of them to the end.
+    the recording, or verified as well where it was not recorded. Operators marked `external` always are taken from it.
+    Operators that differ are run once more, alone and given the recorded inputs, and their messages compared field by
+    field: the culprits as far as the first difference, with a `tolerance` (absolute, in the unit of each floating-point
+    field) all of them to the end.
     `start` (seconds from the first message) begins in the middle, from recorded states where there are any; see
     `midway.verify_from`. Further options are the fields of `RunPlan`.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
@@ -133,8 +141,10 @@ def verify(
         raise ReplayError(f"tolerance {tolerance}: expected a finite number, 0 or more")
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
-        chosen = _chosen(played, first, only)
+        chosen = _with_makers(recording, played, _chosen(played, first, only))
         require_records(recording, sorted(chosen))
+        require_ports(recording, played, sorted(chosen))
+        ledger = read_ledger(recording, played, sorted(chosen))
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
@@ -144,6 +154,8 @@ def verify(
         torn = recording.torn
     if start is not None:
         results, wall = verify_from(path, played, chosen, begin)
+        for result in results:
+            ledger.enter(result)
         return VerifyReport(
             operators=tuple(results),
             stood_in=tuple(name for name in played.nodes if name not in chosen or name in feeding),
@@ -158,6 +170,8 @@ def verify(
     report = execute(RunPlan(played, log=log, verify=frozenset(chosen), **options), mode="verify", watch=watch)
     found = {v["operator"]: Verification.from_wire(v) for v in report.verifications}
     compared = [found[name] for name in played.nodes if name in found]
+    for verification in compared:
+        ledger.enter(verification)
     span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
     differing = [v.operator for v in compared if v.first and (tolerance is not None or v.verdict == "culprit")]
     return VerifyReport(
@@ -204,6 +218,19 @@ def require_records(recording: Recording, operators: Iterable[str]) -> None:
             )
 
 
+def require_ports(recording: Recording, graph: Graph, operators: Iterable[str]) -> None:
+    """Raises `ReplayError` for the first operator whose outputs are not those it was recorded with."""
+    for name in operators:
+        node = graph.nodes[name]
+        record = next((r for r in recorded_firings(recording, name) if r.outcome == "ok" and r.outputs), None)
+        if record is not None and len(record.outputs) != len(node.outputs):
+            raise ReplayError(
+                f"{recording.path}: operator {name!r} was recorded with {len(record.outputs)} output ports and has "
+                f"{len(node.outputs)} now ({', '.join(node.outputs)}), so its firings cannot be compared: verify with "
+                f"the operator as it was, or record anew"
+            )
+
+
 def _compare(
     path: Path, graph: Graph, operators: Collection[str], tolerance: float | None
 ) -> Mapping[str, OutputComparison]:
@@ -234,6 +261,18 @@ def _chosen(graph: Graph, first: str | None, only: str | None) -> set[str]:
     while new := {e.consumer for e in edges if e.producer in following} - following:
         following |= new
     return following & able
+
+
+def _with_makers(recording: Recording, graph: Graph, chosen: set[str]) -> set[str]:
+    """The operators with those that make what they take, as far as it was not recorded."""
+    wanted, left = set(chosen), list(chosen)
+    while left:
+        for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
+            maker = graph.nodes[graph.streams[stream].node]
+            if stream not in recording.streams and not (maker.source or maker.external or maker.name in wanted):
+                wanted.add(maker.name)
+                left.append(maker.name)
+    return wanted
 
 
 def _differing_facts(metadata: Mapping[str, Mapping[str, str]], graph: Graph) -> tuple[tuple[str, str, str], ...]:

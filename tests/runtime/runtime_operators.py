@@ -233,6 +233,25 @@ class Tuned(Operator):
         self.total = state["total"]
 
 
+class TunedAtStart(Tuned):
+    """Keeps the factor with which it was started."""
+
+    def setup(self) -> None:
+        super().setup()
+        self.began_with = self.factor
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        made = super().process(x)
+        return value(made.stamp, number(made) + self.began_with)
+
+
+class TunedNudged(Tuned):
+    """`Tuned` as another machine's rounding might leave it."""
+
+    def setup(self) -> None:
+        self.total = 1e-4
+
+
 class TunedForgetful(Tuned):
     """`Tuned` whose `restore` loses something."""
 

@@ -74,7 +74,7 @@ def batches(draw: st.DrawFn) -> list[FiringRecord]:
             stale=draw(st.frozensets(names, max_size=2)),
             late=draw(st.frozensets(names, max_size=2)),
             outputs=tuple(draw(st.lists(emissions, max_size=3))),
-            outcome=draw(st.sampled_from(["ok", "error", "torn"])),
+            outcome=draw(st.sampled_from(["ok", "error"])),
             drops=tuple(draw(st.lists(drops, max_size=2))),
             detail=draw(st.dictionaries(names, st.one_of(st.integers(0, 9), names), max_size=2)),
             wall_start=draw(numbers),

@@ -8,7 +8,9 @@ import pytest
 
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
+from dataflow.runtime.chaos import plan_of
 from dataflow.runtime.execute import replay, run
+from dataflow.runtime.reexecute import recorded_firings
 from dataflow.runtime.replay import ReplayError
 from dataflow.runtime.verify import verify
 
@@ -64,6 +66,42 @@ def test_a_state_that_restores_to_something_else_is_found(recorded: Path, tmp_pa
     report = verify(recorded, graph=load_graph(changed, settings=["count=120"]), start=0.5, only="tuned")
 
     assert report.culprits == ("tuned",)
+
+
+def test_a_middle_after_a_restart_has_the_parameters_with_which_it_was_started_again(tmp_path: Path) -> None:
+    text = (HERE / "chaos.yaml").read_text().replace("runtime_operators:Tuned", "runtime_operators:TunedAtStart")
+    file, path = tmp_path / "chaos.yaml", tmp_path / "run.mcap"
+    file.write_text(text)
+    graph = load_graph(file, settings=["count=150"], live=True)
+    plan = {
+        "faults": [
+            {"kind": "param", "operator": "tuned", "name": "factor", "values": [3.0], "at": "200ms"},
+            {"kind": "raise", "operator": "tuned", "at": "500ms"},
+            {"kind": "param", "operator": "tuned", "name": "factor", "values": [2.0], "at": "700ms"},
+        ]
+    }
+    run(graph, live=True, placement="one_host", record=path, faults=plan_of(plan, graph), rate=1.0)
+
+    report = verify(path, start=0.9, only="tuned")
+
+    with Recording(path) as recording:
+        kinds = [r.kind for r in recorded_firings(recording, "tuned") if r.kind in ("setup", "param")]
+    assert kinds == ["setup", "param", "setup", "param"]
+    assert report.identical, report.as_json()
+    assert report.operators[0].began == "snapshot"
+
+
+def test_a_tolerance_for_messages_is_none_for_the_states_between_them(recorded: Path, tmp_path: Path) -> None:
+    text = (HERE / "chaos.yaml").read_text().replace("runtime_operators:Tuned", "runtime_operators:TunedNudged")
+    changed = tmp_path / "changed.yaml"
+    changed.write_text(text)
+
+    graph = load_graph(changed, settings=["count=120"])
+    exact, tolerant = (verify(recorded, graph=graph, only="tuned", tolerance=t) for t in (None, 0.01))
+
+    assert exact.culprits == ("tuned",)
+    assert exact.operators[0].states > 0
+    assert tolerant.within_tolerance, tolerant.as_json()
 
 
 def test_a_start_beyond_the_end_is_refused(recorded: Path) -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 
-from runtime_operators import Broken, Smooth
+from runtime_operators import Broken, Merge, Smooth, Sum, number
 
 from dataflow.messages import FeatureVector
 
@@ -64,3 +65,28 @@ class Doubled(Broken):
 
     def process(self, x: FeatureVector) -> FeatureVector:
         return x.replace(vectors=x.vectors * 2)
+
+
+class BrokenOtherwise(Broken):
+    """A pass-through that fails where it did, in another way."""
+
+    def process(self, x: FeatureVector) -> FeatureVector:
+        if number(x) == self.at:
+            raise KeyError("gripper")
+        return super().process(x)
+
+
+class MergeDoubled(Merge):
+    """`Merge` that somebody changed."""
+
+    def process(self, all: Mapping[str, FeatureVector]) -> FeatureVector:
+        made = super().process(all)
+        return made.replace(vectors=made.vectors * 2)
+
+
+class SumHalved(Sum):
+    """A sink that somebody changed."""
+
+    def summary(self) -> Mapping[str, float]:
+        found = super().summary()
+        return {**found, "total": found["total"] / 2}
