@@ -43,7 +43,8 @@ class BaselineError(ValueError):
 class Judged:
     """One operator of one recording, measured by what is expected of it: the recording, or the accepted outcome.
 
-    `firm`: it came out alike both times it was run, so it can be accepted.
+    `firm`: every call was repeated, and neither it nor what it depends on came out otherwise when it was run again; only
+    that can be accepted.
     """
 
     operator: str
@@ -145,7 +146,7 @@ class Baseline:
         """Takes over what a recording came to. (operators accepted anew or otherwise, operators that cannot be)."""
         outcomes = {j.operator: j.outcome for j in checked.judged if j.outcome is not None and j.firm}
         refused = [
-            j.operator for j in checked.judged if j.verdict == "unverifiable" or (j.outcome is not None and not j.firm)
+            j.operator for j in checked.judged if not j.firm and (j.outcome is not None or j.verdict == "unverifiable")
         ]
         before = self.of(checked.path)
         changed = [name for name in {**before, **outcomes} if before.get(name) != outcomes.get(name)]
@@ -208,7 +209,8 @@ def check(
 def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged, ...]:
     """The verdict on each operator, given what has been accepted.
 
-    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well.
+    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well. Where
+    calls could not be repeated, neither a tolerance nor an accepted outcome lets it pass.
     """
     outcomes = {v.operator: outcome_of(report, v) for v in report.operators}
     unexpected = {
@@ -216,17 +218,22 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
         for v in report.operators
         if outcomes[v.operator] is not None and outcomes[v.operator] != accepted.get(v.operator)
     }
+    unsteady = {v.operator for v in report.operators if report.repeats(v.operator) is False}
     judged = []
     for v in report.operators:
         own, outcome = report.verdict(v), outcomes[v.operator]
+        whole = not (v.unverifiable or v.lost_records)
         verdict: OperatorVerdict = own
-        if v.operator in accepted and outcome is None and own != "unverifiable":
+        if v.operator in accepted and outcome is None and whole:
             verdict = "not as accepted"
         elif outcome is not None and v.operator not in unexpected:
             verdict = "accepted"
         elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
             verdict = "culprit"
-        judged.append(Judged(v.operator, verdict, outcome, report.repeats(v.operator) is not False))
+        if verdict in PASSES and not whole:
+            verdict = "unverifiable"
+        steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
+        judged.append(Judged(v.operator, verdict, outcome, whole and steady))
     return tuple(judged)
 
 
