@@ -106,6 +106,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
     from dataflow.runtime.attach import NotRunning
+    from dataflow.runtime.chaos import ChaosError
     from dataflow.runtime.replay import ReplayError
     from dataflow.runtime.report import RunFailed
     from dataflow.transport.registry import RegistryError
@@ -118,6 +119,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         OperatorImportError,
         NotRunning,
         RegistryError,
+        ChaosError,
     )
     viewer = sys.modules.get("dataflow.view.process")  # importing it takes long; an error of it has imported it
     match error:

@@ -43,8 +43,8 @@ class BaselineError(ValueError):
 class Judged:
     """One operator of one recording, measured by what is expected of it: the recording, or the accepted outcome.
 
-    `firm`: every call was repeated, and neither it nor what it depends on came out otherwise when it was run again; only
-    that can be accepted.
+    `firm`: every call was repeated, and neither it nor what it depends on came out otherwise when run again. Only that
+    can be accepted.
     """
 
     operator: str

@@ -88,6 +88,30 @@ def test_wrong_options_are_refused_before_anything_runs(
     assert told.stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (b"faults:\n  - {kind: stop, operator: lefd, for: 1s, at: 1s}", "plan.yaml:2:28: no operator 'lefd'"),
+        (
+            b"faults:\n  - {kind: param, operator: smooth, name: sleep, values: [1], at: 1s}",
+            "'sleep' of 'smooth' cannot",
+        ),
+        (b"\xff\xfe\x00", "plan.yaml: 'utf-8' codec"),
+    ],
+)
+def test_a_faulty_fault_plan_is_refused_before_anything_runs(
+    dataflow, small: Path, tmp_path: Path, plan: bytes, message: str
+) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_bytes(plan)
+
+    told = dataflow("run", small, "--chaos", path, code=2)
+
+    assert message in told.stderr
+    assert "internal error" not in told.stderr
+    assert told.stdout == ""
+
+
 def test_a_replay_onto_itself_is_refused_under_any_name(dataflow, recorded, tmp_path: Path) -> None:
     path, _ = recorded
     link = tmp_path / "link.mcap"
