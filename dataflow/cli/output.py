@@ -81,6 +81,11 @@ def wants_traceback() -> bool:
     return os.environ.get(TRACEBACK, "0") not in ("", "0")
 
 
+def own_traceback(text: str) -> str:
+    """A traceback of the runtime's own code where it is asked for; else how to ask for it."""
+    return text if wants_traceback() else f"where in the code: run it again with {TRACEBACK}=1"
+
+
 @contextmanager
 def friendly_errors() -> Iterator[None]:
     """Turns the errors that bad input causes into one clear message and an exit code; others pass."""
@@ -126,7 +131,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         case GraphError():
             return f"\n{error}", "", COULD_NOT_RUN
         case RunFailed():
-            return str(error), error.details, INTERRUPTED if error.interrupted else DIFFERENT
+            details = own_traceback(error.details) if error.internal else error.details
+            return str(error), details, INTERRUPTED if error.interrupted else DIFFERENT
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:

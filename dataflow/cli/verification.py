@@ -8,9 +8,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from dataflow.cli.arguments import FLAG, Json, Settings, existing, output_file
+from dataflow.cli.arguments import FLAG, Json, Settings, check_offset, existing, output_file
 from dataflow.cli.execution import HostEach, OneHost, Quiet
-from dataflow.cli.output import COULD_NOT_RUN, DIFFERENT, err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.output import (
+    COULD_NOT_RUN,
+    DIFFERENT,
+    err,
+    fail,
+    friendly_errors,
+    out,
+    own_traceback,
+    print_json,
+    say,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -113,6 +123,7 @@ def verify(
             raise fail("--set changes a graph file: name it with --graph")
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
+        check_offset("--start", start)
         if start is not None and (tolerance is not None or one_host or host_each or baseline is not None):
             raise fail("--start goes with --from, --only, --graph and --json only")
         if accept and baseline is None:
@@ -180,7 +191,8 @@ def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | N
 
         write_junit(junit, checked, explain)
     if single and checked[0].report is None:
-        fail(checked[0].error, details=checked[0].details)
+        [one] = checked
+        fail(one.error, details=own_traceback(one.details) if one.internal else one.details)
     elif single and json:
         print_json(checked[0].as_json())
     elif single:

@@ -59,7 +59,10 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all."""
+    """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all.
+
+    `internal`: `details` is a traceback of the runtime's own code.
+    """
 
     path: Path
     name: str
@@ -68,6 +71,7 @@ class Checked:
     error: str = ""
     details: str = ""
     wall: float = 0.0
+    internal: bool = False
 
     @property
     def verdict(self) -> RecordingVerdict:
@@ -190,19 +194,22 @@ def check(
     Raises only `RunFailed` for a run that was interrupted.
     """
     started = time.monotonic()
+
+    def could_not(error: str, details: str = "", *, internal: bool = False) -> Checked:
+        return Checked(path, name, None, (), error, details, time.monotonic() - started, internal)
+
     try:
         report = verify(path)
     except RunFailed as failure:
         if failure.interrupted:
             raise
-        return Checked(path, name, None, (), str(failure), failure.details, time.monotonic() - started)
+        return could_not(str(failure), failure.details, internal=failure.internal)
     except (RecordingError, ReplayError, FiringRecordError, MessageError, ParameterError, OSError) as error:
-        return Checked(path, name, None, (), str(error), "", time.monotonic() - started)
+        return could_not(str(error))
     except (
         Exception
     ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
-        what = f"{type(error).__name__}: {error}"
-        return Checked(path, name, None, (), what, traceback.format_exc(), time.monotonic() - started)
+        return could_not(f"{type(error).__name__}: {error}", traceback.format_exc(), internal=True)
     return Checked(path, name, report, judge(report, accepted or {}), wall=time.monotonic() - started)
 
 

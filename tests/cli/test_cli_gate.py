@@ -202,6 +202,9 @@ def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder:
         (["--baseline", "b.yaml"], "ends in .json"),
         (["--junit", "v.txt"], "ends in .xml"),
         (["--tolerance", "-1"], "0 or more"),
+        (["--start", "nan"], "--start nan: expected seconds"),
+        (["--start", "inf"], "--start inf: expected seconds"),
+        (["--start", "-1"], "--start -1: expected seconds"),
         (["absent.mcap"], "absent.mcap"),
     ],
 )

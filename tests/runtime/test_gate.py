@@ -228,6 +228,17 @@ def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Excepti
     assert not one.passed
 
 
+def test_an_operators_traceback_is_told_from_the_runtimes_own() -> None:
+    def failing(operator: str | None) -> Checked:
+        def verify(path: Path) -> VerifyReport:
+            raise RunFailed("it failed", "Traceback (most recent call last)", operator)
+
+        return check(Path("x.mcap"), "x", verify)
+
+    assert failing(None).internal
+    assert not failing("smooth").internal
+
+
 def test_an_interruption_ends_the_gate() -> None:
     def interrupted(path: Path) -> VerifyReport:
         raise RunFailed("stopped", interrupted=True)
