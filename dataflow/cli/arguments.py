@@ -99,13 +99,18 @@ def span(recording: Recording, streams: Iterable[str]) -> tuple[int, int] | None
     return (min(firsts), max(lasts)) if firsts and lasts else None
 
 
+def check_offset(option: str, value: float | None) -> None:
+    """Refuses what cannot be seconds into a recording."""
+    if value is not None and not 0 <= value < 1e9:
+        raise fail(f"{option} {value:g}: expected seconds from the recording's first message, 0 or more")
+
+
 def window(
     whole: tuple[int, int] | None, start: float | None, end: float | None, path: Path
 ) -> tuple[int | None, int | None]:
     """`--start` and `--end` as stamps (ns), checked against what the recording holds."""
-    for option, value in (("--start", start), ("--end", end)):
-        if value is not None and not 0 <= value < 1e9:
-            raise fail(f"{option} {value:g}: expected seconds from the recording's first message, 0 or more")
+    check_offset("--start", start)
+    check_offset("--end", end)
     if start is not None and end is not None and end <= start:
         raise fail(f"--end {end:g} must be greater than --start {start:g}")
     if whole is None:

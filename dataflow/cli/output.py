@@ -81,6 +81,11 @@ def wants_traceback() -> bool:
     return os.environ.get(TRACEBACK, "0") not in ("", "0")
 
 
+def own_traceback(text: str) -> str:
+    """A traceback of the runtime's own code where it is asked for; else how to ask for it."""
+    return text if wants_traceback() else f"where in the code: run it again with {TRACEBACK}=1"
+
+
 @contextmanager
 def friendly_errors() -> Iterator[None]:
     """Turns the errors that bad input causes into one clear message and an exit code; others pass."""
@@ -106,6 +111,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
     from dataflow.runtime.attach import NotRunning
+    from dataflow.runtime.chaos import ChaosError
     from dataflow.runtime.replay import ReplayError
     from dataflow.runtime.report import RunFailed
     from dataflow.transport.registry import RegistryError
@@ -118,13 +124,15 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         OperatorImportError,
         NotRunning,
         RegistryError,
+        ChaosError,
     )
     viewer = sys.modules.get("dataflow.view.process")  # importing it takes long; an error of it has imported it
     match error:
         case GraphError():
             return f"\n{error}", "", COULD_NOT_RUN
         case RunFailed():
-            return str(error), error.details, INTERRUPTED if error.interrupted else DIFFERENT
+            details = own_traceback(error.details) if error.internal else error.details
+            return str(error), details, INTERRUPTED if error.interrupted else DIFFERENT
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:

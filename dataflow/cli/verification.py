@@ -6,10 +6,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
-from dataflow.cli.arguments import FLAG, Json, Settings, existing, output_file
+from dataflow.cli.arguments import FLAG, Json, Settings, check_offset, existing, output_file
 from dataflow.cli.execution import HostEach, OneHost, Quiet
-from dataflow.cli.output import COULD_NOT_RUN, DIFFERENT, err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.output import (
+    COULD_NOT_RUN,
+    DIFFERENT,
+    err,
+    fail,
+    friendly_errors,
+    out,
+    own_traceback,
+    print_json,
+    say,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -112,6 +123,7 @@ def verify(
             raise fail("--set changes a graph file: name it with --graph")
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
+        check_offset("--start", start)
         if start is not None and (tolerance is not None or one_host or host_each or baseline is not None):
             raise fail("--start goes with --from, --only, --graph and --json only")
         if accept and baseline is None:
@@ -154,7 +166,7 @@ def _check(
     checked = []
     for number, (path, name) in enumerate(targets, start=1):
         if not quiet and not single:
-            say(f"[dim]{number} of {len(targets)}: {name}[/]")
+            say(f"[dim]{number} of {len(targets)}: {escape(name)}[/]")
         accepted = {} if known is None else known.of(path)
         checked.append(check(path, name, _verifier(options, quiet=quiet), accepted))
     return checked
@@ -179,7 +191,8 @@ def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | N
 
         write_junit(junit, checked, explain)
     if single and checked[0].report is None:
-        fail(checked[0].error, details=checked[0].details)
+        [one] = checked
+        fail(one.error, details=own_traceback(one.details) if one.internal else one.details)
     elif single and json:
         print_json(checked[0].as_json())
     elif single:
@@ -194,7 +207,8 @@ def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, who
     """Says what the baseline names in vain; with `accept`, takes over what differs and says what that is."""
     if not accept:
         if whole and (unused := known.unused(checked)):
-            say(f"[yellow]note:[/] {known.file} names recordings that were not verified: {', '.join(unused)}")
+            names = escape(", ".join(unused))
+            say(f"[yellow]note:[/] {escape(str(known.file))} names recordings that were not verified: {names}")
         return
     news = []
     for one in checked:
@@ -204,11 +218,11 @@ def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, who
         news += [f"{one.name}: {name}" for name in changed]
         for name in refused:
             say(
-                f"[yellow]not accepted:[/] {one.name}: {name} (not wholly verifiable, or other each time: "
+                f"[yellow]not accepted:[/] {escape(one.name)}: {name} (not wholly verifiable, or other each time: "
                 "it could not be recognised again)"
             )
     known.save()
-    say(f"accepted into {known.file}: " + ("; ".join(news) if news else "nothing new"))
+    say(escape(f"accepted into {known.file}: " + ("; ".join(news) if news else "nothing new")))
 
 
 def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
@@ -216,5 +230,10 @@ def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
         return COULD_NOT_RUN
     if accepted is None:
         return 0 if all(c.passed for c in checked) else DIFFERENT
-    left = [j for c in checked for j in c.judged if not j.passed and accepted.of(c.path).get(j.operator) != j.outcome]
+    left = [
+        j
+        for c in checked
+        for j in c.judged
+        if not j.passed and (not j.firm or accepted.of(c.path).get(j.operator) != j.outcome)
+    ]
     return DIFFERENT if left else 0

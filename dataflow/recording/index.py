@@ -407,7 +407,7 @@ class McapFile:
         try:
             return record.read(ReadDataStream(io.BytesIO(body)))
         except (McapError, struct.error, UnicodeDecodeError, ValueError) as error:
-            raise self._damaged(f"a {record.__name__} record cannot be read: {error}") from error
+            raise self._damaged(f"a {record.__name__} record cannot be read: {error!r}") from error
 
     def _damaged(self, what: str) -> RecordingError:
         return RecordingError(f"{self.path} is damaged: {what}; `mcap recover` may save what is left")

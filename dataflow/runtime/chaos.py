@@ -11,15 +11,16 @@ import random
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 import pydantic
-from ruamel.yaml import YAML
-from ruamel.yaml.error import MarkedYAMLError
 
-from dataflow.graph.model import Graph
+from dataflow.graph.document import at, parse, plain
+from dataflow.graph.model import Graph, Node
+from dataflow.graph.problems import Place, Problems, did_you_mean
 from dataflow.messages.base import Message
-from dataflow.operator import Duration, is_live
+from dataflow.operator import ParameterError, is_live, validate_parameters
+from dataflow.sync.stamps import parse_duration
 
 SECOND = 1_000_000_000
 TO_OPERATORS = ("raise", "hang", "slow", "leak")
@@ -28,18 +29,35 @@ TO_PROCESSES = ("kill", "freeze")
 
 
 class ChaosError(ValueError):
-    """A fault plan that cannot be followed: says which entry, and what would be right."""
+    """A fault plan that cannot be followed: says where (in a file: the line), and what would be right.
+
+    `where` leads to what is wrong in the plan: ("faults", 2, "operator").
+    """
+
+    def __init__(self, what: str, where: tuple[str | int, ...] = (), hint: str = "") -> None:
+        place = ".".join(map(str, where))
+        super().__init__((f"{place}: " if place else "") + what + (f"; {hint}" if hint else ""))
+        self.what, self.where, self.hint = what, where, hint
+
+
+def _with_unit(value: Any) -> int:
+    if not isinstance(value, str):
+        raise ValueError("a duration has a unit, such as 100ms")
+    return parse_duration(value)
+
+
+_Time = Annotated[int, pydantic.BeforeValidator(_with_unit)]
+"""Nanoseconds of a duration with a unit."""
+_Span = Annotated[_Time, pydantic.Field(gt=0)]
 
 
 class _Timed(pydantic.BaseModel):
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 
     operator: str
-    at: Duration | None = pydantic.Field(None, description="time after the sources were released")
-    every: Duration | None = pydantic.Field(
-        None, description="again and again, at random times with this mean distance"
-    )
-    until: Duration | None = pydantic.Field(None, description="end of `every`; default: the whole run")
+    at: _Time | None = pydantic.Field(None, description="time after the sources were released")
+    every: _Span | None = pydantic.Field(None, description="again and again, at random times with this mean distance")
+    until: _Span | None = pydantic.Field(None, description="end of `every`; default: the whole run")
 
     @pydantic.model_validator(mode="after")
     def _once_or_often(self) -> _Timed:
@@ -54,24 +72,24 @@ class _Plain(_Timed):
 
 class _Lasting(_Timed):
     kind: Literal["freeze", "stop"]
-    span: Duration = pydantic.Field(alias="for")
+    span: _Span = pydantic.Field(alias="for")
 
 
 class _Slow(_Timed):
     kind: Literal["slow"]
-    by: Duration
-    span: Duration = pydantic.Field(alias="for")
+    by: _Span
+    span: _Span = pydantic.Field(alias="for")
 
 
 class _Flood(_Timed):
     kind: Literal["flood"]
     factor: int = pydantic.Field(ge=2, le=1000)
-    span: Duration = pydantic.Field(alias="for")
+    span: _Span = pydantic.Field(alias="for")
 
 
 class _Jump(_Timed):
     kind: Literal["jump", "past"]
-    by: Duration
+    by: _Span
     back: bool = pydantic.Field(True, description="backwards; false: forwards")
 
 
@@ -117,50 +135,101 @@ def load_plan(path: Path, graph: Graph, *, seed: int | None = None) -> Iterator[
 
     `seed` replaces the plan's own. Raises `ChaosError`.
     """
+    problems, file = Problems(), str(path)
     try:
-        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
-    except (OSError, MarkedYAMLError) as error:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
         raise ChaosError(f"{path}: {error}") from error
-    return plan_of(content, graph, seed=seed, name=str(path))
+    tree = parse(text, file, problems)
+    if not problems.found:
+        try:
+            return plan_of(None if tree is None else plain(tree), graph, seed=seed)
+        except ChaosError as error:
+            place = Place(file, 1, 1) if tree is None else at(tree, error.where).place
+            problems.add(place, error.what, error.hint)
+    raise ChaosError("\n".join(map(str, problems.found)))
 
 
-def plan_of(content: Any, graph: Graph, *, seed: int | None = None, name: str = "plan") -> Iterator[Fault]:
+def plan_of(content: Any, graph: Graph, *, seed: int | None = None) -> Iterator[Fault]:
     """As `load_plan`, from the plan's content."""
+    if not isinstance(content, Mapping):
+        raise ChaosError("a fault plan is a mapping with 'faults', a list, and perhaps 'seed'")
     try:
         plan = _Plan.model_validate(content)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise ChaosError(f"{name}: {place}: {first['msg']} (got {first['input']!r})") from error
+        raise _explained(error.errors()[0]) from None
     for k, entry in enumerate(plan.faults):
-        _check(entry, graph, f"{name}: faults.{k}")
+        _check(entry, graph, ("faults", k))
     return _merged(plan, plan.seed if seed is None else seed)
 
 
-def _check(entry: Any, graph: Graph, place: str) -> None:
+def _explained(fault: Any) -> ChaosError:
+    loc = fault["loc"]
+    where = loc[:2] + loc[3:]  # an entry's third part is its kind
+    match fault["type"]:
+        case "missing":
+            return ChaosError(f"{loc[-1]!r} is missing", where[:-1])
+        case "union_tag_not_found":
+            return ChaosError("'kind' is missing", where, f"there are {', '.join(_kinds())}")
+        case "union_tag_invalid":
+            kind = fault["ctx"]["tag"]
+            return ChaosError(f"no kind of fault {kind!r}", (*where, "kind"), did_you_mean(kind, _kinds(), "there are"))
+        case "extra_forbidden":
+            return ChaosError(f"unknown key {loc[-1]!r}", where)
+        case "value_error":
+            return ChaosError(fault["msg"].removeprefix("Value error, "), where)
+    return ChaosError(f"{fault['msg']}, got {fault['input']!r}", where)
+
+
+def _kinds() -> list[str]:
+    return [kind for entry in get_args(get_args(_Entry)[0]) for kind in get_args(entry.model_fields["kind"].annotation)]
+
+
+def _check(entry: Any, graph: Graph, where: tuple[str | int, ...]) -> None:
     node = graph.nodes.get(entry.operator)
+    at_operator = (*where, "operator")
     if node is None:
-        raise ChaosError(f"{place}: no operator {entry.operator!r}; there are {', '.join(graph.nodes)}")
+        raise ChaosError(
+            f"no operator {entry.operator!r}", at_operator, did_you_mean(entry.operator, graph.nodes, "there are")
+        )
     if entry.kind in TO_SOURCES and not node.source:
         sources = ", ".join(n.name for n in graph.sources())
-        raise ChaosError(f"{place}: {entry.kind!r} is for sources ({sources}); {entry.operator!r} is none")
+        raise ChaosError(f"{entry.kind!r} is for sources ({sources}); {entry.operator!r} is none", at_operator)
     if entry.kind in TO_OPERATORS and node.source:
-        raise ChaosError(f"{place}: {entry.kind!r} is for operators with inputs; {entry.operator!r} is a source")
+        raise ChaosError(f"{entry.kind!r} is for operators with inputs; {entry.operator!r} is a source", at_operator)
     if entry.kind == "param":
-        able = [name for name, field in node.spec.parameters.model_fields.items() if is_live(field)]
-        if entry.name not in able:
-            raise ChaosError(
-                f"{place}: {entry.name!r} of {entry.operator!r} cannot change while the graph runs; "
-                f"those that can: {', '.join(able) or 'none'}"
-            )
+        _check_parameter(entry, node, where)
     needs_restart = entry.kind in ("kill", "raise", "hang")
     if needs_restart and node.live.restart.max < 1:
         raise ChaosError(
-            f"{place}: {entry.kind!r} would end the run: give {entry.operator!r} a restart policy, "
-            "live: {restart: {max: 100, backoff: 100ms}}"
+            f"{entry.kind!r} would end the run",
+            at_operator,
+            f"give {entry.operator!r} a restart policy, live: {{restart: {{max: 100, backoff: 100ms}}}}",
         )
     if entry.kind == "hang" and node.live.deadline is None:
-        raise ChaosError(f"{place}: nothing would notice that {entry.operator!r} hangs: give it live: {{deadline: 1s}}")
+        raise ChaosError(
+            f"nothing would notice that {entry.operator!r} hangs", at_operator, "give it live: {deadline: 1s}"
+        )
+
+
+def _check_parameter(entry: _Param, node: Node, where: tuple[str | int, ...]) -> None:
+    """The parameter can change while the graph runs, and the operator takes each of the values."""
+    fields = node.spec.parameters.model_fields
+    able = [name for name, field in fields.items() if is_live(field)]
+    if entry.name not in fields:
+        hint = did_you_mean(entry.name, able, "those that can change while the graph runs")
+        raise ChaosError(f"{entry.operator!r} has no parameter {entry.name!r}", (*where, "name"), hint)
+    if entry.name not in able:
+        raise ChaosError(
+            f"{entry.name!r} of {entry.operator!r} cannot change while the graph runs",
+            (*where, "name"),
+            f"those that can: {', '.join(able) or 'none'}",
+        )
+    for k, value in enumerate(entry.values):
+        try:
+            validate_parameters(node.operator, {**node.params, entry.name: value})
+        except ParameterError as error:
+            raise ChaosError(str(error), (*where, "values", k)) from None
 
 
 def _merged(plan: _Plan, seed: int) -> Iterator[Fault]:

@@ -43,7 +43,8 @@ class BaselineError(ValueError):
 class Judged:
     """One operator of one recording, measured by what is expected of it: the recording, or the accepted outcome.
 
-    `firm`: it came out alike both times it was run, so it can be accepted.
+    `firm`: every call was repeated, and neither it nor what it depends on came out otherwise when run again. Only that
+    can be accepted.
     """
 
     operator: str
@@ -58,7 +59,10 @@ class Judged:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all."""
+    """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all.
+
+    `internal`: `details` is a traceback of the runtime's own code.
+    """
 
     path: Path
     name: str
@@ -67,6 +71,7 @@ class Checked:
     error: str = ""
     details: str = ""
     wall: float = 0.0
+    internal: bool = False
 
     @property
     def verdict(self) -> RecordingVerdict:
@@ -145,7 +150,7 @@ class Baseline:
         """Takes over what a recording came to. (operators accepted anew or otherwise, operators that cannot be)."""
         outcomes = {j.operator: j.outcome for j in checked.judged if j.outcome is not None and j.firm}
         refused = [
-            j.operator for j in checked.judged if j.verdict == "unverifiable" or (j.outcome is not None and not j.firm)
+            j.operator for j in checked.judged if not j.firm and (j.outcome is not None or j.verdict == "unverifiable")
         ]
         before = self.of(checked.path)
         changed = [name for name in {**before, **outcomes} if before.get(name) != outcomes.get(name)]
@@ -189,26 +194,30 @@ def check(
     Raises only `RunFailed` for a run that was interrupted.
     """
     started = time.monotonic()
+
+    def could_not(error: str, details: str = "", *, internal: bool = False) -> Checked:
+        return Checked(path, name, None, (), error, details, time.monotonic() - started, internal)
+
     try:
         report = verify(path)
     except RunFailed as failure:
         if failure.interrupted:
             raise
-        return Checked(path, name, None, (), str(failure), failure.details, time.monotonic() - started)
+        return could_not(str(failure), failure.details, internal=failure.internal)
     except (RecordingError, ReplayError, FiringRecordError, MessageError, ParameterError, OSError) as error:
-        return Checked(path, name, None, (), str(error), "", time.monotonic() - started)
+        return could_not(str(error))
     except (
         Exception
     ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
-        what = f"{type(error).__name__}: {error}"
-        return Checked(path, name, None, (), what, traceback.format_exc(), time.monotonic() - started)
+        return could_not(f"{type(error).__name__}: {error}", traceback.format_exc(), internal=True)
     return Checked(path, name, report, judge(report, accepted or {}), wall=time.monotonic() - started)
 
 
 def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged, ...]:
     """The verdict on each operator, given what has been accepted.
 
-    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well.
+    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well. Where
+    calls could not be repeated, neither a tolerance nor an accepted outcome lets it pass.
     """
     outcomes = {v.operator: outcome_of(report, v) for v in report.operators}
     unexpected = {
@@ -216,17 +225,22 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
         for v in report.operators
         if outcomes[v.operator] is not None and outcomes[v.operator] != accepted.get(v.operator)
     }
+    unsteady = {v.operator for v in report.operators if report.repeats(v.operator) is False}
     judged = []
     for v in report.operators:
         own, outcome = report.verdict(v), outcomes[v.operator]
+        whole = not (v.unverifiable or v.lost_records)
         verdict: OperatorVerdict = own
-        if v.operator in accepted and outcome is None and own != "unverifiable":
+        if v.operator in accepted and outcome is None and whole:
             verdict = "not as accepted"
         elif outcome is not None and v.operator not in unexpected:
             verdict = "accepted"
         elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
             verdict = "culprit"
-        judged.append(Judged(v.operator, verdict, outcome, report.repeats(v.operator) is not False))
+        if verdict in PASSES and not whole:
+            verdict = "unverifiable"
+        steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
+        judged.append(Judged(v.operator, verdict, outcome, whole and steady))
     return tuple(judged)
 
 

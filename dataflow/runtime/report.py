@@ -89,3 +89,8 @@ class RunFailed(RuntimeError):
     ) -> None:
         super().__init__(message)
         self.details, self.operator, self.interrupted = details, operator, interrupted
+
+    @property
+    def internal(self) -> bool:
+        """Whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
+        return self.operator is None and self.details.startswith("Traceback")

@@ -58,7 +58,10 @@ def _make(name: str, size: int) -> int:
         os.ftruncate(descriptor, size)
         fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW)
     except OSError as error:
-        raise SharedMemoryError(f"cannot make shared memory of {size} bytes: {error}") from error
+        raise SharedMemoryError(
+            f"cannot make shared memory of {size} bytes: {error.strerror}; raise the limit of memory or of file sizes "
+            "(ulimit -f), or do without: network: {shared_memory: false}"
+        ) from error
     return descriptor
 
 

@@ -11,6 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
+from dataflow.recording import Recording, RecordingWriter
+from dataflow.recording.layout import RESERVED_METADATA
 
 NUDGED = '{use: "verified_operators:Nudged", inputs: {x: left/fast}}'
 ADDED = '{use: "verified_operators:Chatty", inputs: {x: left/fast}}'
@@ -135,6 +137,37 @@ def test_an_accepted_change_passes_until_something_else_changes(dataflow, folder
     assert json.loads(baseline.read_text())["accepted"] == {}
 
 
+def without_message(path: Path, stream: str, number: int, target: Path) -> None:
+    """A copy of a recording in which one message of a stream is missing."""
+    with Recording(path) as recording:
+        metadata = {name: dict(v) for name, v in recording.metadata.items() if name not in RESERVED_METADATA}
+        with RecordingWriter(target, metadata=metadata, namespace="test") as writer:
+            for name, info in recording.streams.items():
+                extra = {key: info.metadata[key] for key in ("operator", "port") if key in info.metadata}
+                assert info.message_type is not None
+                writer.add_stream(name, info.message_type, static=info.static, extra=extra)
+            for operator, payload in recording.firings():
+                writer.write_firings(operator, 0, payload)
+            for found in recording.messages():
+                if (found.stream, found.seq) != (stream, number):
+                    writer.write(found.stream, found.message, seq=found.seq, incarnation=found.incarnation)
+
+
+@pytest.mark.parametrize("one", [SMOOTH, NUDGED])
+def test_what_could_not_be_repeated_is_not_accepted_and_ends_with_1(
+    dataflow, folder: Path, tmp_path: Path, one: str
+) -> None:
+    torn, baseline = tmp_path / "torn.mcap", tmp_path / "accepted.json"
+    without_message(folder / "recordings" / "first.mcap", "test/left/fast", 9, torn)
+    words = ["verify", torn, "--graph", graph_of(tmp_path, "g.yaml", one), "--baseline", baseline, "--one-host", "-q"]
+
+    told = dataflow(*words, "--accept", code=1)
+
+    assert "not accepted: torn.mcap: one" in told.stderr
+    assert "one" not in json.loads(baseline.read_text())["accepted"].get("torn.mcap", {})
+    dataflow(*words, "--only", "one", code=1)
+
+
 def test_a_tolerance_passes_with_its_own_word_and_not_as_identical(dataflow, folder: Path, tmp_path: Path) -> None:
     changed = graph_of(tmp_path, "changed.yaml", NUDGED)
     one = folder / "recordings" / "first.mcap"
@@ -169,6 +202,9 @@ def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder:
         (["--baseline", "b.yaml"], "ends in .json"),
         (["--junit", "v.txt"], "ends in .xml"),
         (["--tolerance", "-1"], "0 or more"),
+        (["--start", "nan"], "--start nan: expected seconds"),
+        (["--start", "inf"], "--start inf: expected seconds"),
+        (["--start", "-1"], "--start -1: expected seconds"),
         (["absent.mcap"], "absent.mcap"),
     ],
 )

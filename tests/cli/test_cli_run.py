@@ -11,6 +11,12 @@ import sys
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
+
+from dataflow.cli.main import app
+
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""What a compressed chunk begins with."""
 
 
 def test_a_run_reports_operators_and_figures_on_stdout_and_progress_on_stderr(dataflow, small: Path) -> None:
@@ -88,6 +94,30 @@ def test_wrong_options_are_refused_before_anything_runs(
     assert told.stdout == ""
 
 
+@pytest.mark.parametrize(
+    ("plan", "message"),
+    [
+        (b"faults:\n  - {kind: stop, operator: lefd, for: 1s, at: 1s}", "plan.yaml:2:28: no operator 'lefd'"),
+        (
+            b"faults:\n  - {kind: param, operator: smooth, name: sleep, values: [1], at: 1s}",
+            "'sleep' of 'smooth' cannot",
+        ),
+        (b"\xff\xfe\x00", "plan.yaml: 'utf-8' codec"),
+    ],
+)
+def test_a_faulty_fault_plan_is_refused_before_anything_runs(
+    dataflow, small: Path, tmp_path: Path, plan: bytes, message: str
+) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_bytes(plan)
+
+    told = dataflow("run", small, "--chaos", path, code=2)
+
+    assert message in told.stderr
+    assert "internal error" not in told.stderr
+    assert told.stdout == ""
+
+
 def test_a_replay_onto_itself_is_refused_under_any_name(dataflow, recorded, tmp_path: Path) -> None:
     path, _ = recorded
     link = tmp_path / "link.mcap"
@@ -119,6 +149,31 @@ def test_files_that_are_no_recordings_are_refused_with_the_reason(dataflow, smal
         assert "expected a recording" in dataflow(command, small.parent / "x.mcap", code=2).stderr
     foreign = data_dir / "bags" / "nav2_turtlebot.mcap"
     assert "does not hold the graph" in dataflow("replay", foreign, code=2).stderr
+
+
+@pytest.fixture(scope="module")
+def damaged(recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A recording with one wrong byte in a compressed chunk."""
+    data = bytearray(recorded[0].read_bytes())
+    data[data.index(ZSTD) + 100] ^= 0xFF
+    path = tmp_path_factory.mktemp("damaged") / "damaged.mcap"
+    path.write_bytes(data)
+    return path
+
+
+@pytest.mark.parametrize("asked", ["0", "1"])
+def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_asked_for(
+    damaged: Path, monkeypatch: pytest.MonkeyPatch, asked: str
+) -> None:
+    monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
+
+    told = CliRunner().invoke(app, ["replay", str(damaged), "--one-host", "-q"])
+
+    assert told.exit_code == 1
+    assert "damaged.mcap is damaged: chunk" in told.stderr
+    assert "`mcap recover` may save what is left" in told.stderr
+    assert ("Traceback" in told.stderr) == (asked == "1")
+    assert asked == "1" or told.stderr.splitlines()[1:] == ["where in the code: run it again with DATAFLOW_TRACEBACK=1"]
 
 
 def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_is_left(

@@ -66,16 +66,22 @@ def test_a_plan_file_has_a_seed_of_its_own_which_may_be_replaced(graph: Graph, t
 @pytest.mark.parametrize(
     ("entry", "words"),
     [
-        ({**KILL, "operator": "smoth"}, "faults.0: no operator 'smoth'; there are left, right, mix"),
-        ({**KILL, "kind": "burn"}, "burn"),
-        ({**KILL, "at": "1s"}, "give either 'at' (once) or 'every' (again and again)"),
-        ({**KILL, "every": "soon"}, "faults.0.kill.every"),
+        ({**KILL, "operator": "smoth"}, "faults.0.operator: no operator 'smoth'; did you mean 'smooth'?"),
+        ({**KILL, "kind": "burn"}, "faults.0.kind: no kind of fault 'burn'; there are: kill, raise, hang, freeze"),
+        ({"operator": "smooth", "at": "1s"}, "faults.0: 'kind' is missing; there are kill, raise"),
+        ({**KILL, "at": "1s"}, "faults.0: give either 'at' (once) or 'every' (again and again)"),
+        ({**KILL, "every": "soon"}, "faults.0.every: duration 'soon': expected a number and a unit"),
+        ({**KILL, "every": 3}, "faults.0.every: a duration has a unit, such as 100ms"),
+        ({**KILL, "every": "0s"}, "faults.0.every: Input should be greater than 0, got '0s'"),
         ({**SLOW, "operator": "left"}, "'slow' is for operators with inputs; 'left' is a source"),
+        ({"kind": "slow", "operator": "mix", "for": "1s", "at": "1s"}, "faults.0: 'by' is missing"),
         ({"kind": "stop", "operator": "mix", "for": "1s", "at": "1s"}, "'stop' is for sources (left, right)"),
-        ({"kind": "hang", "operator": "mix", "at": "1s"}, "nothing would notice that 'mix' hangs: give it live: {dead"),
+        ({"kind": "hang", "operator": "mix", "at": "1s"}, "nothing would notice that 'mix' hangs; give it live: {dead"),
         ({"kind": "flood", "operator": "left", "factor": 1, "for": "1s", "at": "1s"}, "greater than or equal to 2"),
-        ({**TUNE, "name": "factr"}, "'factr' of 'tuned' cannot change while the graph runs; those that can: factor"),
-        ({"kind": "malformed", "operator": "left", "at": "1s", "size": 3}, "Extra inputs are not permitted"),
+        ({**TUNE, "name": "factr"}, "faults.0.name: 'tuned' has no parameter 'factr'; did you mean 'factor'?"),
+        ({**TUNE, "operator": "slow", "name": "sleep"}, "'sleep' of 'slow' cannot change while the graph runs; "),
+        ({**TUNE, "values": [1.0, 1e9]}, "faults.0.values.1: Tuned.factor: Input should be less than or equal to"),
+        ({"kind": "malformed", "operator": "left", "at": "1s", "size": 3}, "faults.0.size: unknown key 'size'"),
     ],
 )
 def test_a_plan_that_cannot_be_followed_says_which_entry_and_why(graph: Graph, entry: Any, words: str) -> None:
@@ -87,17 +93,38 @@ def test_a_plan_that_cannot_be_followed_says_which_entry_and_why(graph: Graph, e
 def test_what_nothing_would_outlive_is_refused() -> None:
     fragile = load_graph(HERE / "live.yaml", live=True)
 
-    with pytest.raises(ChaosError, match="'kill' would end the run: give 'smooth' a restart policy"):
+    with pytest.raises(ChaosError, match="'kill' would end the run; give 'smooth' a restart policy"):
         plan_of({"faults": [KILL]}, fragile)
 
 
-def test_a_file_that_is_no_plan_is_named(graph: Graph, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (b"", "plan.yaml:1:1: a fault plan is a mapping"),
+        (b"faults: [", "plan.yaml:1:10: not readable as YAML"),
+        (b"seed: x\nfaults: []", "plan.yaml:1:7: Input should be a valid integer"),
+        (b"\xff\xfe", "plan.yaml: 'utf-8' codec"),
+        (
+            b"faults:\n  - {kind: kill, operator: smooth, at: 1s}\n"
+            b"  - {kind: param, operator: tuned, name: factor, values: [1, 1000000], at: 1s}\n",
+            "plan.yaml:3:62: Tuned.factor: Input should be less than or equal to",
+        ),
+    ],
+)
+def test_a_plan_file_that_cannot_be_followed_is_named_with_the_line(
+    graph: Graph, tmp_path: Path, text: bytes, words: str
+) -> None:
+    path = tmp_path / "plan.yaml"
+    path.write_bytes(text)
+
+    with pytest.raises(ChaosError) as caught:
+        load_plan(path, graph)
+    assert words in str(caught.value)
+
+
+def test_a_plan_file_that_is_not_there_is_named(graph: Graph, tmp_path: Path) -> None:
     with pytest.raises(ChaosError, match=r"nowhere\.yaml"):
         load_plan(tmp_path / "nowhere.yaml", graph)
-    broken = tmp_path / "broken.yaml"
-    broken.write_text("faults: [")
-    with pytest.raises(ChaosError, match=r"broken\.yaml"):
-        load_plan(broken, graph)
 
 
 def step(stamp: int) -> dict[str, Message]:

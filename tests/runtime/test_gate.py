@@ -122,6 +122,41 @@ def test_what_could_not_be_repeated_never_passes_and_is_never_accepted(tmp_path:
     assert baseline.of(one.path) == {}
 
 
+@pytest.mark.parametrize("part", ["unverifiable", "lost_records"])
+def test_what_differs_and_could_not_be_repeated_in_part_is_not_accepted(tmp_path: Path, part: str) -> None:
+    made = report({"a": "x", "b": "y"}, CHAIN, culprits={"a"})
+    setattr(made.operators[0], part, 2)
+    one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
+    baseline = Baseline(tmp_path / "b.json")
+
+    assert verdicts(one.judged) == {"a": "culprit", "b": "downstream"}
+    assert baseline.accept(one) == (["b"], ["a"])
+    assert set(baseline.of(one.path)) == {"b"}
+
+
+@pytest.mark.parametrize("part", ["unverifiable", "lost_records"])
+def test_an_accepted_outcome_does_not_pass_where_it_could_not_be_repeated_in_part(part: str) -> None:
+    known = accepted({"a": "x"}, {})
+    made = report({"a": "x"}, {})
+    setattr(made.operators[0], part, 2)
+
+    found = judge(made, known)  # type: ignore[arg-type]
+
+    assert verdicts(found) == {"a": "unverifiable"}
+    assert not found[0].passed
+
+
+def test_what_follows_from_an_operator_that_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
+    made = report({"a": "x", "b": "y", "c": None}, CHAIN, culprits={"a"})
+    made = VerifyReport(
+        **{name: getattr(made, name) for name in made.__dataclass_fields__ if name != "comparisons"},
+        comparisons={"a": OutputComparison("a", index=4, got="z")},
+    )
+    one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
+
+    assert Baseline(tmp_path / "b.json").accept(one) == ([], ["a", "b"])
+
+
 def test_what_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
     made = report({"a": "x"}, {})
     made = VerifyReport(
@@ -191,6 +226,17 @@ def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Excepti
     assert one.verdict == "could not run"
     assert str(error.args[0]) in one.error
     assert not one.passed
+
+
+def test_an_operators_traceback_is_told_from_the_runtimes_own() -> None:
+    def failing(operator: str | None) -> Checked:
+        def verify(path: Path) -> VerifyReport:
+            raise RunFailed("it failed", "Traceback (most recent call last)", operator)
+
+        return check(Path("x.mcap"), "x", verify)
+
+    assert failing(None).internal
+    assert not failing("smooth").internal
 
 
 def test_an_interruption_ends_the_gate() -> None:
