@@ -19,19 +19,29 @@ _FORBIDDEN = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]"
 """Characters that no XML document may hold."""
 
 
-def write_junit(file: Path, checked: Iterable[Checked], explain: Callable[[Checked, Judged], Iterable[str]]) -> None:
-    """Writes the file. `explain` gives the lines about an operator that did not pass."""
+def write_junit(
+    file: Path,
+    checked: Iterable[Checked],
+    explain: Callable[[Checked, Judged], Iterable[str]],
+    reservations: Callable[[Checked], Iterable[str]],
+) -> None:
+    """Writes the file. `explain` gives the lines about an operator that did not pass, `reservations` those about a
+    recording that did."""
     root = ElementTree.Element("testsuites")
     now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
     for number, one in enumerate(checked):
-        root.append(_suite(number, one, now, explain))
+        root.append(_suite(number, one, now, explain, reservations))
     ElementTree.indent(root)
     file.parent.mkdir(parents=True, exist_ok=True)
     ElementTree.ElementTree(root).write(file, encoding="utf-8", xml_declaration=True)
 
 
 def _suite(
-    number: int, one: Checked, now: str, explain: Callable[[Checked, Judged], Iterable[str]]
+    number: int,
+    one: Checked,
+    now: str,
+    explain: Callable[[Checked, Judged], Iterable[str]],
+    reservations: Callable[[Checked], Iterable[str]],
 ) -> ElementTree.Element:
     failures = sum(not j.passed for j in one.judged)
     suite = ElementTree.Element(
@@ -73,7 +83,7 @@ def _suite(
         )
         error = ElementTree.SubElement(case, "error", message=_clean(one.error), type="could_not_run")
         error.text = _clean(one.details or one.error)
-    ElementTree.SubElement(suite, "system-out")
+    ElementTree.SubElement(suite, "system-out").text = _clean("\n".join(reservations(one))) or None
     ElementTree.SubElement(suite, "system-err")
     return suite
 

@@ -18,6 +18,7 @@ from dataflow.sync.stamps import format_stamp
 
 STYLES = {
     "identical": "green",
+    "identical up to the cut": "yellow",
     "within tolerance": "cyan",
     "accepted": "cyan",
     "culprit": "bold red",
@@ -44,13 +45,8 @@ def print_one(console: Console, checked: Checked) -> None:
     for judged in checked.judged:
         for line in explain(checked, judged):
             console.print(Text(line), soft_wrap=True)
-    if report.torn:
-        console.print(
-            Text(
-                "the recording has no proper end: verified is what its writer had stored when it died", style="yellow"
-            ),
-            soft_wrap=True,
-        )
+    if said := _cut(report):
+        console.print(Text(said, style="yellow"), soft_wrap=True)
     if not report.identical:
         for line in fact_lines(report):
             console.print(Text(line, style="dim"), soft_wrap=True)
@@ -73,6 +69,10 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
     console.print(summary)
     for checked in all_checked:
         if checked.passed:
+            if lines := list(reservations(checked)):
+                console.print(Text(checked.name, style="bold"))
+                for line in lines:
+                    console.print(Text(f"  {line}"), soft_wrap=True)
             continue
         console.print(Text(checked.name, style="bold"))
         if checked.report is None:
@@ -90,6 +90,16 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
     style = "green" if passed == len(all_checked) else "bold red"
     total = plural(len(all_checked), "recording")
     console.print(Text.assemble((f"{passed} of {total} passed", style), f" ({', '.join(rest)})" if rest else ""))
+
+
+def reservations(checked: Checked) -> Iterator[str]:
+    """What is to be known of a recording that passed: where it was cut, and what it lacks."""
+    if checked.report is None:
+        return
+    if said := _cut(checked.report):
+        yield said
+    for v in checked.report.operators:
+        yield from _left_out(v)
 
 
 def print_completion(console: Console, made: Completion) -> None:
@@ -157,6 +167,13 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         yield f"{v.operator}: file {file} is not the one that was read then"
 
 
+def _cut(report: VerifyReport) -> str:
+    """Why a recording tells of its run only up to a cut; nothing where it tells of all."""
+    if report.torn:
+        return "the recording has no proper end: verified is what its writer had stored when it died"
+    return "the run did not end in order: verified is what was recorded until then" if report.cut else ""
+
+
 def _left_out(v: Verification) -> Iterator[str]:
     """What could not be repeated, and what the recording lacks."""
     if v.lost_records:
@@ -169,11 +186,10 @@ def _left_out(v: Verification) -> Iterator[str]:
         missing = v.missing or "input"
         after = ", after the cut" if v.cut and v.beyond else ""
         yield f"{v.operator}: {plural(v.unverifiable, 'firing')} could not be repeated (missing {missing}{after})"
-    if v.cut:
-        rest = f"; {plural(v.after_cut, 'message')} lie after it" if v.after_cut else ""
-        yield f"{v.operator}: verified up to a cut: the recording ends before its run did{rest}"
+    if v.after_cut:
+        yield f"{v.operator}: {plural(v.after_cut, 'message')} after the cut, of which no firing record tells"
     if v.not_stored:
-        yield f"{v.operator}: {plural(v.not_stored, 'message')} it made again are missing from the recording"
+        yield f"{v.operator}: {plural(v.not_stored, 'message')} made again, not in the recording (never sent, or lost)"
 
 
 def fact_lines(report: VerifyReport) -> Iterator[str]:
@@ -231,7 +247,7 @@ def _conclusion(checked: Checked, report: VerifyReport) -> str:
     if report.wall and report.span:
         pace += f", {report.span / report.wall:.1f} × real time"
     match checked.verdict:
-        case "identical":
+        case "identical" | "identical up to the cut":
             return f": {what}{pace}"
         case "within tolerance":
             return f" of {report.tolerance:g}, not identical: {what}{pace}"

@@ -184,12 +184,12 @@ def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], Verif
 
 
 def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | None) -> None:
-    from dataflow.cli.verdicts import explain, print_many, print_one
+    from dataflow.cli.verdicts import explain, print_many, print_one, reservations
 
     if junit is not None:
         from dataflow.cli.junit import write_junit
 
-        write_junit(junit, checked, explain)
+        write_junit(junit, checked, explain, reservations)
     if single and checked[0].report is None:
         [one] = checked
         fail(one.error, details=own_traceback(one.details) if one.internal else one.details)

@@ -26,9 +26,15 @@ OperatorVerdict = Literal[
     "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "unverifiable"
 ]
 RecordingVerdict = Literal[
-    "identical", "within tolerance", "accepted", "different", "not wholly verified", "could not run"
+    "identical",
+    "identical up to the cut",
+    "within tolerance",
+    "accepted",
+    "different",
+    "not wholly verified",
+    "could not run",
 ]
-PASSES = ("identical", "within tolerance", "accepted")
+PASSES = ("identical", "identical up to the cut", "within tolerance", "accepted")
 """The verdicts with which the gate lets pass."""
 
 Outcome = Mapping[str, Any]
@@ -82,7 +88,11 @@ class Checked:
             return "different"
         if "unverifiable" in found:
             return "not wholly verified"
-        return "accepted" if "accepted" in found else "within tolerance" if "within tolerance" in found else "identical"
+        if "accepted" in found:
+            return "accepted"
+        if "within tolerance" in found:
+            return "within tolerance"
+        return "identical up to the cut" if self.report.cut else "identical"
 
     @property
     def passed(self) -> bool:
@@ -229,18 +239,17 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
     judged = []
     for v in report.operators:
         own, outcome = report.verdict(v), outcomes[v.operator]
-        whole = not (v.unverifiable or v.lost_records)
         verdict: OperatorVerdict = own
-        if v.operator in accepted and outcome is None and whole:
+        if v.operator in accepted and outcome is None and v.whole:
             verdict = "not as accepted"
         elif outcome is not None and v.operator not in unexpected:
             verdict = "accepted"
         elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
             verdict = "culprit"
-        if verdict in PASSES and not whole:
+        if verdict in PASSES and not v.whole:
             verdict = "unverifiable"
         steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
-        judged.append(Judged(v.operator, verdict, outcome, whole and steady))
+        judged.append(Judged(v.operator, verdict, outcome, v.whole and steady))
     return tuple(judged)
 
 

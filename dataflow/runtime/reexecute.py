@@ -11,6 +11,7 @@ import re
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
+from pathlib import PurePath
 from typing import Any, Literal
 
 from dataflow.graph.model import Node
@@ -265,10 +266,7 @@ class RecordedRunner:
         statics = self._set_up()
         first = self._setup_record
         if first is not None:
-            before = first.detail.get("files", {})
-            self.result.files_changed = sorted(
-                f for f, digest in self.operator.files.items() if before.get(f) != digest
-            )
+            self.result.files_changed = _changed_files(first.detail.get("files", {}), self.operator.files)
             self._compare(first, statics)
         self._take_up()
         for state in self.ports.states.values():
@@ -505,6 +503,12 @@ class RecordedRunner:
             if (lost.incarnation, lost.seq) > self._latest.get(lost.stream, (-1, -1)):
                 self.result.beyond = self.result.unverifiable
         self.ports.end(None, "end of records")
+
+
+def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
+    """Files whose content is that of no file of the same name that was read then, wherever that lay."""
+    known = {(PurePath(file).name, digest) for file, digest in before.items()}
+    return sorted(file for file, digest in now.items() if (PurePath(file).name, digest) not in known)
 
 
 def _word(emission: Emission | Message | None) -> str:
