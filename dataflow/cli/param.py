@@ -159,13 +159,22 @@ def _split(word: str, graph: Graph) -> tuple[str, str]:
 
 
 def _value(text: str) -> Any:
+    import msgpack
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
-        return YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
+        value = YAML(typ="safe", pure=True).load(text)
+    except (YAMLError, ValueError) as error:
         raise fail(f"{text!r} is no YAML value: {str(error).splitlines()[0]}") from None
+    try:
+        msgpack.packb(value)
+    except (TypeError, ValueError, OverflowError):
+        raise fail(
+            f"{text!r} cannot be the value of a parameter: expected a text, true, false, a number of at most 64 bits, "
+            "or a list or mapping of these"
+        ) from None
+    return value
 
 
 def _asked(

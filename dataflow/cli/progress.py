@@ -151,7 +151,7 @@ def _line_printer(console: Console, display: RunDisplay, every: float = 5.0) -> 
         now = time.monotonic()
         if now >= due or status.phase != phase:
             due, phase = now + every, status.phase
-            spent = seconds(time.time() - status.started)
+            spent = seconds(time.time() - status.started) if status.started else ""
             console.print(f"{status.phase:<8}  {spent:>8}  {display.reached(status)}".rstrip(), soft_wrap=True)
 
     return watch

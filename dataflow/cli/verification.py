@@ -168,7 +168,11 @@ def _check(
         if not quiet and not single:
             say(f"[dim]{number} of {len(targets)}: {escape(name)}[/]")
         accepted = {} if known is None else known.of(path)
-        checked.append(check(path, name, _verifier(options, quiet=quiet), accepted))
+        one = check(path, name, _verifier(options, quiet=quiet), accepted, options["graph"])
+        if one.not_in_graph:
+            names = escape(", ".join(one.not_in_graph))
+            say(f"[yellow]note:[/] {escape(name)}: recorded operators that the graph does not have: {names}")
+        checked.append(one)
     return checked
 
 

@@ -11,9 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from dataflow.graph.model import Graph
 from dataflow.messages import MessageError
 from dataflow.operator import ParameterError
-from dataflow.recording import RecordingError
+from dataflow.recording import Recording, RecordingError
 from dataflow.runtime.firings import FiringRecordError
 from dataflow.runtime.reexecute import Verification
 from dataflow.runtime.replay import ReplayError
@@ -67,7 +68,8 @@ class Judged:
 class Checked:
     """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all.
 
-    `internal`: `details` is a traceback of the runtime's own code.
+    `internal`: `details` is a traceback of the runtime's own code. `not_in_graph`: recorded operators that the graph
+    lacks.
     """
 
     path: Path
@@ -78,6 +80,7 @@ class Checked:
     details: str = ""
     wall: float = 0.0
     internal: bool = False
+    not_in_graph: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> RecordingVerdict:
@@ -111,7 +114,7 @@ class Checked:
         verdicts = {j.operator: j.verdict for j in self.judged}
         for operator in report["operators"]:
             operator["verdict"] = verdicts[operator["operator"]]
-        return value | report | {"culprits": list(self.culprits)}
+        return value | report | {"culprits": list(self.culprits), "not_in_graph": list(self.not_in_graph)}
 
 
 @dataclass(slots=True)
@@ -197,9 +200,15 @@ def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
 
 
 def check(
-    path: Path, name: str, verify: Callable[[Path], VerifyReport], accepted: Mapping[str, Outcome] | None = None
+    path: Path,
+    name: str,
+    verify: Callable[[Path], VerifyReport],
+    accepted: Mapping[str, Outcome] | None = None,
+    graph: Graph | None = None,
 ) -> Checked:
     """Verifies one recording and judges it; whatever prevents that becomes its `error`.
+
+    `graph`: the one that it is verified against, where that is not the recorded one.
 
     Raises only `RunFailed` for a run that was interrupted.
     """
@@ -220,7 +229,15 @@ def check(
         Exception
     ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
         return could_not(f"{type(error).__name__}: {error}", traceback.format_exc(), internal=True)
-    return Checked(path, name, report, judge(report, accepted or {}), wall=time.monotonic() - started)
+    missing = () if graph is None else recorded_but_not_in(graph, path)
+    judged = judge(report, accepted or {})
+    return Checked(path, name, report, judged, wall=time.monotonic() - started, not_in_graph=missing)
+
+
+def recorded_but_not_in(graph: Graph, path: Path) -> tuple[str, ...]:
+    """The operators with firing records in a recording that a graph does not have."""
+    with Recording(path) as recording:
+        return tuple(name for name in recording.firing_batches() if name not in graph.nodes)
 
 
 def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged, ...]:

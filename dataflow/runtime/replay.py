@@ -63,7 +63,10 @@ def plan_replay(
             check_type(recording, graph, stream)
         streams += recorded
     if not streams:
-        raise ReplayError(f"graph {graph.name!r} has no sources to replace")
+        raise ReplayError(
+            f"nothing of {recording.path} can be played into graph {graph.name!r}: it has no sources, or what is to "
+            "run takes nothing from them; name another graph with --graph"
+        )
     first = min((i.first for s in streams if (i := recording.streams[s]).first is not None and not i.static), default=0)
     return LogPlan(
         Path(recording.path),

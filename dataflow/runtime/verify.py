@@ -246,6 +246,11 @@ def _compare(
 def _chosen(graph: Graph, first: str | None, only: str | None) -> set[str]:
     """The operators to verify: all that are neither sources nor external, or those asked for."""
     able = {name for name, node in graph.nodes.items() if not node.source and not node.external}
+    if not able:
+        raise ReplayError(
+            f"graph {graph.name!r} holds nothing to verify: all its operators ({', '.join(graph.nodes)}) are sources "
+            "or external, whose recorded output is taken as it is; name a graph with further operators with --graph"
+        )
     for asked in (first, only):
         if asked is not None and asked not in able:
             raise ReplayError(

@@ -194,6 +194,31 @@ def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder:
     assert "verified_operators.py" in told.stderr  # the operator's own traceback
 
 
+def test_recorded_operators_that_the_graph_does_not_have_are_named(dataflow, folder: Path, tmp_path: Path) -> None:
+    fewer = graph_of(tmp_path, "fewer.yaml", SMOOTH)
+    fewer.write_text("".join(line for line in fewer.read_text().splitlines(True) if "two" not in line))
+
+    told = gate(dataflow, folder, "--graph", fewer, "--json", code=0)
+
+    for name in ("first.mcap", "deep/second.mcap"):
+        assert f"note: {name}: recorded operators that the graph does not have: two" in told.stderr
+    assert [r["not_in_graph"] for r in json.loads(told.stdout)["recordings"]] == [["two"], ["two"]]
+    assert json.loads(gate(dataflow, folder, "--json", code=0).stdout)["recordings"][0]["not_in_graph"] == []
+
+
+@pytest.mark.parametrize("words", [[], ["--start", "0.05"]])
+def test_a_recording_of_sources_alone_holds_nothing_to_verify(
+    dataflow, folder: Path, tmp_path: Path, words: list[str]
+) -> None:
+    alone = graph_of(tmp_path, "alone.yaml", SMOOTH)
+    alone.write_text("".join(line for line in alone.read_text().splitlines(True) if "one" not in line))
+    dataflow("run", alone, "--record", tmp_path / "alone.mcap", "--one-host", "-q")
+
+    told = dataflow("verify", tmp_path / "alone.mcap", "-q", *words, code=2).stderr
+
+    assert "graph 'gated' holds nothing to verify: all its operators (left) are sources or external" in told
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

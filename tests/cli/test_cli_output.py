@@ -15,8 +15,9 @@ from rich.console import Console
 
 from dataflow.cli.arguments import chosen_streams, existing, output_file, window
 from dataflow.cli.output import figure, jsonable, plural, seconds, size
+from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report
-from dataflow.runtime.report import OperatorCounts, RunReport
+from dataflow.runtime.report import OperatorCounts, RunReport, Status
 
 
 @pytest.mark.parametrize(
@@ -162,3 +163,12 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
     assert any(line.split() == ["ate", "rmse", "0.0123", "m"] for line in lines)
     assert "10.0 s of event time in 5.00 s, 2.00 × real time" in lines[0]
     assert "wrote out/run.mcap (1 message, 5.0 MB)" in lines
+
+
+def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
+    console = Console(file=io.StringIO(), width=100)
+    with shown(console, RunDisplay(console), quiet=False) as watch:
+        assert watch is not None
+        watch(Status("running", operators={"smooth": OperatorCounts(3)}))
+
+    assert console.file.getvalue().split() == ["running", "3", "firings"]  # type: ignore[attr-defined]
