@@ -235,16 +235,17 @@ class Host:
 
     def run(self) -> None:
         """The main loop; returns when the supervisor has let the host go."""
-        while not self._left:
+        while True:
             if self._probing:
                 self._probe()
             self._take(self._wait_time())
             if self._left:
-                return
+                break
             worked = self._work()
             self.outlet.flush_due()
             self._report(idle=not worked)
             self._answer_poll(idle=not worked)
+        self.hand_over()
 
     def _answer_poll(self, *, idle: bool) -> None:
         """Answers after the work that was there: a host is idle only when a look at everything found nothing to do."""
@@ -666,8 +667,8 @@ class Host:
         for publisher in self.remote.values():
             publisher.probe()
 
-    def fail(self) -> None:
-        """After a failure: hands over the firing records that were not sent yet, the failed one among them."""
+    def hand_over(self) -> None:
+        """Sends the firing records that were not sent yet: after a failure here, the failed one among them."""
         if self._released:
             self.outlet.flush_all()
 

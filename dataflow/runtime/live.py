@@ -163,9 +163,7 @@ class LiveSupervisor(Supervisor):
             self.status.restarts[name] = self.status.restarts.get(name, 0) + 1
             if name in self.status.operators:
                 self._base[name] = self.status.operators[name]
-        held = {n: list(self._records.get(n, ())) for n in process.nodes}
-        for batches in held.values():
-            self._tell_recorder("records", batches=batches)
+        self._hand_over_records(process.nodes)
         self._tell_consumers(process, absent=True)
         self._cover()
         self._event(
@@ -231,6 +229,12 @@ class LiveSupervisor(Supervisor):
             self._event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
         elif not process.probing and now - process.rejoining > self.plan.start_timeout:
             self._kill(process, f"was not ready again within {self.plan.start_timeout:g} s")
+
+    def _hand_over_records(self, operators: Iterable[str] | None = None) -> None:
+        """Gives the recorder the firing records held of some operators, or of all; it leaves out what it has."""
+        for name in list(self._records) if operators is None else operators:
+            if held := self._records.get(name):
+                self._tell_recorder("records", batches=list(held))
 
     # What hosts say
 

@@ -249,6 +249,7 @@ class SinkHost:
                 if self._outcome != "complete":
                     self._drain()
             case "lost":
+                self._drain()
                 raise ChannelClosed("the supervisor is gone")
 
     def _drain(self) -> None:
@@ -262,8 +263,8 @@ class SinkHost:
             if item[0] == "envelope":
                 self._handle(item)
 
-    def fail(self) -> None:
-        """After a failure of the sink's own there is nothing left to hand over."""
+    def hand_over(self) -> None:
+        """A sink keeps nothing that another process needs."""
 
     def close(self) -> Mapping[str, Any]:
         facts: Mapping[str, Any] = {}

