@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from dataflow.graph.model import Node, Restart
+from dataflow.graph.model import Restart
 from dataflow.runtime.chaos import Fault
-from dataflow.runtime.firings import WITHHELD, decode_batch
 from dataflow.runtime.health import HealthMonitor, diagnostics_fields
+from dataflow.runtime.held import HeldRecords
 from dataflow.runtime.keys import firings_key
 from dataflow.runtime.plan import HostPlan, RunPlan
 from dataflow.runtime.report import OperatorCounts, RunFailed
@@ -25,7 +24,6 @@ from dataflow.runtime.supervisor import Supervised, Supervisor
 from dataflow.sync import FOREVER, NEVER
 
 DIAGNOSE_EVERY = 1.0
-HELD_RECORDS = 4096
 EDGES_WITHIN = 5.0
 BEAT_WITHIN = 3.0
 
@@ -35,7 +33,7 @@ class LiveSupervisor(Supervisor):
 
     def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
         super().__init__(plan, on_output=on_output)
-        self._records: dict[str, deque[bytes]] = {}
+        self._held = {name: HeldRecords(tuple(node.outputs)) for name, node in plan.graph.nodes.items()}
         self._base: dict[str, OperatorCounts] = {}
         self._away: dict[str, str] = {}
         self._ended_streams: dict[str, str] = {}
@@ -193,9 +191,7 @@ class LiveSupervisor(Supervisor):
         old.restarts.begun()
         self._close_process(old)
         resume = {
-            name: resumed(self._records.get(name, ()), self.plan.graph.nodes[name])
-            | {"restarts": self.status.restarts.get(name, 0)}
-            for name in old.nodes
+            name: self._held[name].resumed() | {"restarts": self.status.restarts.get(name, 0)} for name in old.nodes
         }
         self._spawn(old.label, old.nodes, old.kind, {**old.config, "resume": resume})
         new = self._processes[old.label]
@@ -232,9 +228,8 @@ class LiveSupervisor(Supervisor):
 
     def _hand_over_records(self, operators: Iterable[str] | None = None) -> None:
         """Gives the recorder the firing records held of some operators, or of all; it leaves out what it has."""
-        for name in list(self._records) if operators is None else operators:
-            if held := self._records.get(name):
-                self._tell_recorder("records", batches=list(held))
+        for name in self._held if operators is None else operators:
+            self._tell_recorder("records", batches=list(self._held[name].batches))
 
     # What hosts say
 
@@ -251,8 +246,7 @@ class LiveSupervisor(Supervisor):
         super()._on_message(process, kind, fields)
         match kind:
             case "record":
-                held = self._records.setdefault(fields["operator"], deque(maxlen=HELD_RECORDS))
-                held.append(fields["data"])
+                self._held[fields["operator"]].add(fields["data"])
             case "beat":
                 self._check_memory(process, fields["memory"])
             case "overdue":
@@ -315,22 +309,3 @@ def _taken(plan: RunPlan, host: HostPlan) -> set[str]:
         return set(host.subscribe)
     firings = {firings_key(plan.graph.namespace, node) for node in plan.graph.nodes} if host.sink == "record" else set()
     return set(host.streams) | firings
-
-
-def resumed(batches: Iterable[bytes], node: Node) -> dict[str, Any]:
-    """Where an operator had got to by its last firing records: what `host.Resumed` holds, as plain values."""
-    incarnation = 0
-    last: dict[str, int] = {}
-    changed: dict[str, Any] = {}
-    ports = list(node.outputs)
-    for data in batches:
-        for record in decode_batch(data).records:
-            if record.kind == "reset":
-                last.clear()
-            if record.kind == "param":
-                changed[record.detail["name"]] = record.detail["value"]
-            incarnation = max(incarnation, record.incarnation)
-            for port, emission in zip(ports, record.outputs, strict=False):
-                if emission is not None and emission.seq != WITHHELD and record.kind != "setup":
-                    last[port] = emission.stamp
-    return {"incarnation": incarnation + 1, "last": last, "changed": changed}

@@ -42,7 +42,7 @@ def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: queue.Simp
 
 
 def _hand_over(host: Any) -> None:
-    """Sends the firing records that a host still holds; where that fails too, the first cause stays the one reported."""
+    """Sends the firing records that a host still holds; where that fails too, the first cause is reported."""
     try:
         if host is not None:
             host.hand_over()
