@@ -57,8 +57,8 @@ class Supervised:
     gone: bool = False
     restarts: Restarts | None = None
     beat: float | None = None
-    work: str = ""
-    """What it was at for longer than a moment, when it was last heard of."""
+    work: tuple[str, int, float] | None = None
+    """The firing that it was at for longer than a moment when it was last heard of: operator, stamp, seconds."""
     cause: str = ""
     """Why the supervisor killed it."""
     rejoining: float | None = None
@@ -73,6 +73,13 @@ class Supervised:
     def describe(self) -> str:
         what = ", ".join(self.nodes)
         return f"host {self.label!r}" + (f" (operators {what})" if what and what != self.label else "")
+
+    def at_work(self) -> str:
+        """Such as "host 'camera', camera at stamp 5 for 3 s"."""
+        if self.work is None:
+            return self.describe()
+        operator, stamp, seconds = self.work
+        return f"{self.describe()}, {operator} at stamp {stamp} for {seconds:.0f} s"
 
 
 class Supervisor:
@@ -279,7 +286,7 @@ class Supervisor:
         busy = silent or [p for p in self._processes.values() if p.report is None]
         for process in silent:
             process.child.kill()
-        names = "; ".join(p.describe() + (f", {p.work}" if p.work else "") for p in busy)
+        names = "; ".join(p.at_work() for p in busy)
         raise RunFailed(f"no progress for {self.plan.stall_timeout:g} s; still busy: {names}", self._last_words())
 
     def _poll_quiescence(self) -> None:
@@ -356,7 +363,7 @@ class Supervisor:
                 self._cover()
             case "beat":
                 process.beat = time.monotonic()
-                process.work = fields["work"]
+                process.work = None if fields["work"] is None else tuple(fields["work"])
             case "state":
                 process.state = fields
             case "ended":
