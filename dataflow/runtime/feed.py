@@ -12,7 +12,7 @@ from dataflow.messages.digest import StreamDigest
 from dataflow.recording import Recorded, Recording
 from dataflow.runtime.firings import Emission
 from dataflow.runtime.runner import Emitter, Recorder
-from dataflow.sync import NEVER, Entry
+from dataflow.sync import FOREVER, NEVER, Entry
 
 
 class Feed(Protocol):
@@ -40,6 +40,7 @@ class Window:
     def __init__(self, messages: int, nbytes: int) -> None:
         self.messages, self.nbytes = messages, nbytes
         self._outstanding: deque[tuple[int, int, int]] = deque()
+        self._open = False
         self.count = self.size = 0
 
     @property
@@ -47,12 +48,15 @@ class Window:
         return bool(self._outstanding) and (self.count >= self.messages or self.size >= self.nbytes)
 
     def add(self, stamp: int, messages: int, nbytes: int) -> None:
+        if self._open:
+            return
         self._outstanding.append((stamp, messages, nbytes))
         self.count += messages
         self.size += nbytes
 
     def cover(self, frontier: int) -> None:
-        """Everything with a stamp ≤ `frontier` is done by every operator."""
+        """Everything with a stamp ≤ `frontier` is done by every operator; with `FOREVER` there is none to wait for."""
+        self._open = frontier == FOREVER
         while self._outstanding and self._outstanding[0][0] <= frontier:
             _, messages, nbytes = self._outstanding.popleft()
             self.count -= messages
@@ -67,6 +71,30 @@ class Window:
         """Doubles the window: for graphs that must look further ahead than it allows."""
         self.messages *= 2
         self.nbytes *= 2
+
+
+class Handover:
+    """Messages and bytes that one thread has put and another has not taken yet; every number has one writer."""
+
+    def __init__(self) -> None:
+        self._put = [0, 0]
+        self._taken = [0, 0]
+
+    @property
+    def count(self) -> int:
+        return self._put[0] - self._taken[0]
+
+    @property
+    def size(self) -> int:
+        return self._put[1] - self._taken[1]
+
+    def put(self, messages: int, nbytes: int) -> None:
+        self._put[0] += messages
+        self._put[1] += nbytes
+
+    def take(self, messages: int, nbytes: int) -> None:
+        self._taken[0] += messages
+        self._taken[1] += nbytes
 
 
 @dataclass(slots=True)

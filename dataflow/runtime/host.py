@@ -6,6 +6,7 @@ the firings that are decided, lets feeds admit what the window allows, and waits
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import sys
 import threading
@@ -23,16 +24,16 @@ from dataflow.recording import Recording
 from dataflow.runtime.admission import LiveRunner
 from dataflow.runtime.chaos import TO_SOURCES, SourceFaults
 from dataflow.runtime.control import Channel, ChannelClosed
-from dataflow.runtime.feed import Feed, LogFeed, Window
+from dataflow.runtime.feed import Feed, Handover, LogFeed, Window
 from dataflow.runtime.host_config import HostConfig, Resumed
 from dataflow.runtime.network import network_config
 from dataflow.runtime.outlet import Outlet
 from dataflow.runtime.reexecute import RecordedRunner, recorded_digests, recorded_firings
 from dataflow.runtime.runner import OperatorFailure, OperatorRunner, summary_of
-from dataflow.runtime.source import SourceRunner, step_stamp
+from dataflow.runtime.source import SourceRunner, step_size, step_stamp
 from dataflow.runtime.threads import limit_threads
 from dataflow.runtime.watchdog import Watchdog
-from dataflow.sync import NEVER, Entry
+from dataflow.sync import FOREVER, NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode
 from dataflow.transport.bus import BusError
 from dataflow.transport.keys import runtime_key
@@ -43,6 +44,9 @@ PROBE_EVERY = 0.01
 PROMISE_EVERY = 8
 STATICS_WITHIN = 5.0
 MISSED_AFTER = 0.2
+BACKLOG = (16, 8)
+"""How many windows of messages and of bytes may wait for operators that no source waits for."""
+BACKLOG_EVERY = 0.5
 
 
 class HostFailure(RuntimeError):
@@ -68,6 +72,9 @@ class Host:
         self.faults: dict[str, SourceFaults] = {}
         self._static_seen: set[str] = set()
         self.window = Window(*config.window)
+        self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
+        self._unread: dict[str, Handover] = {}
+        self._backlog_due = 0.0
         self._expected: dict[str, tuple[int, int]] = {}
         self._probed: set[str] = set()
         self._probing = False
@@ -235,16 +242,17 @@ class Host:
 
     def run(self) -> None:
         """The main loop; returns when the supervisor has let the host go."""
-        while not self._left:
+        while True:
             if self._probing:
                 self._probe()
             self._take(self._wait_time())
             if self._left:
-                return
+                break
             worked = self._work()
             self.outlet.flush_due()
             self._report(idle=not worked)
             self._answer_poll(idle=not worked)
+        self.hand_over()
 
     def _answer_poll(self, *, idle: bool) -> None:
         """Answers after the work that was there: a host is idle only when a look at everything found nothing to do."""
@@ -285,8 +293,8 @@ class Host:
                 self._receive(stream, payload)
             case ("control", kind, fields):
                 self._control(kind, fields)
-            case ("source", runner, step):
-                self._from_live(runner, step)
+            case ("source", runner, step, lost):
+                self._from_live(runner, step, lost)
             case ("param", name, query):
                 self._set_parameter(name, query)
             case ("source_failed", failure):
@@ -428,14 +436,16 @@ class Host:
     def _start_live(self, runner: SourceRunner) -> None:
         faults = self.faults[runner.node.name]
         behind = self.config.resume is not None
+        unread = self._unread[runner.node.name] = Handover()
+        lost = 0
 
         def read() -> None:
-            nonlocal behind
+            nonlocal behind, lost
             try:
                 while not self._stopping.is_set():
                     step = runner.take()
                     if step is None:
-                        self.inbox.put(("source", runner, None))
+                        self.inbox.put(("source", runner, None, lost))
                         return
                     if not runner.source.live:
                         stamp = step_stamp(step)
@@ -444,7 +454,13 @@ class Host:
                         behind = False
                         self._pace(stamp)
                     for given in faults.apply(step, time.monotonic()):
-                        self.inbox.put(("source", runner, given))
+                        if unread.count >= self.backlog.messages or unread.size >= self.backlog.nbytes:
+                            lost += 1
+                            self._tell_backlog(unread.count, unread.size)
+                            continue
+                        unread.put(*step_size(given))
+                        self.inbox.put(("source", runner, given, lost))
+                        lost = 0
                 runner.close_stream()
             except OperatorFailure as failure:
                 self.inbox.put(("source_failed", failure))
@@ -456,14 +472,20 @@ class Host:
         if self._start is not None:
             self._stopping.wait(max(0.0, self._due_in(stamp)))
 
-    def _from_live(self, runner: SourceRunner, step: dict[str, Message] | None) -> None:
+    def _from_live(self, runner: SourceRunner, step: dict[str, Message] | None, lost: int) -> None:
+        """Takes a step that the source's thread has read, and how many it dropped before, since they were too many."""
+        if step is not None:
+            self._unread[runner.node.name].take(*step_size(step))
         if runner.ended:
             return
+        runner.overflow += lost
         if step is None:
             runner.finish()
             return
-        if self.window.full:
+        if self.window.full or self.backlog.full:
             runner.overflow += 1
+            if self.backlog.full:
+                self._tell_backlog(self.backlog.count, self.backlog.size)
             return
         incarnation = runner.records.incarnation
         admitted = runner.emit_live(step)
@@ -471,9 +493,19 @@ class Host:
             return
         if runner.records.incarnation != incarnation:
             self.window.clear()
+            self.backlog.clear()
             self.channel.send("jumped", operator=runner.node.name, stamp=runner.last)
         runner.promise()
         self.window.add(runner.last, *admitted)
+        self.backlog.add(runner.last, *admitted)
+
+    def _tell_backlog(self, messages: int, nbytes: int) -> None:
+        """Tells the supervisor, now and then, that a source drops since so much waits; on any thread."""
+        now = time.monotonic()
+        if now >= self._backlog_due:
+            self._backlog_due = now + BACKLOG_EVERY
+            with contextlib.suppress(ChannelClosed):  # the control thread sees to it
+                self.channel.send("backlog", messages=messages, bytes=nbytes)
 
     # Progress
 
@@ -567,6 +599,7 @@ class Host:
                 self._fault(fields["fault"], fields["operator"], fields["fields"])
             case "covered":
                 self.window.cover(fields["frontier"])
+                self.backlog.cover(fields.get("backlog", FOREVER))
             case "grow":
                 self.window.grow()
             case "poll":
@@ -666,8 +699,8 @@ class Host:
         for publisher in self.remote.values():
             publisher.probe()
 
-    def fail(self) -> None:
-        """After a failure: hands over the firing records that were not sent yet, the failed one among them."""
+    def hand_over(self) -> None:
+        """Sends the firing records that were not sent yet: after a failure here, the failed one among them."""
         if self._released:
             self.outlet.flush_all()
 

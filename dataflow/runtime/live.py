@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import signal
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
-from dataflow.graph.model import Node, Restart
+from dataflow.graph.model import Restart
 from dataflow.runtime.chaos import Fault
-from dataflow.runtime.firings import WITHHELD, decode_batch
 from dataflow.runtime.health import HealthMonitor, diagnostics_fields
+from dataflow.runtime.held import HeldRecords
 from dataflow.runtime.keys import firings_key
+from dataflow.runtime.live_flow import LiveFlow
 from dataflow.runtime.plan import HostPlan, RunPlan
 from dataflow.runtime.report import OperatorCounts, RunFailed
 from dataflow.runtime.restarts import Restarts
@@ -25,9 +25,10 @@ from dataflow.runtime.supervisor import Supervised, Supervisor
 from dataflow.sync import FOREVER, NEVER
 
 DIAGNOSE_EVERY = 1.0
-HELD_RECORDS = 4096
 EDGES_WITHIN = 5.0
 BEAT_WITHIN = 3.0
+HUNG_AFTER = 5.0
+"""Seconds that a firing may take, at least, when sources drop because of it."""
 
 
 class LiveSupervisor(Supervisor):
@@ -35,7 +36,9 @@ class LiveSupervisor(Supervisor):
 
     def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
         super().__init__(plan, on_output=on_output)
-        self._records: dict[str, deque[bytes]] = {}
+        self._held = {name: HeldRecords(tuple(node.outputs)) for name, node in plan.graph.nodes.items()}
+        self._flow = LiveFlow(plan.graph, [host.nodes for host in self._plans.values()])
+        self._frontiers: dict[str, tuple[int, int]] = {}
         self._base: dict[str, OperatorCounts] = {}
         self._away: dict[str, str] = {}
         self._ended_streams: dict[str, str] = {}
@@ -163,9 +166,7 @@ class LiveSupervisor(Supervisor):
             self.status.restarts[name] = self.status.restarts.get(name, 0) + 1
             if name in self.status.operators:
                 self._base[name] = self.status.operators[name]
-        held = {n: list(self._records.get(n, ())) for n in process.nodes}
-        for batches in held.values():
-            self._tell_recorder("records", batches=batches)
+        self._hand_over_records(process.nodes)
         self._tell_consumers(process, absent=True)
         self._cover()
         self._event(
@@ -195,9 +196,7 @@ class LiveSupervisor(Supervisor):
         old.restarts.begun()
         self._close_process(old)
         resume = {
-            name: resumed(self._records.get(name, ()), self.plan.graph.nodes[name])
-            | {"restarts": self.status.restarts.get(name, 0)}
-            for name in old.nodes
+            name: self._held[name].resumed() | {"restarts": self.status.restarts.get(name, 0)} for name in old.nodes
         }
         self._spawn(old.label, old.nodes, old.kind, {**old.config, "resume": resume})
         new = self._processes[old.label]
@@ -232,6 +231,46 @@ class LiveSupervisor(Supervisor):
         elif not process.probing and now - process.rejoining > self.plan.start_timeout:
             self._kill(process, f"was not ready again within {self.plan.start_timeout:g} s")
 
+    def _hand_over_records(self, operators: Iterable[str] | None = None) -> None:
+        """Gives the recorder the firing records held of some operators, or of all; it leaves out what it has."""
+        for name in self._held if operators is None else operators:
+            self._tell_recorder("records", batches=list(self._held[name].batches))
+
+    # Flow control
+
+    def _counted(self) -> Iterator[tuple[Supervised, str]]:
+        """The operators that take part at the moment, with their processes."""
+        for process in self._processes.values():
+            if process.kind == "host" and process.report is None and process.back:
+                for name in self._consumers(process):
+                    yield process, name
+
+    def _cover(self) -> None:
+        """Tells each host with sources how far everything is done: by all for whom they wait, and by all."""
+        for name, node in self.plan.graph.nodes.items():
+            if node.source and name in self.status.operators:
+                self._flow.reached(name, self.status.operators[name].done)
+        strict = [
+            max((self._flow.lag(source, stamp) for source, stamp in process.done.items()), default=0)
+            for process in self._processes.values()
+            if process.kind == "sink" and process.report is None
+        ]
+        loose = list(strict)
+        for process, name in self._counted():
+            behind_last, behind_foremost = self._flow.lags(name, process.done.get(name, NEVER))
+            loose.append(behind_foremost)
+            if name in self._flow.waited_for:
+                strict.append(behind_last)
+        for process in self._processes.values():
+            sources = [name for name in process.nodes if self.plan.graph.nodes[name].source]
+            if sources and process.report is None:
+                covered, backlog = (
+                    self._flow.covered(sources, max(lags)) if lags else FOREVER for lags in (strict, loose)
+                )
+                if self._frontiers.get(process.label) != (covered, backlog):
+                    self._frontiers[process.label] = covered, backlog
+                    self._send(process, "covered", frontier=covered, backlog=backlog)
+
     # What hosts say
 
     def _counts_agree(self) -> bool:
@@ -247,13 +286,13 @@ class LiveSupervisor(Supervisor):
         super()._on_message(process, kind, fields)
         match kind:
             case "record":
-                held = self._records.setdefault(fields["operator"], deque(maxlen=HELD_RECORDS))
-                held.append(fields["data"])
+                self._held[fields["operator"]].add(fields["data"])
             case "beat":
                 self._check_memory(process, fields["memory"])
             case "overdue":
-                stamp, spent = fields["stamp"], fields["seconds"]
-                self._overdue(process, fields["operator"], f"its firing at stamp {stamp} has taken {spent:.2f} s")
+                self._overdue(process, fields["operator"], fields["stamp"], fields["seconds"])
+            case "backlog":
+                self._look_for_hang(fields["messages"], fields["bytes"])
             case "restarting":
                 name = fields["operator"]
                 self.status.restarts[name] = self.status.restarts.get(name, 0) + 1
@@ -278,7 +317,7 @@ class LiveSupervisor(Supervisor):
                 self._ended_streams[fields["stream"]] = fields["reason"]
             case "jumped":
                 name, stamp = fields["operator"], fields["stamp"]
-                self._covered = NEVER
+                self._frontiers.clear()
                 for other in self._processes.values():
                     other.done = {n: min(f, stamp - 1) for n, f in other.done.items() if f != FOREVER}
                 self._event("clock_jump", f"the clock of {name!r} jumped back to {stamp}", operator=name, stamp=stamp)
@@ -291,12 +330,31 @@ class LiveSupervisor(Supervisor):
                 raise RunFailed(f"{process.describe()} {cause}", self._last_words(), process.nodes[0])
             self._kill(process, cause)
 
-    def _overdue(self, process: Supervised, operator: str, what: str) -> None:
+    def _overdue(self, process: Supervised, operator: str, stamp: int, seconds: float) -> None:
         deadline = self.plan.graph.nodes[operator].live.deadline or 0
-        cause = f"missed the deadline of {operator!r}: {what} (deadline {deadline * 1e-9:g} s)"
+        what = f"its firing at stamp {stamp} has taken {seconds:.2f} s (deadline {deadline * 1e-9:g} s)"
+        self._end_hang(process, operator, f"missed the deadline of {operator!r}: {what}")
+
+    def _look_for_hang(self, messages: int, nbytes: int) -> None:
+        """Sources drop because so much waits for operators that no source waits for: one of those may hang."""
+        lags = {name: self._flow.lags(name, process.done.get(name, NEVER))[1] for process, name in self._counted()}
+        for process in self._processes.values():
+            if process.work is None or process.gone or not process.back or process.cause:
+                continue
+            operator, stamp, seconds = process.work
+            late = 2 * lags.get(operator, 0) >= max(lags.values())  # not just another one that is slow
+            if seconds > HUNG_AFTER and late and self.plan.graph.nodes[operator].live.queue != "block":
+                cause = (
+                    f"hangs in {operator!r}: its firing at stamp {stamp} has taken {seconds:.1f} s, "
+                    f"and {messages} messages ({nbytes / 1e6:.1f} MB) wait"
+                )
+                self._end_hang(process, operator, cause, advice=": give it a `deadline` or a restart policy")
+                return
+
+    def _end_hang(self, process: Supervised, operator: str, cause: str, *, advice: str = "") -> None:
         if not self._may_restart(process):
             process.child.kill()
-            raise RunFailed(f"{process.describe()} {cause}", self._last_words(), operator)
+            raise RunFailed(f"{process.describe()} {cause}{advice}", self._last_words(), operator)
         self._kill(process, cause)
 
 
@@ -311,22 +369,3 @@ def _taken(plan: RunPlan, host: HostPlan) -> set[str]:
         return set(host.subscribe)
     firings = {firings_key(plan.graph.namespace, node) for node in plan.graph.nodes} if host.sink == "record" else set()
     return set(host.streams) | firings
-
-
-def resumed(batches: Iterable[bytes], node: Node) -> dict[str, Any]:
-    """Where an operator had got to by its last firing records: what `host.Resumed` holds, as plain values."""
-    incarnation = 0
-    last: dict[str, int] = {}
-    changed: dict[str, Any] = {}
-    ports = list(node.outputs)
-    for data in batches:
-        for record in decode_batch(data).records:
-            if record.kind == "reset":
-                last.clear()
-            if record.kind == "param":
-                changed[record.detail["name"]] = record.detail["value"]
-            incarnation = max(incarnation, record.incarnation)
-            for port, emission in zip(ports, record.outputs, strict=False):
-                if emission is not None and emission.seq != WITHHELD and record.kind != "setup":
-                    last[port] = emission.stamp
-    return {"incarnation": incarnation + 1, "last": last, "changed": changed}

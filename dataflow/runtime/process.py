@@ -41,6 +41,15 @@ def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: queue.Simp
     return Host(HostConfig(**config), channel, inbox)
 
 
+def _hand_over(host: Any) -> None:
+    """Sends the firing records that a host still holds; where that fails too, the first cause is reported."""
+    try:
+        if host is not None:
+            host.hand_over()
+    except Exception as error:
+        print(f"firing records are lost: {type(error).__name__}: {error}", file=sys.stderr)
+
+
 def _report(channel: Channel, error: BaseException) -> None:
     """Tells the supervisor what failed, if it is still there."""
     operator = getattr(error, "operator", None)
@@ -82,10 +91,10 @@ def main(descriptor: int) -> int:
         host.run()
     except ChannelClosed:
         code = SUPERVISOR_GONE
+        _hand_over(host)
     except BaseException as error:
         code = FAILED
-        if host is not None:
-            host.fail()
+        _hand_over(host)
         _report(channel, error)
         _await_leave(inbox)
     facts: Any = {}

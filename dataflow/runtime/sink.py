@@ -94,6 +94,9 @@ class SinkHost:
         self._expected: dict[str, tuple[int, int]] = {}
         self._recorded: dict[str, tuple[int, int]] = {}  # operator → the record that follows those stored
         self._probed: set[str] = set()
+        taken = [*(self.graph.streams[s].node for s in config.streams), *config.firings]
+        self._taken = {name: NEVER for name in taken if self.graph.nodes[name].source}
+        self._told: dict[str, int] = {}
         self._done = NEVER
         self._report_due = 0.0
         self._flush_due = 0.0
@@ -176,6 +179,7 @@ class SinkHost:
                 assert envelope.message is not None
                 self.sink.message(key, envelope.message, envelope.seq, envelope.incarnation)
                 self.written += 1
+                self._note_taken(self.graph.streams[key].node, envelope.stamp)
                 self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
             case Kind.FRONTIER:
                 self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
@@ -203,15 +207,23 @@ class SinkHost:
             data = encode_batch(fresh, last=batch.last)
         self._recorded[batch.operator] = (batch.incarnation, last.index + 1)
         self.sink.firings(batch.operator, last.stamp, data)
+        if last.kind == "fire":
+            self._note_taken(batch.operator, last.stamp)
         return batch.last
 
+    def _note_taken(self, operator: str, stamp: int) -> None:
+        if operator in self._taken and stamp > 0:
+            self._taken[operator] = stamp
+
     def _report(self, now: float) -> None:
+        """Tells how far it is: up to which stamp in all streams, or, in a live run, of each source it takes from."""
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
-        done = min(dynamic, default=FOREVER)
-        if done != self._done:
-            self._done = done
+        self._done = min(dynamic, default=FOREVER)
+        done = dict(self._taken) if self.config.live else {self.config.label: self._done}
+        if done != self._told:
+            self._told = done
             self._report_due = now + REPORT_EVERY
-            self.channel.send("progress", done={self.config.label: done}, counts=self._counts())
+            self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
             self._ended = True
             self.channel.send("ended", report={"counts": self._counts()})
@@ -249,6 +261,7 @@ class SinkHost:
                 if self._outcome != "complete":
                     self._drain()
             case "lost":
+                self._drain()
                 raise ChannelClosed("the supervisor is gone")
 
     def _drain(self) -> None:
@@ -262,8 +275,8 @@ class SinkHost:
             if item[0] == "envelope":
                 self._handle(item)
 
-    def fail(self) -> None:
-        """After a failure of the sink's own there is nothing left to hand over."""
+    def hand_over(self) -> None:
+        """A sink keeps nothing that another process needs."""
 
     def close(self) -> Mapping[str, Any]:
         facts: Mapping[str, Any] = {}

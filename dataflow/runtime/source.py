@@ -104,7 +104,7 @@ class SourceRunner:
         lost, self._told = self.overflow - self._told, self.overflow
         self.records.add("fire", stamp, started, outputs=emissions, detail={"overflow": lost} if lost else {})
         self.ports.publish()
-        return len(step), sum(m.nbytes() for m in step.values())
+        return step_size(step)
 
     def emit_live(self, step: Mapping[str, Message]) -> tuple[int, int] | None:
         """As `emit`, for a source whose stamps may go back: returns None for a step that is not sent.
@@ -171,3 +171,8 @@ class SourceRunner:
 
 def step_stamp(step: Mapping[str, Message]) -> int:
     return next(iter(step.values())).stamp
+
+
+def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
+    """How many messages and bytes a step is."""
+    return len(step), sum(m.nbytes() for m in step.values())

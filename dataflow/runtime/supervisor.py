@@ -57,8 +57,8 @@ class Supervised:
     gone: bool = False
     restarts: Restarts | None = None
     beat: float | None = None
-    work: str = ""
-    """What it was at for longer than a moment, when it was last heard of."""
+    work: tuple[str, int, float] | None = None
+    """The firing that it was at for longer than a moment when it was last heard of: operator, stamp, seconds."""
     cause: str = ""
     """Why the supervisor killed it."""
     rejoining: float | None = None
@@ -73,6 +73,13 @@ class Supervised:
     def describe(self) -> str:
         what = ", ".join(self.nodes)
         return f"host {self.label!r}" + (f" (operators {what})" if what and what != self.label else "")
+
+    def at_work(self) -> str:
+        """Such as "host 'camera', camera at stamp 5 for 3 s"."""
+        if self.work is None:
+            return self.describe()
+        operator, stamp, seconds = self.work
+        return f"{self.describe()}, {operator} at stamp {stamp} for {seconds:.0f} s"
 
 
 class Supervisor:
@@ -279,7 +286,7 @@ class Supervisor:
         busy = silent or [p for p in self._processes.values() if p.report is None]
         for process in silent:
             process.child.kill()
-        names = "; ".join(p.describe() + (f", {p.work}" if p.work else "") for p in busy)
+        names = "; ".join(p.at_work() for p in busy)
         raise RunFailed(f"no progress for {self.plan.stall_timeout:g} s; still busy: {names}", self._last_words())
 
     def _poll_quiescence(self) -> None:
@@ -356,7 +363,7 @@ class Supervisor:
                 self._cover()
             case "beat":
                 process.beat = time.monotonic()
-                process.work = fields["work"]
+                process.work = None if fields["work"] is None else tuple(fields["work"])
             case "state":
                 process.state = fields
             case "ended":
@@ -468,16 +475,30 @@ class Supervisor:
                 raise RunFailed(f"did not close within {CLOSE_TIMEOUT:g} s: {'; '.join(late)}", self._last_words())
 
     def _abandon(self, outcome: str) -> None:
-        """After a failure: lets every process close what it has open, for a bounded time."""
-        self._send_all("leave", outcome=f"failed: {outcome}")
-        began = time.monotonic()
-        while not all(p.gone for p in self._processes.values()):
-            if time.monotonic() - began > (LEAVE_AT_ONCE if self._stop_asked > 1 else LEAVE_TIMEOUT):
-                return
+        """After a failure: lets every process close what it has open, for a bounded time.
+
+        The sinks leave last, since hosts hand over firing records when they leave.
+        """
+        self.status.phase = "closing"
+        within = LEAVE_AT_ONCE if self._stop_asked > 1 else LEAVE_TIMEOUT
+        self._let_go("host", outcome, within / 2)
+        self._hand_over_records()
+        self._let_go("sink", outcome, within)
+
+    def _let_go(self, kind: str, outcome: str, within: float) -> None:
+        """Tells the processes of a kind to leave, and waits up to `within` seconds until they have."""
+        leaving = [p for p in self._processes.values() if p.kind == kind]
+        for process in leaving:
+            self._send(process, "leave", outcome=f"failed: {outcome}")
+        deadline = time.monotonic() + within
+        while not all(p.gone for p in leaving) and time.monotonic() < deadline:
             try:
                 self._receive(TICK)
             except RunFailed as later:  # a consequence; the first cause is already on its way to the user
                 self.status.notes.append(f"then: {later}")
+
+    def _hand_over_records(self) -> None:
+        """Gives the recorder the firing records that the supervisor holds; none, unless the run is live."""
 
     def _reap(self) -> None:
         for process in self._processes.values():

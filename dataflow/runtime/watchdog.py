@@ -32,13 +32,13 @@ class Watchdog:
         self._over.set()
         self._thread.join(timeout=1.0)
 
-    def _work(self, now: float) -> str:
-        """The call that has taken more than a second, if any."""
+    def _work(self, now: float) -> tuple[str, int, float] | None:
+        """The call that has taken more than a second, if any: operator, stamp, seconds."""
         for runner in self._runners:
             since = runner.working_since
             if since is not None and now - since > 1.0:
-                return f"{runner.node.name} at stamp {runner.working_stamp} for {now - since:.0f} s"
-        return ""
+                return runner.node.name, runner.working_stamp, now - since
+        return None
 
     def _run(self) -> None:
         told: set[str] = set()

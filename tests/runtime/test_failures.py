@@ -16,6 +16,7 @@ from tests_runtime_graphs import chain
 
 from dataflow.graph import Graph
 from dataflow.recording import Recording
+from dataflow.runtime.live import supervisor_of
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import recorded_firings
 from dataflow.runtime.report import RunFailed
@@ -121,6 +122,49 @@ def test_a_failure_leaves_a_recording_that_says_so(tmp_path: Path) -> None:
         last = list(recorded_firings(recording, "bad"))[-1]
         assert (last.outcome, last.stamp) == ("error", 1_200_000_000)
         assert last.detail["error"] == "RuntimeError: the gripper is on fire"
+
+
+def unexplained(path: Path) -> dict[str, int]:
+    """By stream, the messages of a recording that no firing record of their operator accounts for."""
+    found = {}
+    with Recording(path) as recording:
+        for stream in (s for s, facts in recording.streams.items() if facts.count and "/@/" not in s):
+            _, operator, _ = stream.split("/")
+            made = {
+                (record.incarnation, out.seq, out.stamp)
+                for record in recorded_firings(recording, operator)
+                for out in record.outputs
+                if out is not None
+            }
+            messages = {(m.incarnation, m.seq, m.message.stamp) for m in recording.messages([stream])}
+            assert messages
+            found[stream] = len(messages - made)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("live", "how"),
+    [
+        (False, "raise"),
+        (True, "raise"),
+        (True, "die"),  # the supervisor holds what its host had not sent
+    ],
+)
+def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: str, tmp_path: Path) -> None:
+    path = tmp_path / "failed.mcap"
+    graph = chain(
+        f"bad: {{use: runtime_operators:Broken, params: {{how: {how}}}, inputs: {{x: left/fast}}}}",
+        "smooth: {use: runtime_operators:Smooth, inputs: {x: left/fast}}",
+        "merge: {use: runtime_operators:Merge, inputs: {all: [smooth/mean, left/slow]}}",
+        count=1000,
+    )
+
+    with pytest.raises(RunFailed):
+        supervisor_of(RunPlan(graph, record=path, placement="host_each", live=live)).run()
+
+    lost = unexplained(path)
+    assert {"test/left/fast", "test/bad/y", "test/smooth/mean", "test/merge/seen"} <= set(lost)
+    assert not any(lost.values()), lost
 
 
 def test_what_operators_print_reaches_the_user() -> None:

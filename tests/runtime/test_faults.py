@@ -12,6 +12,7 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.messages import Diagnostics
 from dataflow.recording import Recording
+from dataflow.runtime import live
 from dataflow.runtime.chaos import plan_of
 from dataflow.runtime.execute import run
 from dataflow.runtime.keys import diagnostics_key
@@ -171,6 +172,36 @@ def test_without_a_policy_a_hang_ends_the_run_and_names_operator_and_deadline(pa
         assert recording.streams["test/bad/y"].count > 0
 
 
+SMALL = {"window": (8, 64 << 20)}
+"""So that little has to wait for an operator before it counts as hung."""
+
+
+@pytest.mark.parametrize("placement", ["host_each", "one_host"])
+def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
+    placement: str, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    graph = robot(HANGS.format("queue: newest, size: 1"), count=1000)
+
+    with pytest.raises(
+        RunFailed,
+        match=r"hangs in 'bad': its firing at stamp 1200000000 has taken [\d.]+ s, "
+        r"and \d+ messages \([\d.]+ MB\) wait: give it a `deadline` or a restart policy",
+    ) as caught:
+        Ran(graph, path, placement=placement, **SMALL)
+
+    assert caught.value.operator == "bad"
+
+
+def test_a_hang_without_a_deadline_is_ended_by_its_restart_policy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    ran = Ran(robot(HANGS.format(f"queue: newest, size: 1, {AGAIN}"), count=400), path, **SMALL)
+
+    assert ran.report.restarts == {"bad": 1}
+    assert "host 'bad' hangs in 'bad': its firing at stamp 1200000000" in ran.events("restart")[0]
+    assert ran.is_repeated()
+
+
 LEAK = {"kind": "leak", "operator": "smooth", "megabytes": 400, "at": "200ms"}
 
 
@@ -198,14 +229,16 @@ def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> 
     graph = robot(
         "slow: {use: runtime_operators:Smooth, inputs: {x: left/fast}, live: {queue: newest, size: 1}}",
         "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
-        count=150,
+        count=250,
     )
+    slow = {"kind": "slow", "operator": "slow", "by": "1500ms", "for": "1s", "at": "200ms"}
 
-    ran = Ran(graph, path, {"kind": "slow", "operator": "slow", "by": "50ms", "for": "1s", "at": "200ms"})
+    ran = Ran(graph, path, slow, window=(64, 64 << 20))  # much more than a window comes while it is at one firing
 
-    assert ran.dropped("slow", "overflow", "x") > 20
+    assert ran.dropped("slow", "overflow", "x") > 100
     assert ran.dropped("slow", "overflow", "@tick") > 0  # nor does its own timer fall behind
-    assert ran.report.summaries["sum"]["count"] == 150
+    assert ran.report.operators["left"].dropped == 0
+    assert ran.report.summaries["sum"]["count"] == 250
     assert "dropping" in ran.states("slow")
     assert ran.is_repeated()
 
@@ -222,13 +255,32 @@ def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
     assert ran.is_repeated()
 
 
+def test_a_source_that_stops_holds_up_no_other(path: Path) -> None:
+    graph = robot(
+        "right: {use: runtime_operators:Counter, params: {count: 250}}",
+        "one: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
+        "other: {use: runtime_operators:Sum, inputs: {x: right/fast}}",
+        count=250,
+    )
+    stop = {"kind": "stop", "operator": "right", "for": "1500ms", "at": "300ms"}
+
+    ran = Ran(graph, path, stop, window=(64, 64 << 20))  # less than the other gives in that time
+
+    assert ran.report.operators["left"].dropped == 0
+    assert ran.report.summaries["one"]["count"] == 250
+    assert ran.report.summaries["other"]["count"] < 150
+    assert ran.is_repeated()
+
+
 def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, params: {sleep: 0.01}, inputs: {x: left/fast}, "
         "live: {queue: newest, size: 4}}"
     )
 
-    ran = Ran(graph, path, {"kind": "flood", "operator": "left", "factor": 50, "for": "300ms", "at": "300ms"})
+    flood = {"kind": "flood", "operator": "left", "factor": 50, "for": "300ms", "at": "300ms"}
+
+    ran = Ran(graph, path, flood, window=(2048, 64 << 20))
 
     assert len(ran.numbers("test/left/fast")) > 500
     assert ran.dropped("slow", "overflow", "x") > 300
