@@ -11,9 +11,9 @@ from rerun.blueprint.api import VisualizerLike
 
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
-from dataflow.view.canvas import TIMELINE, Role, plots_of, roles_of
+from dataflow.view.canvas import Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
-from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, entity_of
+from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, Outlook, entity_of
 
 _BACKGROUND = (24, 27, 33)
 _PLOT_SECONDS = 10.0

@@ -14,10 +14,7 @@ from rerun.error_utils import catch_and_log_exceptions
 from dataflow.messages import Message
 from dataflow.view import colors
 from dataflow.view.frames import FrameCycleError, Rank
-from dataflow.view.scene import VIEWER_LOG, SceneState
-
-TIMELINE = "stamp"
-"""The one timeline: event time."""
+from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
 
 NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""

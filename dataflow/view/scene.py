@@ -23,6 +23,9 @@ SCENE = "/scene"
 FRAMES = "/frames"
 """Entities of the frames: `/frames/<name>`."""
 
+TIMELINE = "stamp"
+"""The one timeline: event time."""
+
 VIEWER_LOG = "/viewer/log"
 """Entity of what the viewer itself has to say."""
 
@@ -90,6 +93,7 @@ class SceneState:
     _around: list[Vector] = field(default_factory=list)
     _posed: dict[str, None] = field(default_factory=dict)
     _waiting: dict[str, int] = field(default_factory=dict)
+    _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
 
     def changed(self, entity: str, key: str, value: object) -> bool:
         """Whether `value` differs from what was last remembered under (entity, key); remembers it."""
@@ -149,22 +153,46 @@ class SceneState:
             match change:
                 case Attach():
                     position, orientation = split_matrix(change.T_parent_child)
-                    recording.log(
-                        frame_entity(change.child),
-                        rr.Transform3D(
-                            translation=position,
-                            quaternion=rr.Quaternion(xyzw=orientation),
-                            parent_frame=change.parent,
-                            child_frame=change.child,
-                        ),
-                        static=static and not change.assumed,
+                    pose = rr.Transform3D(
+                        translation=position,
+                        quaternion=rr.Quaternion(xyzw=orientation),
+                        parent_frame=change.parent,
+                        child_frame=change.child,
                     )
+                    self._log_frame(recording, change.child, pose, stamp, static=static, given=not change.assumed)
                     if change.assumed:
                         self._waiting.setdefault(change.child, stamp)
                 case Detach():
-                    recording.log(frame_entity(change.child), rr.Clear(recursive=False))
+                    self._log_frame(
+                        recording, change.child, rr.Clear(recursive=False), stamp, static=static, given=False
+                    )
                 case NewRoot():
                     recording.log(SCENE, rr.CoordinateFrame(change.frame), static=True)
+
+    def _log_frame(
+        self,
+        recording: rr.RecordingStream,
+        frame: str,
+        row: rr.AsComponents,
+        stamp: int,
+        *,
+        static: bool,
+        given: bool,
+    ) -> None:
+        """Logs a row of a frame so that it takes the place of what was assumed, whichever of the two is stamped later.
+
+        A static row would not: Rerun keeps the parents of earlier rows beside it, and may find a loop. So a frame that
+        has a row in time gets no static one; a pose that holds for all time then replaces its last row in time.
+        """
+        if static and given and frame not in self._rows:
+            recording.log(frame_entity(frame), row, static=True)
+            return
+        last, moving = self._rows.get(frame, (stamp, False))
+        at = last if static else stamp if given and moving else max(last, stamp)
+        recording.set_time(TIMELINE, timestamp=np.datetime64(at, "ns"))
+        recording.log(frame_entity(frame), row)
+        recording.set_time(TIMELINE, timestamp=np.datetime64(stamp, "ns"))
+        self._rows[frame] = at, given and not static
 
     def doubts(self, stamp: int) -> list[str]:
         """What to tell people about frames that nobody placed for a while; each once."""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError
+from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, read_utf8
 
 VOID = 255
 _MASKS = ("masks", "annotations", "labels")
@@ -65,7 +65,7 @@ def read_segmentation_data(folder: Path, seed: int = 0) -> SegmentationData:
     names_file = folder / "classes.txt"
     if not names_file.is_file():
         raise DataError(f"{folder} has no classes.txt; it should name the classes 0, 1, 2 ... one a line")
-    names = tuple(line.strip() for line in names_file.read_text(encoding="utf-8").splitlines() if line.strip())
+    names = tuple(line.strip() for line in read_utf8(names_file).splitlines() if line.strip())
     masks = next((folder / name for name in _MASKS if (folder / name).is_dir()), None)
     if masks is None or not (folder / "images").is_dir():
         raise DataError(f"{folder} should hold the folders images/ and masks/")
@@ -94,7 +94,7 @@ def _divided(folder: Path, names: tuple[str, ...], pairs: list[MaskedImage], see
     listed = folder / "val.txt"
     held_out: set[str] = set()
     if listed.is_file():
-        held_out = {line.strip() for line in listed.read_text(encoding="utf-8").splitlines() if line.strip()}
+        held_out = {line.strip() for line in read_utf8(listed).splitlines() if line.strip()}
         unknown = held_out - {p.image.name for p in pairs}
         if unknown:
             raise DataError(f"{listed} names {min(unknown)!r}, which is not in images/")
@@ -105,5 +105,11 @@ def _divided(folder: Path, names: tuple[str, ...], pairs: list[MaskedImage], see
         chosen = np.random.default_rng(seed).permutation(len(pairs))[:count]
         validation = [pairs[i] for i in sorted(chosen)]
         notes = (f"no validation images are named: {count} of {len(pairs)} were set aside by seed {seed}",)
-    training = [p for p in pairs if p not in validation] or validation
+    training = [p for p in pairs if p not in validation]
+    if not training:
+        training = validation
+        notes = (
+            *notes,
+            "all images are for validation: they are trained on too, so the score says little",
+        )
     return SegmentationData(names, tuple(training), tuple(validation), notes)

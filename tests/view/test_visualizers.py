@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import permutations
 from pathlib import Path
 
 import numpy as np
@@ -163,6 +164,43 @@ def test_a_moving_robot_carries_its_sensors_and_leaves_a_trail(tmp_path: Path) -
     trail = at(found, "/w/odom/space/trail", "LineStrips3D:strips")
     assert [row.values for row in trail] == [[[[0, 0, 0], [1, 0, 0]]], [[[1, 0, 0], [3, 0, 0]]]]
     assert [row.stamp for row in trail] == [STAMP + 1, STAMP + 3]
+
+
+@pytest.mark.parametrize("late", [-5, 0, 5])
+@pytest.mark.parametrize("order", list(permutations(["color", "depth", "odom", "mounts"])), ids="-".join)
+def test_mounts_hold_whenever_they_are_told(tmp_path: Path, order: tuple[str, ...], late: int) -> None:
+    mounts = Transforms(
+        stamp=STAMP + late,
+        frames=["base", "depth"],
+        child_frames=["depth", "color"],
+        translations=[[0, 0, 1], [0, 2, 0]],
+        rotations=[[0, 0, 0, 1]] * 2,
+    )
+    told: dict[str, Message] = {
+        "color": cloud_in("color", STAMP),
+        "depth": cloud_in("depth", STAMP + 1),
+        "odom": odometry(2, 1.0),
+        "mounts": mounts,
+    }
+    found = draw(tmp_path, *[(name, told[name]) for name in order], static=("mounts",))
+    assert chain(found, "color", STAMP + 9) == ["color", "depth", "base", "odom"]
+
+
+def cloud_in(frame: str, stamp: int) -> PointCloud:
+    return PointCloud(stamp=stamp, frame=frame, points=np.ones((3, 3), np.float32))
+
+
+def chain(found: list[Row], frame: str, stamp: int) -> list[str]:
+    """The frame and those that it hangs below, as Rerun finds them: a static row is of no use beside earlier ones."""
+    path = [frame]
+    while len(path) < 9:
+        parents = at(found, f"/frames/{path[-1]}", "Transform3D:parent_frame")
+        assert len({row.stamp is None for row in parents}) <= 1, f"{path[-1]} has both static rows and others"
+        known = [row for row in parents if row.stamp is None or row.stamp <= stamp]
+        if not known:
+            return path
+        path += sorted(known, key=lambda row: row.stamp or 0)[-1].values
+    raise AssertionError(f"a loop: {path}")
 
 
 def test_a_lost_pose_is_not_drawn_and_breaks_the_trail(tmp_path: Path) -> None:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from operators.detection.custom.dataset import DataError, DetectionData, LabelledImage, labelled
+from operators.detection.custom.dataset import DataError, DetectionData, LabelledImage, labelled, read_utf8
 
 _PATTERNS = (
     "annotations.json",
@@ -56,12 +57,15 @@ def _split(file: Path, folder: Path) -> str:
 
 def _read_json(file: Path) -> Mapping[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_utf8(file))
     except json.JSONDecodeError as error:
         raise DataError(f"{file}:{error.lineno}: not valid JSON: {error.msg}") from None
     for key in ("images", "categories", "annotations"):
         if not isinstance(content, dict) or not isinstance(content.get(key), list):
             raise DataError(f"{file} has no list {key!r}; a COCO file has images, categories and annotations")
+        for k, entry in enumerate(content[key]):
+            if not isinstance(entry, dict):
+                raise DataError(f"{file}: {key}[{k}] is {entry!r}; it should be an object with an `id`")
     return dict(content)
 
 
@@ -70,8 +74,10 @@ def _merged_names(contents: Mapping[Path, Mapping[str, Any]]) -> tuple[str, ...]
     names: dict[str, None] = {}
     for file, content in contents.items():
         for k, category in enumerate(content["categories"]):
-            if not isinstance(category, dict) or "id" not in category or not category.get("name"):
-                raise DataError(f"{file}: categories[{k}] is {category!r}; it should have an `id` and a `name`")
+            if not isinstance(category.get("id"), int) or not category.get("name"):
+                raise DataError(
+                    f"{file}: categories[{k}] is {category!r}; it should have an `id` (an integer) and a `name`"
+                )
         for category in sorted(content["categories"], key=lambda c: int(c["id"])):
             names.setdefault(str(category["name"]))
     used = {
@@ -93,10 +99,10 @@ def _images(folder: Path, file: Path, content: Mapping[str, Any], names: Sequenc
     for k, annotation in enumerate(content["annotations"]):
         where = f"{file}: annotations[{k}] (id {annotation.get('id')})"
         key = annotation.get("image_id")
-        if key not in sizes:
+        if not isinstance(key, (int, str)) or key not in sizes:
             raise DataError(f"{where}: image_id {key!r} is not among the images")
         label = annotation.get("category_id")
-        if label not in number:
+        if not isinstance(label, int) or label not in number:
             raise DataError(f"{where}: category_id {label!r} is not among the categories {sorted(number)}")
         ignored = bool(annotation.get("iscrowd") or annotation.get("ignore"))
         rows[key].append((_box(where, annotation.get("bbox"), sizes[key]), number[label], ignored))
@@ -113,14 +119,14 @@ def _columns(rows: list[tuple[list[float], int, bool]]) -> tuple[list[list[float
 def _size(file: Path, index: int, image: Mapping[str, Any]) -> tuple[int, int]:
     width, height = image.get("width"), image.get("height")
     whole = isinstance(width, int) and isinstance(height, int) and width > 0 and height > 0
-    if "id" not in image or not image.get("file_name") or not whole:
+    if not isinstance(image.get("id"), (int, str)) or not image.get("file_name") or not whole:
         raise DataError(f"{file}: images[{index}] needs `id`, `file_name`, `width` and `height` (pixels), is {image!r}")
     return int(image["width"]), int(image["height"])
 
 
 def _box(where: str, box: Any, size: tuple[int, int]) -> list[float]:
     right = "it should be [x, y, width, height] in pixels"
-    if not isinstance(box, list) or len(box) != 4 or not all(isinstance(v, (int, float)) for v in box):
+    if not isinstance(box, list) or len(box) != 4 or not all(map(_is_number, box)):
         raise DataError(f"{where}: bbox is {box!r}; {right}")
     x, y, w, h = map(float, box)
     if not (w > 0 and h > 0):
@@ -128,6 +134,10 @@ def _box(where: str, box: Any, size: tuple[int, int]) -> list[float]:
     if min(x, y) < -_OUTSIDE or x + w > size[0] + _OUTSIDE or y + h > size[1] + _OUTSIDE:
         raise DataError(f"{where}: bbox {box!r} reaches over the image of {size[0]}x{size[1]} pixels; {right}")
     return [x / size[0], y / size[1], (x + w) / size[0], (y + h) / size[1]]
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and math.isfinite(value)
 
 
 def _locate(folder: Path, annotations: Path, name: str) -> Path:

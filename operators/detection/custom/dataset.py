@@ -128,6 +128,16 @@ def split(data: DetectionData, seed: int) -> DetectionData:
     )
 
 
+def read_utf8(file: Path) -> str:
+    """The text of a file. Raises DataError where it is not UTF-8."""
+    raw = file.read_bytes()
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise DataError(f"{file}:{line}: byte 0x{raw[error.start]:02x} is not UTF-8; save the file as UTF-8") from None
+
+
 def labelled(
     file: Path,
     boxes: Sequence[Sequence[float]],

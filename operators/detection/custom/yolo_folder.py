@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,14 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from operators.detection.custom.dataset import IMAGE_SUFFIXES, DataError, DetectionData, LabelledImage, labelled
+from operators.detection.custom.dataset import (
+    IMAGE_SUFFIXES,
+    DataError,
+    DetectionData,
+    LabelledImage,
+    labelled,
+    read_utf8,
+)
 
 _NAME_LISTS = ("classes.txt", "labels/classes.txt", "obj.names")
 _VALIDATION = ("val", "valid", "validation")
@@ -34,15 +42,21 @@ def read_yolo(folder: Path) -> DetectionData:
     notes: list[str] = []
     training = list(_images(folder, source, settings, ("train",), notes))
     validation = list(_images(folder, source, settings, _VALIDATION, notes))
-    held_out = set(validation)
-    training = [file for file in training if file not in held_out]
     if not training:
         raise DataError(f"{folder}: no image ({', '.join(IMAGE_SUFFIXES)}) under images/ or where {source.name} points")
+    held_out = set(validation)
+    if held_out.issuperset(training):
+        notes.append(
+            f"{source.name} names the images to train on for validation too: the score says little about new images"
+        )
+    else:
+        training = [file for file in training if file not in held_out]
+    images = {file: _labelled(file, len(names), source) for file in sorted({*training, *validation})}
     return DetectionData(
         names,
-        tuple(_labelled(file, len(names), source) for file in training),
-        tuple(_labelled(file, len(names), source) for file in validation),
-        tuple(notes),
+        tuple(images[file] for file in training),
+        tuple(images[file] for file in validation),
+        (*notes, *_unpaired(images)),
     )
 
 
@@ -50,15 +64,13 @@ def read_rows(file: Path, classes: int, names_file: Path) -> tuple[list[list[flo
     """Boxes (x1, y1, x2, y2, shares) and classes of a label file; polygon rows become their bounding boxes."""
     boxes: list[list[float]] = []
     labels: list[int] = []
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
-        if not line.strip():
-            continue
-        where = f"{file}:{number}: {line.strip()[:60]!r}"
+    for number, line in _lines(file):
+        where = f"{file}:{number}: {line[:60]!r}"
         try:
             label, *values = (float(word) for word in line.split())
         except ValueError:
             raise DataError(f"{where} is not a row of numbers; it should be `class cx cy w h`") from None
-        if label != int(label) or not 0 <= label < classes:
+        if label not in range(classes):
             raise DataError(
                 f"{where}: class {label:g} is not one of the {classes} classes (0 to {classes - 1}) of {names_file}"
             )
@@ -76,7 +88,7 @@ def _box(values: Sequence[float], where: str) -> list[float]:
         centred = 0 <= x <= 1 and 0 <= y <= 1 and max(w, h) <= 1 + _TOLERANCE
     elif len(values) >= 6 and len(values) % 2 == 0:
         box = [min(values[::2]), min(values[1::2]), max(values[::2]), max(values[1::2])]
-        centred = box[2] > box[0] and box[3] > box[1]
+        centred = box[2] > box[0] and box[3] > box[1] and all(map(math.isfinite, values))
         centred = centred and min(box) >= -_TOLERANCE and max(box) <= 1 + _TOLERANCE
     else:
         raise DataError(
@@ -101,6 +113,21 @@ def label_file(image: Path) -> Path:
             parts[i] = "labels"
             break
     return Path(*parts).with_suffix(".txt")
+
+
+def _unpaired(images: Iterable[Path]) -> Iterable[str]:
+    """Notes on images without labels and on labels without an image."""
+    bare = [image for image in images if not label_file(image).is_file()]
+    if bare:
+        yield f"{len(bare)} images have no label file and count as background; the first is {bare[0]}"
+    # Only folders of their own hold nothing but labels.
+    folders = {label_file(i).parent: i.parent for i in images if label_file(i).parent != i.parent}
+    orphans = []
+    for labels, pictures in sorted(folders.items()):
+        known = {f.stem for f in pictures.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES} | {"classes"}
+        orphans += sorted(f for f in labels.glob("*.txt") if f.stem not in known)
+    if orphans:
+        yield f"{len(orphans)} label files have no image and are left out; the first is {orphans[0]}"
 
 
 def _images(
@@ -152,7 +179,8 @@ def _listed(file: Path, number: int, line: str) -> Path:
 
 
 def _lines(file: Path) -> Iterable[tuple[int, str]]:
-    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), 1):
+    """The lines that are not empty, stripped, each with its number from 1."""
+    for number, line in enumerate(read_utf8(file).splitlines(), 1):
         if line.strip():
             yield number, line.strip()
 
@@ -166,13 +194,18 @@ def _in_folder(folder: Path) -> list[Path]:
 def _names(source: Path, settings: Mapping[str, Any]) -> tuple[str, ...]:
     if not settings:
         names = [line for _, line in _lines(source)]
-    elif isinstance(settings["names"], Mapping):
-        numbered = {int(k): str(v) for k, v in settings["names"].items()}
-        if sorted(numbered) != list(range(len(numbered))):
-            raise DataError(f"{source}: `names` must be numbered 0 to {len(numbered) - 1}, got {sorted(numbered)}")
-        names = [numbered[i] for i in range(len(numbered))]
     else:
-        names = [str(name) for name in settings["names"] or ()]
+        given = settings["names"] or []
+        if isinstance(given, Mapping):
+            numbered = {str(k): name for k, name in given.items()}
+            if set(numbered) != set(map(str, range(len(given)))):
+                raise DataError(f"{source}: `names` must be numbered 0 to {len(given) - 1}, got {list(given)}")
+            given = [numbered[str(i)] for i in range(len(given))]
+        elif not isinstance(given, list):
+            raise DataError(f"{source}: `names` is {given!r}; it should be a list, such as [{given}]")
+        names = [str(name) for name in given]
+        if settings.get("nc", len(names)) != len(names):
+            raise DataError(f"{source}: `nc` is {settings['nc']!r}, but `names` has {len(names)}; they should agree")
     if not names:
         raise DataError(f"{source} names no class")
     if len(set(names)) != len(names):
@@ -183,7 +216,7 @@ def _names(source: Path, settings: Mapping[str, Any]) -> tuple[str, ...]:
 
 def _read_yaml(file: Path) -> Mapping[str, Any]:
     try:
-        found = YAML(typ="safe").load(file.read_text(encoding="utf-8"))
+        found = YAML(typ="safe").load(read_utf8(file))
     except YAMLError as error:
         raise DataError(f"{file} is not valid YAML: {error}") from None
     return found if isinstance(found, Mapping) else {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +20,7 @@ from operators.detection.custom.anchors import fit_anchors, mean_best_iou, size_
 from operators.detection.custom.augmentation import view
 from operators.detection.custom.dataset import DataError, labelled, read_detection_data
 from operators.detection.custom.decode import decode_grid, find_boxes
+from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
 from operators.training.augmentation import NONE, Variation, fitted, tensor_of, warp
@@ -199,6 +201,10 @@ def test_polygons_become_their_bounding_boxes(tmp_path: Path) -> None:
         ("0 50 50 10 10", r"002\.txt:2: .*lie in \[0, 1\]"),
         ("crate 0.5 0.5 0.1 0.1", r"002\.txt:2: .*not a row of numbers"),
         ("0 0.5 nan 0.1 0.1", r"002\.txt:2: .*lie in \[0, 1\]"),
+        ("0 0.5 0.5 nan 0.6 0.7 0.7", r"002\.txt:2: .*lie in \[0, 1\]"),
+        ("inf 0.5 0.5 0.1 0.1", r"002\.txt:2: .*class inf is not one of the 2 classes"),
+        ("nan 0.5 0.5 0.1 0.1", r"002\.txt:2: .*class nan is not one of the 2 classes"),
+        ("0.5 0.5 0.5 0.1 0.1", r"002\.txt:2: .*class 0.5 is not one of the 2 classes"),
     ],
 )
 def test_a_bad_yolo_row_is_named_with_file_and_line(tmp_path: Path, row: str, fault: str) -> None:
@@ -219,6 +225,15 @@ def test_a_bad_yolo_row_is_named_with_file_and_line(tmp_path: Path, row: str, fa
         (lambda c: c["images"][0].update(file_name="x.png"), r"no image 'x\.png' \(looked in "),
         (lambda c: c["images"][0].pop("width"), r"images\[0\] needs `id`, `file_name`, `width` and `height`"),
         (lambda c: c.pop("images"), r"has no list 'images'"),
+        (lambda c: c["images"].insert(0, None), r"annotations\.json: images\[0\] is None; it should be an object"),
+        (lambda c: c["annotations"].insert(1, None), r"annotations\.json: annotations\[1\] is None"),
+        (lambda c: c["annotations"][0].update(image_id=[1]), r"annotations\[0\] .*image_id \[1\] is not among"),
+        (lambda c: c["annotations"][0].update(category_id="ball"), r"category_id 'ball' is not among"),
+        (
+            lambda c: c["annotations"][0].update(bbox=[math.nan, 1, 2, 3]),
+            r"annotations\[0\] .*bbox is \[nan, 1,",
+        ),
+        (lambda c: c["categories"][0].update(id="a"), r"annotations\.json: categories\[0\] .*an `id` \(an integer\)"),
     ],
 )
 def test_a_bad_coco_entry_is_named(tmp_path: Path, change, fault: str) -> None:  # type: ignore[no-untyped-def]
@@ -227,6 +242,62 @@ def test_a_bad_coco_entry_is_named(tmp_path: Path, change, fault: str) -> None: 
     change(content)
     file.write_text(json.dumps(content))
     with pytest.raises(DataError, match=fault):
+        read_detection_data(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("settings", "fault"),
+    [
+        ("names: crate", r"data\.yaml: `names` is 'crate'; it should be a list, such as \[crate\]"),
+        ("names: {a: crate, b: ball}", r"data\.yaml: `names` must be numbered 0 to 1, got \['a', 'b'\]"),
+        ("names: {0: crate, 2: ball}", r"data\.yaml: `names` must be numbered 0 to 1, got \[0, 2\]"),
+        ("nc: 3\nnames: [crate, ball]", r"data\.yaml: `nc` is 3, but `names` has 2"),
+        ("names:", r"data\.yaml names no class"),
+        ("names: [crate, crate]", r"data\.yaml names the class 'crate' twice"),
+    ],
+)
+def test_bad_class_names_are_named_with_their_file(tmp_path: Path, settings: str, fault: str) -> None:
+    (write_yolo(tmp_path, 2) / "data.yaml").write_text(settings)
+    with pytest.raises(DataError, match=fault):
+        read_detection_data(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["labels/001.txt", "data.yaml"])
+def test_text_that_is_not_utf8_is_named_with_its_line(tmp_path: Path, name: str) -> None:
+    file = write_yolo(tmp_path, 2) / name
+    file.write_bytes(file.read_bytes() + b"\n\xff")
+    line = file.read_bytes().count(b"\n") + 1
+    with pytest.raises(DataError, match=rf"{name}:{line}: byte 0xff is not UTF-8"):
+        read_detection_data(tmp_path)
+
+
+def test_images_named_for_both_are_trained_and_scored_on(tmp_path: Path) -> None:
+    (write_yolo(tmp_path, 4) / "data.yaml").write_text("names: [crate, ball]\ntrain: images\nval: images\n")
+    data = read_detection_data(tmp_path)
+    assert len(data.training) == 4
+    assert data.training == data.validation
+    (note,) = data.notes
+    assert "data.yaml names the images to train on for validation too" in note
+
+
+def test_images_without_labels_and_labels_without_images_are_counted(tmp_path: Path) -> None:
+    write_yolo(tmp_path, 9)
+    (tmp_path / "labels" / "classes.txt").write_text("crate\nball\n")
+    assert not any("label" in note for note in read_yolo(tmp_path).notes)
+    for i in (2, 3):
+        (tmp_path / "labels" / f"00{i}.txt").unlink()
+        (tmp_path / "images" / f"00{i + 3}.png").unlink()
+    bare, orphans = read_yolo(tmp_path).notes
+    assert bare.startswith("2 images have no label file")
+    assert bare.endswith("images/002.png")
+    assert orphans.startswith("2 label files have no image")
+    assert orphans.endswith("labels/005.txt")
+
+
+def test_an_image_that_a_list_names_must_be_there(tmp_path: Path) -> None:
+    (write_yolo(tmp_path, 2) / "data.yaml").write_text("names: [crate, ball]\ntrain: list.txt\n")
+    (tmp_path / "list.txt").write_text("images/000.png\nimages/009.png\n")
+    with pytest.raises(DataError, match=r"list\.txt:2: no image 'images/009\.png'"):
         read_detection_data(tmp_path)
 
 

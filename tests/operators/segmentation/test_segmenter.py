@@ -51,6 +51,17 @@ def write_folder(folder: Path, count: int, seed: int = 0) -> Path:
     return folder
 
 
+def test_images_that_are_all_for_validation_are_trained_on_and_that_is_said(tmp_path: Path) -> None:
+    write_folder(tmp_path, 2)
+    (tmp_path / "val.txt").write_text("000.jpg\n001.jpg\n")
+    data = read_segmentation_data(tmp_path)
+    assert data.training == data.validation
+    assert "trained on too" in data.notes[0]
+    (tmp_path / "classes.txt").write_bytes(b"wall\nfl\xffor\n")
+    with pytest.raises(DataError, match=r"classes\.txt:2: byte 0xff is not UTF-8"):
+        read_segmentation_data(tmp_path)
+
+
 def test_a_folder_of_masks_becomes_a_segmenter(tmp_path: Path) -> None:
     data = read_segmentation_data(write_folder(tmp_path / "data", 20))
     variation = Variation(color=0.1, noise=4, scale=1.2)
