@@ -7,7 +7,7 @@ how it ended. Records are gathered in batches of one operator and written to its
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -131,6 +131,18 @@ def encode_batch(records: list[FiringRecord], *, last: bool = False) -> bytes:
     }
     data: bytes = msgpack.packb(batch, use_bin_type=True)
     return data
+
+
+def consecutive(records: Iterable[FiringRecord]) -> Iterator[list[FiringRecord]]:
+    """Records of one operator, in order, in parts that can each be a batch."""
+    part: list[FiringRecord] = []
+    for record in records:
+        if part and (record.incarnation, record.index) != (part[-1].incarnation, part[-1].index + 1):
+            yield part
+            part = []
+        part.append(record)
+    if part:
+        yield part
 
 
 @dataclass(frozen=True, slots=True)

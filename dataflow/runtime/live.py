@@ -287,6 +287,8 @@ class LiveSupervisor(Supervisor):
         match kind:
             case "record":
                 self._held[fields["operator"]].add(fields["data"])
+            case "lacks":
+                self._hand_over_records([fields["operator"]])
             case "beat":
                 self._check_memory(process, fields["memory"])
             case "overdue":

@@ -20,7 +20,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message, message_type
 from dataflow.runtime.control import Channel, ChannelClosed
-from dataflow.runtime.firings import decode_batch, encode_batch
+from dataflow.runtime.firings import consecutive, decode_batch, encode_batch
 from dataflow.runtime.keys import firings_key
 from dataflow.runtime.network import network_config
 from dataflow.sync import FOREVER, NEVER
@@ -93,6 +93,7 @@ class SinkHost:
         self.written = 0
         self._expected: dict[str, tuple[int, int]] = {}
         self._recorded: dict[str, tuple[int, int]] = {}  # operator → the record that follows those stored
+        self._lacking: dict[str, set[tuple[int, int]]] = {}  # operator → records before it that did not come
         self._probed: set[str] = set()
         taken = [*(self.graph.streams[s].node for s in config.streams), *config.firings]
         self._taken = {name: NEVER for name in taken if self.graph.nodes[name].source}
@@ -194,21 +195,22 @@ class SinkHost:
     def _take_records(self, data: bytes) -> bool:
         """Stores a batch of firing records, those of it that are not stored yet; True for an operator's last batch.
 
-        Records of an operator come twice when its process has died: once from itself and once from the supervisor.
+        Records come twice when their operator's process has died or the run has failed, and when some were lost on
+        their way: once from the operator and once from the supervisor, which is asked for what is lacking.
         """
         assert self.sink is not None
         batch = decode_batch(data)
         following = self._recorded.get(batch.operator, (-1, 0))
-        first, last = batch.records[0], batch.records[-1]
-        if (batch.incarnation, first.index) < following:
-            fresh = [r for r in batch.records if (r.incarnation, r.index) >= following]
-            if not fresh:
-                return batch.last
-            data = encode_batch(fresh, last=batch.last)
-        self._recorded[batch.operator] = (batch.incarnation, last.index + 1)
-        self.sink.firings(batch.operator, last.stamp, data)
-        if last.kind == "fire":
-            self._note_taken(batch.operator, last.stamp)
+        lacking = self._lacking.setdefault(batch.operator, set())
+        places = [(r.incarnation, r.index) for r in batch.records]
+        if places[0][0] == following[0] and places[0] > following:
+            lacking.update((batch.incarnation, index) for index in range(following[1], places[0][1]))
+            self.channel.send("lacks", operator=batch.operator)
+        fresh = [r for r, place in zip(batch.records, places, strict=True) if place >= following or place in lacking]
+        lacking.difference_update(places)
+        self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
+        for part in consecutive(fresh):
+            self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last))
         return batch.last
 
     def _note_taken(self, operator: str, stamp: int) -> None:

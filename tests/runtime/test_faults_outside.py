@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from dataflow.runtime.attach import find_running
 from dataflow.runtime.execute import run
 from dataflow.runtime.live import LiveSupervisor
 from dataflow.runtime.plan import RunPlan
+from dataflow.runtime.reexecute import recorded_firings
 from dataflow.runtime.report import RunReport
 from dataflow.runtime.verify import verify
 
@@ -236,23 +237,22 @@ def links() -> Iterator[list[Link]]:
         link.end()
 
 
-def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor_the_proof(
-    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The link from `left` to `smooth` is cut for half a second; everything else stays connected."""
+def run_with_a_cut(
+    label: str, graph: Graph, path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+) -> RunReport:
+    """A live run, a host each, in which every link to the process `label` is cut for half a second."""
     spawn = LiveSupervisor._spawn
 
     def through_a_link(
-        self: LiveSupervisor, label: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]
+        self: LiveSupervisor, spawned: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]
     ) -> None:
-        if label == "smooth":
+        if spawned == label:
             links.extend(Link(endpoint) for endpoint in config["connect"])
             config = {**config, "connect": [link.endpoint for link in links]}
-        spawn(self, label, nodes, kind, config)
+        spawn(self, spawned, nodes, kind, config)
 
     monkeypatch.setattr(LiveSupervisor, "_spawn", through_a_link)
-    graph = load_graph(graph_file(tmp_path, count=300), live=True)
-    supervisor = LiveSupervisor(RunPlan(graph, live=True, placement="host_each", record=tmp_path / "run.mcap"))
+    supervisor = LiveSupervisor(RunPlan(graph, live=True, placement="host_each", record=path))
     reports: list[RunReport] = []
     thread = threading.Thread(target=lambda: reports.append(supervisor.run()))
     thread.start()
@@ -266,14 +266,46 @@ def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor
             link.whole = True
     finally:
         thread.join(60)
-
-    (report,) = reports
     assert sum(link.cuts for link in links) >= 1
+    (report,) = reports
+    return report
+
+
+def gaps_in(path: Path) -> list[Mapping[str, Any]]:
+    with Recording(path) as recording:
+        return [event.data for event in recording.events() if event.name == "gap"]
+
+
+def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor_the_proof(
+    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The link from `left` to `smooth`; everything else stays connected."""
+    graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
+
+    report = run_with_a_cut("smooth", graph, path, links, monkeypatch)
+
     assert report.summaries["sum"]["count"] == 300  # whose link was whole
-    with Recording(tmp_path / "run.mcap") as recording:
-        gaps = [event.data for event in recording.events() if event.name == "gap"]
+    gaps = gaps_in(path)
     assert [(gap["stream"], gap["taker"]) for gap in gaps] == [("test/left/fast", "smooth")]
     (gap,) = gaps
     assert 0 < gap["following"] - gap["first"] < 299  # it came back
-    verified = verify(tmp_path / "run.mcap", graph=graph, placement="one_host")
+    verified = verify(path, graph=graph, placement="one_host")
     assert verified.identical, verified.as_json()
+
+
+def test_a_recorder_that_was_cut_off_has_every_firing_record_and_its_gaps_are_said(
+    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
+
+    run_with_a_cut("@recorder", graph, path, links, monkeypatch)
+
+    assert {gap["taker"] for gap in gaps_in(path)} == {"@recorder"}
+    with Recording(path) as recording:
+        for operator in graph.nodes:
+            indices = sorted(record.index for record in recorded_firings(recording, operator))
+            assert indices == list(range(len(indices))), operator
+    verified = verify(path, graph=graph, placement="one_host")
+    assert not verified.identical
+    assert not any(v.lost_records or v.unaccounted or v.unfinished for v in verified.operators)
+    assert all(v.verdict == "unverifiable" and v.unverifiable for v in verified.operators)

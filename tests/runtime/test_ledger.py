@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +13,7 @@ from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.layout import RESERVED_METADATA
 from dataflow.runtime.completion import complete
 from dataflow.runtime.execute import run
-from dataflow.runtime.firings import FiringRecord, encode_batch
+from dataflow.runtime.firings import FiringRecord, consecutive, encode_batch
 from dataflow.runtime.recorder import OUTCOME
 from dataflow.runtime.reexecute import Verification, recorded_firings
 from dataflow.runtime.replay import ReplayError
@@ -53,21 +53,9 @@ def rewritten(
                     if stored(name, m.seq):
                         writer.write(name, m.message, seq=m.seq, incarnation=m.incarnation)
             for operator in ("left", "right", "mix", "smooth", "merge", "sum"):
-                for batch in runs(r for r in recorded_firings(recording, operator) if records(r)):
+                for batch in consecutive(r for r in recorded_firings(recording, operator) if records(r)):
                     writer.write_firings(operator, max(batch[-1].stamp, 1), encode_batch(batch))
     return out
-
-
-def runs(records: Iterator[FiringRecord]) -> Iterator[list[FiringRecord]]:
-    """The records in batches without a gap."""
-    batch: list[FiringRecord] = []
-    for record in records:
-        if batch and record.index != batch[-1].index + 1:
-            yield batch
-            batch = []
-        batch.append(record)
-    if batch:
-        yield batch
 
 
 def early(operator: str, index: int) -> Callable[[FiringRecord], bool]:
