@@ -78,10 +78,9 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
         if checked.report is None:
             console.print(Text(f"  {checked.error}"), soft_wrap=True)
             continue
-        for judged in checked.judged:
-            if not judged.passed:
-                for line in explain(checked, judged):
-                    console.print(Text(f"  {line}"), soft_wrap=True)
+        told = [line for judged in checked.judged if not judged.passed for line in explain(checked, judged)]
+        for line in dict.fromkeys([*told, *reservations(checked)]):
+            console.print(Text(f"  {line}"), soft_wrap=True)
         for line in fact_lines(checked.report):
             console.print(Text(f"  {line}", style="dim"), soft_wrap=True)
     passed = sum(c.passed for c in all_checked)
@@ -93,7 +92,7 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
 
 
 def reservations(checked: Checked) -> Iterator[str]:
-    """What is to be known of a recording that passed: where it was cut, and what it lacks."""
+    """What is to be known of a recording besides verdicts: where it was cut, and what it lacks."""
     if checked.report is None:
         return
     if said := _cut(checked.report):

@@ -190,10 +190,6 @@ def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], Verif
 def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | None) -> None:
     from dataflow.cli.verdicts import explain, print_many, print_one, reservations
 
-    if junit is not None:
-        from dataflow.cli.junit import write_junit
-
-        write_junit(junit, checked, explain, reservations)
     if single and checked[0].report is None:
         [one] = checked
         fail(one.error, details=own_traceback(one.details) if one.internal else one.details)
@@ -205,6 +201,10 @@ def _report(checked: list[Checked], *, single: bool, json: bool, junit: Path | N
         print_json({"passed": all(c.passed for c in checked), "recordings": [c.as_json() for c in checked]})
     else:
         print_many(out, checked)
+    if junit is not None:
+        from dataflow.cli.junit import write_junit
+
+        write_junit(junit, checked, explain, reservations)
 
 
 def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, whole: bool) -> None:

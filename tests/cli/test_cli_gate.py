@@ -114,6 +114,13 @@ def test_a_change_is_named_with_its_field_in_the_table_the_json_and_the_junit_fi
     assert (field["field"], field["index"]) == ("vectors", [0, 2])
 
 
+def test_results_are_shown_also_when_their_file_cannot_be_written(dataflow, folder: Path) -> None:
+    told = gate(dataflow, folder, "--junit", "/proc/v.xml", code=2)
+
+    assert "/proc/v.xml" in told.stderr
+    assert "2 of 2 recordings passed" in told.stdout
+
+
 def test_an_accepted_change_passes_until_something_else_changes(dataflow, folder: Path, tmp_path: Path) -> None:
     baseline = tmp_path / "accepted.json"
     changed = graph_of(tmp_path, "changed.yaml", NUDGED)
