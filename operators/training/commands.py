@@ -303,7 +303,8 @@ def evaluate_detector(
         typer.echo(jsonlib.dumps(assessed))
         return
     images = _scored(assessed["images"], len(_every(read.training, read.validation)), everything)
-    table = Table("class", "AP50", title=escape(f"{weights.name}: {images}, {assessed['objects']} objects"))
+    _out.print(f"{weights.name}: {images}, {assessed['objects']} objects", markup=False, soft_wrap=True)
+    table = Table("class", "AP50")
     for name, value in assessed["per_class"].items():
         table.add_row(escape(name), f"{value:.3f}")
     table.add_section()
@@ -336,7 +337,8 @@ def evaluate_segmenter(
         typer.echo(jsonlib.dumps(assessed))
         return
     images = _scored(assessed["images"], len(_every(read.training, read.validation)), everything)
-    table = Table("class", "IoU", title=escape(f"{weights.name}: {images}"))
+    _out.print(f"{weights.name}: {images}", markup=False, soft_wrap=True)
+    table = Table("class", "IoU")
     for name, value in assessed["per_class"].items():
         table.add_row(escape(name), f"{value:.3f}")
     table.add_section()
@@ -389,6 +391,7 @@ def _every(training: Sequence[Sample], validation: Sequence[Sample]) -> tuple[Sa
 
 
 def _scored(count: int, total: int, everything: bool) -> str:
+    """Which of the `total` images are scored on."""
     return f"all {total} images" if everything else f"{count} validation images of {total}"
 
 

@@ -158,7 +158,7 @@ def test_a_network_is_scored_on_the_images_that_its_own_training_set_aside(tmp_p
     scored = dataflow_command("evaluate", "detector", str(data), "--weights", str(file))
     assert scored.returncode == 0, scored.stderr
     assert "1 of 9 were set aside by seed 5" in scored.stderr
-    assert "1 validation images of 9" in " ".join(scored.stdout.split())
+    assert "network.onnx: 1 validation images of 9" in scored.stdout
     assert "[old]" in scored.stdout or "[ball]" in scored.stdout
     other = dataflow_command("evaluate", "detector", str(data), "--weights", str(file), "--seed", "3")
     assert "1 of 9 were set aside by seed 3" in other.stderr
