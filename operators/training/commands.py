@@ -7,10 +7,11 @@ import json as jsonlib
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 if TYPE_CHECKING:
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
 
     from operators.training.backbone import Backbone as Extractor
     from operators.training.loop import Outcome, Settings, Task
+
+Sample = TypeVar("Sample")
 
 FAILED = 1
 _out, _err = Console(), Console(stderr=True)
@@ -35,6 +38,14 @@ Epochs = Annotated[int, typer.Option(min=1, help="Passes through the training im
 Batch = Annotated[int, typer.Option(min=1, help="Images a step.")]
 Rate = Annotated[float, typer.Option("--learning-rate", min=1e-7, help="Largest learning rate.")]
 Seed = Annotated[int, typer.Option(min=0, help="Decides everything random.")]
+SplitSeed = Annotated[
+    int | None,
+    typer.Option(
+        "--seed",
+        min=0,
+        help="Sets the validation images aside, where DATA names none. Default: the seed of the network's training.",
+    ),
+]
 Size = Annotated[
     str | None,
     typer.Option(metavar="WxH", help="Input size, multiples of 16. Default: by the images, longest side 384."),
@@ -244,7 +255,7 @@ def quantize(
     out: Annotated[Path | None, typer.Option(help="The file to write. Default: WEIGHTS, as .int8.onnx.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
     images: Annotated[int, typer.Option(min=1, help="Training images on which ranges are measured.")] = 32,
-    seed: Seed = 0,
+    seed: SplitSeed = None,
     json: Json = False,
 ) -> None:
     """Write a trained network in 8-bit integers: half the time on a CPU, at nearly the same score.
@@ -264,7 +275,7 @@ def quantize(
     table = Table("file", "kB", "score", "ms an image", box=None)
     for file, scores in compared.items():
         kilobytes, said = f"{Path(file).stat().st_size / 1000:.0f}", _said(scores, ("ap50", "ap", "miou"))
-        table.add_row(file, kilobytes, said, f"{scores['ms']:.1f}")
+        table.add_row(escape(file), kilobytes, said, f"{scores['ms']:.1f}")
     _out.print(table)
 
 
@@ -275,23 +286,27 @@ def evaluate_detector(
     everything: Annotated[
         bool, typer.Option("--all", help="Score on all images, not only those for validation.")
     ] = False,
-    seed: Seed = 0,
+    seed: SplitSeed = None,
     json: Json = False,
 ) -> None:
     """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format."""
     with _friendly():
         from operators.detection.custom.assessment import assess
         from operators.detection.custom.dataset import read_detection_data
+        from operators.weights import training_seed
 
-        read = read_detection_data(data, seed)
-        images = (*read.training, *read.validation) if everything else read.validation
-        assessed = assess(weights, read.classes, images)
+        read = read_detection_data(data, training_seed(weights) if seed is None else seed)
+        chosen = _every(read.training, read.validation) if everything else read.validation
+        _notes(read.notes, json)
+        assessed = assess(weights, read.classes, chosen)
     if json:
         typer.echo(jsonlib.dumps(assessed))
         return
-    table = Table("class", "AP50", title=f"{weights.name}: {assessed['images']} images, {assessed['objects']} objects")
+    images = _scored(assessed["images"], len(_every(read.training, read.validation)), everything)
+    _out.print(f"{weights.name}: {images}, {assessed['objects']} objects", markup=False, soft_wrap=True)
+    table = Table("class", "AP50")
     for name, value in assessed["per_class"].items():
-        table.add_row(name, f"{value:.3f}")
+        table.add_row(escape(name), f"{value:.3f}")
     table.add_section()
     table.add_row("mean", f"{assessed['ap50']:.3f}")
     _out.print(table)
@@ -305,23 +320,27 @@ def evaluate_segmenter(
     everything: Annotated[
         bool, typer.Option("--all", help="Score on all images, not only those for validation.")
     ] = False,
-    seed: Seed = 0,
+    seed: SplitSeed = None,
     json: Json = False,
 ) -> None:
     """Score a segmenter by its mean IoU on the validation images of a folder with images/, masks/ and classes.txt."""
     with _friendly():
         from operators.segmentation.assessment import assess
         from operators.segmentation.dataset import read_segmentation_data
+        from operators.weights import training_seed
 
-        read = read_segmentation_data(data, seed)
-        images = (*read.training, *read.validation) if everything else read.validation
-        assessed = assess(weights, read.classes, images)
+        read = read_segmentation_data(data, training_seed(weights) if seed is None else seed)
+        chosen = _every(read.training, read.validation) if everything else read.validation
+        _notes(read.notes, json)
+        assessed = assess(weights, read.classes, chosen)
     if json:
         typer.echo(jsonlib.dumps(assessed))
         return
-    table = Table("class", "IoU", title=f"{weights.name}: {assessed['images']} images")
+    images = _scored(assessed["images"], len(_every(read.training, read.validation)), everything)
+    _out.print(f"{weights.name}: {images}", markup=False, soft_wrap=True)
+    table = Table("class", "IoU")
     for name, value in assessed["per_class"].items():
-        table.add_row(name, f"{value:.3f}")
+        table.add_row(escape(name), f"{value:.3f}")
     table.add_section()
     table.add_row("mean", f"{assessed['miou']:.3f}")
     _out.print(table)
@@ -352,13 +371,28 @@ def _prepare(
 def _tell(
     notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
 ) -> None:
+    _notes(notes, quiet)
     if quiet:
         return
-    for note in notes:
-        _err.print(f"[yellow]note:[/yellow] {note}", highlight=False)
     named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
     counts = f"{training} images to train on, {validation} to score on"
-    _err.print(f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}", highlight=False)
+    told = f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}"
+    _err.print(told, highlight=False, markup=False, soft_wrap=True)
+
+
+def _notes(notes: Sequence[str], quiet: bool) -> None:
+    for note in () if quiet else notes:
+        _err.print(f"[yellow]note:[/yellow] {escape(note)}", highlight=False, soft_wrap=True)
+
+
+def _every(training: Sequence[Sample], validation: Sequence[Sample]) -> tuple[Sample, ...]:
+    """All images of the data, each once."""
+    return tuple(dict.fromkeys((*training, *validation)))
+
+
+def _scored(count: int, total: int, everything: bool) -> str:
+    """Which of the `total` images are scored on."""
+    return f"all {total} images" if everything else f"{count} validation images of {total}"
 
 
 def _finish(outcome: Outcome, operator: str, json: bool) -> None:
@@ -378,8 +412,9 @@ def _finish(outcome: Outcome, operator: str, json: bool) -> None:
         )
         return
     scores = _said(outcome.best, [name for name in outcome.best if name != "score"])
-    _out.print(f"[green]{outcome.file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False)
-    _out.print(f"use it: `use: {operator}` with `params: {{weights: {outcome.file}}}`", highlight=False)
+    file = escape(str(outcome.file))
+    _out.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
+    _out.print(f"use it: `use: {operator}` with `params: {{weights: {file}}}`", highlight=False, soft_wrap=True)
 
 
 def _said(scores: Mapping[str, Any], names: Sequence[str]) -> str:
@@ -432,5 +467,5 @@ _EXTRA: dict[str | None, Any] = dict.fromkeys(("torch", "onnx", "pycocotools"))
 
 
 def _fail(message: str, code: int = FAILED) -> None:
-    _err.print(f"[bold red]error:[/bold red] {message}", highlight=False, soft_wrap=True)
+    _err.print(f"[bold red]error:[/bold red] {escape(message)}", highlight=False, soft_wrap=True)
     raise typer.Exit(code)

@@ -10,7 +10,7 @@ import copy
 import math
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -125,7 +125,7 @@ class _Run:
         self.network = task.network.to(self.device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.average = copy.deepcopy(self.network).eval().requires_grad_(False)
         self.optimizer = torch.optim.AdamW(_groups(self.network, settings.weight_decay), lr=settings.learning_rate)
-        self.steps = max(1, math.ceil(task.samples / settings.batch))
+        self.steps = len(batches(range(task.samples), settings.batch))
         self.outcome = Outcome(out, out.with_suffix(".pt"))
 
     def run(self, resume: bool) -> Outcome:
@@ -151,8 +151,7 @@ class _Run:
             rate = self.settings.learning_rate * schedule(done, self.settings.epochs * self.steps, self.settings.warmup)
             for group in self.optimizer.param_groups:
                 group["lr"] = rate
-            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
-                parts = self.task.loss(batch, self.device)
+            parts = self._loss(batch)
             total = torch.stack(list(parts.values())).sum()
             values = {name: float(part.detach()) for name, part in parts.items()}
             if not math.isfinite(sum(values.values())):
@@ -170,6 +169,18 @@ class _Run:
             self.progress.step(epoch, values)
         return {name: value / self.steps for name, value in sums.items()}
 
+    def _loss(self, batch: Any) -> dict[str, Tensor]:
+        try:
+            with torch.autocast(self.device.type, torch.bfloat16, enabled=self.settings.bfloat16):
+                return self.task.loss(batch, self.device)
+        except ValueError as error:
+            if "more than 1 value per channel" not in str(error):
+                raise
+            raise ValueError(
+                "at so small an input, normalisation needs more than one image a step; give a larger input, or at "
+                f"least 2 images a step (now {min(self.settings.batch, self.task.samples)})"
+            ) from error
+
     @torch.no_grad()
     def _follow(self, step: int) -> None:
         """Moves the averaged weights towards the trained ones; faster in the first steps."""
@@ -184,10 +195,9 @@ class _Run:
         """The epoch's batches in order, prepared by a few threads ahead of time."""
         settings = self.settings
         order = np.random.default_rng((settings.seed, epoch)).permutation(self.task.samples).tolist()
-        chunks = [order[i : i + settings.batch] for i in range(0, len(order), settings.batch)]
         with ThreadPoolExecutor(max(1, settings.workers)) as pool:
             pending: deque[Future[Any]] = deque()
-            for chunk in chunks:
+            for chunk in batches(order, settings.batch):
                 rngs = [np.random.default_rng((settings.seed, epoch, sample)) for sample in chunk]
                 pending.append(pool.submit(self.task.batch, chunk, rngs))
                 if len(pending) > _AHEAD:
@@ -234,13 +244,23 @@ class _Run:
         decisive = ("epochs", "batch", "learning_rate", "weight_decay", "warmup", "ema_decay", "seed", "bfloat16")
         different = [f"{k} was {saved.get(k)} and is {mine[k]}" for k in decisive if saved.get(k) != mine[k]]
         if different:
-            raise TrainingFileError(f"{file} cannot be resumed with other settings: {', '.join(different)}")
+            longer = f"; to train longer, start anew from its weights: --from {file}"
+            hint = longer if saved.get("epochs", 0) < mine["epochs"] else ""
+            raise TrainingFileError(f"{file} cannot be resumed with other settings: {', '.join(different)}{hint}")
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["ema"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.outcome.best, self.outcome.best_epoch = dict(state["best"]), int(state["best_epoch"])
         self.outcome.history, self.outcome.seconds = list(state["history"]), float(state["seconds"])
         return int(state["epoch"])
+
+
+def batches(order: Sequence[int], size: int) -> list[list[int]]:
+    """The samples by `size`. A single one that is left over joins the batch before: alone it has no statistics."""
+    chunks = [list(order[i : i + size]) for i in range(0, len(order), size)]
+    if size > 1 and len(chunks) > 1 and len(chunks[-1]) == 1:
+        chunks[-2:] = [chunks[-2] + chunks[-1]]
+    return chunks
 
 
 def schedule(step: int, steps: int, warmup: float) -> float:

@@ -26,7 +26,7 @@ from operators.segmentation.assessment import assess as assess_segmenter
 from operators.segmentation.dataset import read_segmentation_data
 from operators.training.augmentation import fitted, tensor_of, warp
 from operators.training.files import whole
-from operators.weights.network_file import KEY, NetworkFileError, read_facts
+from operators.weights.network_file import KEY, NetworkFileError, read_facts, training_seed
 
 INT8 = "int8"
 _QUANTIZED = ("Conv", "Add", "Relu", "Clip", "Concat", "Resize")
@@ -74,13 +74,16 @@ def quantize_network(file: Path, images: Iterable[Pixels], out: Path) -> None:
         place.write_bytes(model.SerializeToString())
 
 
-def quantize_with(file: Path, data: Path, out: Path, images: int = 32, seed: int = 0) -> dict[str, dict[str, Any]]:
+def quantize_with(
+    file: Path, data: Path, out: Path, images: int = 32, seed: int | None = None
+) -> dict[str, dict[str, Any]]:
     """As `quantize_network`, with evenly chosen training images of a data folder such as the network was trained on.
 
-    Returns both files' scores on its validation images, by file name, each with the median milliseconds (`ms`).
-    Raises DataError too.
+    `seed` sets the validation images aside where the folder names none; None means the seed of the network's training.
+    Returns both files' scores on them, by file name, each with the median milliseconds (`ms`). Raises DataError too.
     """
     score: Callable[[Path], dict[str, Any]]
+    seed = training_seed(file) if seed is None else seed
     if read_facts(file)["kind"] == DETECTOR:
         boxes = read_detection_data(data, seed)
         seen = [image.read for image in boxes.training]

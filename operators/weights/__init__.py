@@ -1,5 +1,12 @@
 """The networks that come with the project, and the file format that training writes and operators read."""
 
-from operators.weights.network_file import Network, NetworkFileError, open_network, read_facts, shipped
+from operators.weights.network_file import (
+    Network,
+    NetworkFileError,
+    open_network,
+    read_facts,
+    shipped,
+    training_seed,
+)
 
-__all__ = ["Network", "NetworkFileError", "open_network", "read_facts", "shipped"]
+__all__ = ["Network", "NetworkFileError", "open_network", "read_facts", "shipped", "training_seed"]

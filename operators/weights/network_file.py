@@ -72,6 +72,14 @@ def read_facts(file: Path) -> dict[str, Any]:
     return _facts(file, _session(file))
 
 
+def training_seed(file: Path) -> int:
+    """The seed of a network's training, by which its validation images were set aside; 0 where the file has none.
+
+    Raises FileNotFoundError or NetworkFileError.
+    """
+    return int(read_facts(file).get("seed", 0))
+
+
 def _facts(file: Path, session: onnxruntime.InferenceSession) -> dict[str, Any]:
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:

@@ -45,7 +45,8 @@ def score_detections(images: Sequence[ScoredImage], classes: Sequence[str]) -> D
     objects = int(sum((~image.ignored).sum() for image in images))
     results = [row for i, image in enumerate(images, 1) for row in _results(i, image)]
     if not objects or not results:
-        return DetectionScore(0.0, 0.0, {}, objects)
+        labelled = {int(label) for image in images for label in image.classes[~image.ignored]}
+        return DetectionScore(0.0, 0.0, {name: 0.0 for k, name in enumerate(classes) if k in labelled}, objects)
     with contextlib.redirect_stdout(io.StringIO()):
         truth = COCO()
         truth.dataset = _dataset(images, classes)

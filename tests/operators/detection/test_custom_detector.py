@@ -151,6 +151,26 @@ def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) ->
     assert "--resume" in second.stderr
 
 
+def test_a_network_is_scored_on_the_images_that_its_own_training_set_aside(tmp_path: Path) -> None:
+    file, _ = exported(tmp_path, 2, {"classes": ["crate [old]", "[ball]"], "seed": 5})
+    data = write_yolo(tmp_path / "mine", 9)
+    (data / "data.yaml").write_text("names: ['crate [old]', '[ball]']\n")
+    scored = dataflow_command("evaluate", "detector", str(data), "--weights", str(file))
+    assert scored.returncode == 0, scored.stderr
+    assert "1 of 9 were set aside by seed 5" in scored.stderr
+    assert "network.onnx: 1 validation images of 9" in scored.stdout
+    assert "[old]" in scored.stdout or "[ball]" in scored.stdout
+    other = dataflow_command("evaluate", "detector", str(data), "--weights", str(file), "--seed", "3")
+    assert "1 of 9 were set aside by seed 3" in other.stderr
+
+
+def test_an_error_keeps_its_square_brackets(tmp_path: Path) -> None:
+    missing = tmp_path / "v[old]"
+    failed = dataflow_command("train", "detector", str(missing), "--out", str(tmp_path / "a.onnx"))
+    assert failed.returncode == 1
+    assert f"error: no data folder {str(missing)!r}" in failed.stderr
+
+
 def test_classes_can_be_chosen_and_a_wrong_one_is_named(tmp_path: Path) -> None:
     data = read_detection_data(write_coco(tmp_path / "mine", 12))
     assert data.classes == ("crate", "ball")
@@ -569,6 +589,14 @@ def test_the_score_is_the_known_one_in_cases_done_by_hand() -> None:
     assert scored(boxes_of(), []) == 0
 
 
+def test_every_labelled_class_is_scored_where_nothing_is_found() -> None:
+    nothing = Candidates(boxes_of(), np.zeros(0, np.float32), np.zeros(0, np.int32))
+    truth = boxes_of([10, 10, 30, 30], [50, 50, 90, 90], [20, 50, 40, 90])
+    labels, ignored = np.array([0, 2, 3], np.int32), np.array([False, False, True])
+    score = score_detections([ScoredImage(truth, labels, ignored, nothing)], ["crate", "ball", "cup", "lamp"])
+    assert score.per_class == {"crate": 0, "cup": 0}
+
+
 def test_an_ignored_object_is_neither_missed_nor_wrong_to_find() -> None:
     both = boxes_of([50, 50, 90, 90], [10, 10, 30, 30])
     assert scored(both[1:], [0.9], ignored=True) == pytest.approx(1)
@@ -580,7 +608,7 @@ def test_an_ignored_object_is_neither_missed_nor_wrong_to_find() -> None:
 # ---- the network file
 
 
-def exported(tmp_path: Path, classes: int = 3) -> tuple[Path, GridDetector]:
+def exported(tmp_path: Path, classes: int = 3, more: dict[str, object] | None = None) -> tuple[Path, GridDetector]:
     from operators.training.export import export_network
 
     torch.manual_seed(0)
@@ -592,6 +620,7 @@ def exported(tmp_path: Path, classes: int = 3) -> tuple[Path, GridDetector]:
         "height": 128,
         "anchors": ANCHORS.tolist(),
         "strides": list(STRIDES),
+        **(more or {}),
     }
     file = tmp_path / "network.onnx"
     export_network(network, (160, 128), ["a", "b", "c"], facts, file)

@@ -16,7 +16,7 @@ from torch import Tensor, nn  # noqa: E402
 
 from operators.training.backbone import MobileNetV2, load_backbone, start_from  # noqa: E402
 from operators.training.files import TrainingFileError, load_safely, save_atomically  # noqa: E402
-from operators.training.loop import Settings, Silent, schedule, train  # noqa: E402
+from operators.training.loop import Settings, Silent, batches, schedule, train  # noqa: E402
 
 
 class Line:
@@ -106,6 +106,22 @@ def test_what_is_trained_on_does_not_depend_on_the_number_of_workers(tmp_path: P
     assert len({noise for sample, noise in one.seen if sample == 4}) == 6
 
 
+def test_a_single_sample_left_over_joins_the_batch_before(tmp_path: Path) -> None:
+    assert batches(range(7), 3) == [[0, 1, 2], [3, 4, 5, 6]]
+    assert batches(range(8), 3) == [[0, 1, 2], [3, 4, 5], [6, 7]]
+    assert batches(range(2), 1) == [[0], [1]]
+    assert batches(range(1), 3) == [[0]]
+
+    class Odd(Line):
+        samples = 19
+
+    task = Odd()
+    train(task, SETTINGS, tmp_path / "odd.onnx")
+    assert sorted(s for s, _ in task.seen) == sorted([*range(19)] * SETTINGS.epochs)
+    with pytest.raises(ValueError, match=r"at least 2 images a step \(now 1\)"):
+        train(Odd(), Settings(**{**vars(SETTINGS), "batch": 1}), tmp_path / "ones.onnx")
+
+
 def test_the_seed_decides_the_order(tmp_path: Path) -> None:
     orders = []
     for seed in (0, 0, 1):
@@ -127,7 +143,7 @@ def test_a_checkpoint_of_another_training_is_refused_with_the_difference(tmp_pat
     train(Line(), SETTINGS, tmp_path / "line.onnx")
     with pytest.raises(TrainingFileError, match=r"line\.pt cannot be resumed: its classes is 'a', this run's is 'b'"):
         train(Line("b"), SETTINGS, tmp_path / "line.onnx", resume=True)
-    with pytest.raises(TrainingFileError, match="epochs was 6 and is 7"):
+    with pytest.raises(TrainingFileError, match=r"epochs was 6 and is 7; to train longer, .*--from .*line\.pt"):
         train(Line(), Settings(**{**vars(SETTINGS), "epochs": 7}), tmp_path / "line.onnx", resume=True)
     with pytest.raises(FileNotFoundError, match=r"none\.pt"):
         train(Line(), SETTINGS, tmp_path / "none.onnx", resume=True)
