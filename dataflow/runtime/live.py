@@ -228,6 +228,7 @@ class LiveSupervisor(Supervisor):
                 over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
                 self._send(process, "ended_elsewhere", streams=over, reason=reason)
             process.rejoining, process.back, process.beat = None, True, None
+            process.done = {name: self._flow.given(name) for name in self._consumers(process)}
             for name in process.nodes:
                 self._away.pop(name, None)
             self._event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
@@ -291,6 +292,8 @@ class LiveSupervisor(Supervisor):
             self.status.drops[name] += self._base_drops.get(name, Counter())
 
     def _on_message(self, process: Supervised, kind: str, fields: dict[str, Any]) -> None:
+        if kind == "progress" and process.kind == "host":  # one that was started again has not decided anything yet
+            fields["done"] = {name: stamp for name, stamp in fields["done"].items() if stamp != NEVER}
         super()._on_message(process, kind, fields)
         match kind:
             case "record":

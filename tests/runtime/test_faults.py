@@ -240,7 +240,7 @@ def test_without_a_policy_a_leak_ends_the_run_before_the_machine_does(path: Path
 def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, inputs: {x: left/fast}, live: {queue: newest, size: 1}}",
-        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
         count=250,
     )
     slow = {"kind": "slow", "operator": "slow", "by": "1500ms", "for": "1s", "at": "200ms"}
@@ -270,17 +270,19 @@ def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
 def test_a_source_that_stops_holds_up_no_other(path: Path) -> None:
     graph = robot(
         "right: {use: runtime_operators:Counter, params: {count: 250}}",
-        "one: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
-        "other: {use: runtime_operators:Sum, inputs: {x: right/fast}}",
+        "one: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
+        f"other: {{use: runtime_operators:Sum, inputs: {{x: right/fast}}, live: {{queue: block, {AGAIN}}}}}",
         count=250,
     )
-    stop = {"kind": "stop", "operator": "right", "for": "1500ms", "at": "300ms"}
+    stop = {"kind": "stop", "operator": "right", "for": "1300ms", "at": "900ms"}
+    kill = {"kind": "kill", "operator": "other", "at": "1100ms"}
 
-    ran = Ran(graph, path, stop, window=(64, 64 << 20))  # less than the other gives in that time
+    ran = Ran(graph, path, stop, kill, window=(64, 64 << 20))  # less than the other gives in that time
 
+    assert ran.report.restarts == {"other": 1}
     assert ran.report.operators["left"].dropped == 0
     assert ran.report.summaries["one"]["count"] == 250
-    assert ran.report.summaries["other"]["count"] < 150
+    assert len(ran.numbers("test/right/fast")) < 150
     assert ran.is_repeated()
 
 
