@@ -86,7 +86,8 @@ def _drops(report: RunReport) -> Table:
     grid.add_column(overflow="fold")
     for operator, drops in report.drops.items():
         for input_name, reason, number in drops:
-            grid.add_row(Text(f"{operator}.{input_name}"), count(number), Text(reason))
+            where = f"{operator}.{input_name}" if input_name else operator
+            grid.add_row(Text(where), count(number), Text(reason))
     return grid
 
 

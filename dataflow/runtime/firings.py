@@ -60,8 +60,8 @@ class FiringRecord:
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
     decided since the previous record. `detail` holds what is particular to the kind: parameters and file hashes for
     `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, what the operator sums up
-    for `finish`, the error's text for the
-    outcome `error` (with `injected` where no call was made at all).
+    for `finish`, the error's text for the outcome `error` (with `injected` where no call was made at all), and for
+    `fire` and `finish` of a source how many steps it has not sent since the record before, by reason.
     `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
     """
 

@@ -29,6 +29,8 @@ class Health:
     load: float
     restarts: int = 0
     note: str = ""
+    drops: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    """What was dropped so far, by (input, reason); a source's input is ""."""
 
     @property
     def level(self) -> int:
@@ -44,6 +46,9 @@ class Health:
             "drop_rate_hz": f"{self.drop_rate:.2f}",
             "load": f"{self.load:.3f}",
             "restarts": str(self.restarts),
+        } | {
+            ".".join(("dropped", *filter(None, (input_name, reason)))): str(count)
+            for (input_name, reason), count in sorted(self.drops.items())
         }
 
 
@@ -71,9 +76,10 @@ class HealthMonitor:
         away: Mapping[str, str] | None = None,
         ended: frozenset[str] = frozenset(),
         restarts: Mapping[str, int] | None = None,
+        drops: Mapping[str, Mapping[tuple[str, str], int]] | None = None,
     ) -> list[Health]:
         """`counts`: per operator firings, emitted, dropped, nanoseconds of work, as hosts report them. `away`: those
-        that are being started again, and why; `restarts`: how often each was."""
+        that are being started again, and why; `restarts`: how often each was; `drops`: how many, by (input, reason)."""
         span = 0.0 if self._taken is None else now - self._taken
         self._taken = now
         found = []
@@ -105,8 +111,9 @@ class HealthMonitor:
             load = min(1.0, max(0, busy_ns - past.busy_ns) * 1e-9 / span) if span else 0.0
             past.firings, past.dropped, past.busy_ns = firings, dropped, busy_ns
             count = (restarts or {}).get(name, 0)
-            drops = lost / span if span else 0.0
-            found.append(Health(name, state, firings, emitted, dropped, rate, drops, load, count, note))
+            drop_rate = lost / span if span else 0.0
+            why = dict((drops or {}).get(name, {}))
+            found.append(Health(name, state, firings, emitted, dropped, rate, drop_rate, load, count, note, why))
         return found
 
 

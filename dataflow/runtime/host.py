@@ -81,6 +81,7 @@ class Host:
         self._released = False
         self._start: tuple[int, float] | None = None
         self._counted: dict[str, list[int]] = {}
+        self._dropped: dict[str, list[list[Any]]] = {}
         self._reported: dict[str, int] = {}
         self._report_due = 0.0
         self._watch: Watchdog | None = None
@@ -478,12 +479,13 @@ class Host:
             self._unread[runner.node.name].take(*step_size(step))
         if runner.ended:
             return
-        runner.overflow += lost
+        if lost:
+            runner.refused["overflow"] += lost
         if step is None:
             runner.finish()
             return
         if self.window.full or self.backlog.full:
-            runner.overflow += 1
+            runner.refused["overflow"] += 1
             if self.backlog.full:
                 self._tell_backlog(self.backlog.count, self.backlog.size)
             return
@@ -521,7 +523,9 @@ class Host:
         self._reported.update(done)
         self._step_done = firings
         self._counted = self._counts()
-        self.channel.send("progress", done=done, counts=self._counted)
+        drops = {name: found for name, found in self._drops().items() if found != self._dropped.get(name)}
+        self._dropped |= drops
+        self.channel.send("progress", done=done, counts=self._counted, drops=drops)
 
     def _counts(self) -> dict[str, list[int]]:
         """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
@@ -530,7 +534,7 @@ class Host:
             counts[source.node.name] = [
                 source.firings,
                 source.ports.emitted,
-                source.overflow + source.refused["past"],
+                source.refused.total(),
                 source.busy_ns,
                 source.last,
             ]
@@ -541,6 +545,12 @@ class Host:
             if isinstance(feed, LogFeed):
                 counts["@log"] = [feed.firings, sum(n for _, n, _ in feed.counts()), 0, feed.busy_ns, feed.last]
         return counts
+
+    def _drops(self) -> dict[str, list[list[Any]]]:
+        """For each operator: input ("" for a source), reason and number of what it dropped."""
+        return {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners} | {
+            s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self.live
+        }
 
     def _end_if_done(self) -> None:
         if all(f.ended for f in self.feeds) and all(s.ended for s in self.live) and all(r.ended for r in self.runners):
@@ -561,8 +571,7 @@ class Host:
         return {
             "streams": streams,
             "counts": self._counts(),
-            "drops": {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self.runners}
-            | {s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self.live if s.refused},
+            "drops": self._drops(),
             "summaries": {r.node.name: s for r in self.runners if (s := summary_of(r.operator, r.node.name))},
             "transport": {**self.bus.counters(), "malformed": self.malformed},
             "verifications": [r.result.to_wire() for r in self.runners if isinstance(r, RecordedRunner)],

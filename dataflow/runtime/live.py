@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import signal
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any
 
@@ -40,6 +41,7 @@ class LiveSupervisor(Supervisor):
         self._flow = LiveFlow(plan.graph, [host.nodes for host in self._plans.values()])
         self._frontiers: dict[str, tuple[int, int]] = {}
         self._base: dict[str, OperatorCounts] = {}
+        self._base_drops: dict[str, Counter[tuple[str, str]]] = {}
         self._away: dict[str, str] = {}
         self._ended_streams: dict[str, str] = {}
         self._restarted = False
@@ -80,7 +82,7 @@ class LiveSupervisor(Supervisor):
         }
         ended = frozenset(n for p in self._processes.values() if p.report is not None for n in p.nodes)
         self.status.health = self._monitor.update(
-            counts, now, away=self._away, ended=ended, restarts=self.status.restarts
+            counts, now, away=self._away, ended=ended, restarts=self.status.restarts, drops=self.status.drops
         )
         self._tell_recorder("diagnostics", **diagnostics_fields(self.status.health, self._event_time()))
 
@@ -166,6 +168,7 @@ class LiveSupervisor(Supervisor):
             self.status.restarts[name] = self.status.restarts.get(name, 0) + 1
             if name in self.status.operators:
                 self._base[name] = self.status.operators[name]
+            self._base_drops[name] = Counter(self.status.drops.get(name, {}))
         self._hand_over_records(process.nodes)
         self._tell_consumers(process, absent=True)
         self._cover()
@@ -225,6 +228,7 @@ class LiveSupervisor(Supervisor):
                 over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
                 self._send(process, "ended_elsewhere", streams=over, reason=reason)
             process.rejoining, process.back, process.beat = None, True, None
+            process.done = {name: self._flow.given(name) for name in self._consumers(process)}
             for name in process.nodes:
                 self._away.pop(name, None)
             self._event("restarted", f"{process.describe()} is back", operators=list(process.nodes))
@@ -282,7 +286,14 @@ class LiveSupervisor(Supervisor):
             if (base := self._base.get(name)) is not None:
                 self.status.operators[name] = self.status.operators[name].after(base)
 
+    def _count_drops(self, drops: Mapping[str, list[tuple[str, str, int]]]) -> None:
+        super()._count_drops(drops)
+        for name in drops:
+            self.status.drops[name] += self._base_drops.get(name, Counter())
+
     def _on_message(self, process: Supervised, kind: str, fields: dict[str, Any]) -> None:
+        if kind == "progress" and process.kind == "host":  # one that was started again has not decided anything yet
+            fields["done"] = {name: stamp for name, stamp in fields["done"].items() if stamp != NEVER}
         super()._on_message(process, kind, fields)
         match kind:
             case "record":
@@ -344,7 +355,7 @@ class LiveSupervisor(Supervisor):
             if process.work is None or process.gone or not process.back or process.cause:
                 continue
             operator, stamp, seconds = process.work
-            late = 2 * lags.get(operator, 0) >= max(lags.values())  # not just another one that is slow
+            late = 2 * lags.get(operator, 0) >= max(lags.values(), default=0)  # not just another one that is slow
             if seconds > HUNG_AFTER and late and self.plan.graph.nodes[operator].live.queue != "block":
                 cause = (
                     f"hangs in {operator!r}: its firing at stamp {stamp} has taken {seconds:.1f} s, "

@@ -37,6 +37,10 @@ class LiveFlow:
         found = [self.lag(source, done) for source in self.upstream[operator]]
         return min(found, default=0), max(found, default=0)
 
+    def given(self, operator: str) -> int:
+        """The foremost stamp that the sources of an operator have given, or `NEVER`."""
+        return max((self._last[s] for s in self.upstream[operator] if s in self._last), default=NEVER)
+
     def covered(self, sources: Collection[str], lag: int) -> int:
         """The stamp up to which everything of these sources is done by those who are `lag` behind."""
         return max((self._last[s] - lag for s in sources if s in self._last), default=NEVER)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -38,6 +39,8 @@ class Status:
     phase: str = "starting"
     started: float = 0.0
     operators: dict[str, OperatorCounts] = field(default_factory=dict)
+    drops: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
+    """By operator, how many messages were dropped by (input, reason); a source's input is ""."""
     host_of: dict[str, str] = field(default_factory=dict)
     first: int | None = None
     steps: int | None = None
@@ -54,9 +57,9 @@ class Status:
 class RunReport:
     """What a run came to.
 
-    `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples;
-    `summaries` holds what metrics sinks report; `wall` is in seconds from the release of the sources; `restarts` counts
-    by operator.
+    `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples, those of
+    processes that were started again included, with the input "" for what a source has not sent; `summaries` holds what
+    metrics sinks report; `wall` is in seconds from the release of the sources; `restarts` counts by operator.
     """
 
     graph: str

@@ -29,15 +29,14 @@ class SourceRunner:
         self.source: Source = self.operator
         self.ports = OutputPorts(node, self.operator.spec, emitter, lossy=live)
         self.refused: Counter[str] = Counter()
-        """Steps of a live run that were not sent, by reason."""
+        """Steps of a live run that were not sent, by reason: `overflow`, `past`, `repeated`."""
+        self._recorded: Counter[str] = Counter()
         self._backwards: list[int] = []
         self._resumed = False
         self.records = Recorder(node.name, emitter)
         self.firings = 0
         self.ended = False
         self.busy_ns = 0
-        self.overflow = 0
-        self._told = 0
         self.last = NEVER
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
@@ -101,10 +100,14 @@ class SourceRunner:
         except OutputError as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
         self.firings += 1
-        lost, self._told = self.overflow - self._told, self.overflow
-        self.records.add("fire", stamp, started, outputs=emissions, detail={"overflow": lost} if lost else {})
+        self.records.add("fire", stamp, started, outputs=emissions, detail=self._take_refused())
         self.ports.publish()
         return step_size(step)
+
+    def _take_refused(self) -> dict[str, int]:
+        """How many steps were not sent since the last record that says so, by reason."""
+        fresh, self._recorded = self.refused - self._recorded, self.refused.copy()
+        return dict(fresh)
 
     def emit_live(self, step: Mapping[str, Message]) -> tuple[int, int] | None:
         """As `emit`, for a source whose stamps may go back: returns None for a step that is not sent.
@@ -156,7 +159,8 @@ class SourceRunner:
         if not self.ended:
             self.ended = True
             self._next = None
-            self.records.add("finish", self.last, time.time_ns(), outputs=(None,) * len(self.ports.states))
+            none = (None,) * len(self.ports.states)
+            self.records.add("finish", self.last, time.time_ns(), outputs=none, detail=self._take_refused())
             self.ports.end(None if self.last == NEVER else self.last, reason)
 
     def close_stream(self) -> None:

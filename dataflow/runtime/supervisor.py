@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -360,6 +361,7 @@ class Supervisor:
                 self._heard = time.monotonic()
                 process.done |= fields["done"]
                 self._count(fields["counts"])
+                self._count_drops(fields.get("drops", {}))
                 self._cover()
             case "beat":
                 process.beat = time.monotonic()
@@ -370,6 +372,7 @@ class Supervisor:
                 self._heard = time.monotonic()
                 process.report = fields["report"]
                 self._count(fields["report"]["counts"])
+                self._count_drops(fields["report"].get("drops", {}))
                 process.done = dict.fromkeys(process.done, FOREVER)
                 self._cover()
             case "closed":
@@ -387,6 +390,10 @@ class Supervisor:
     def _count(self, counts: Mapping[str, list[int]]) -> None:
         for name, values in counts.items():
             self.status.operators[name] = OperatorCounts(*values)
+
+    def _count_drops(self, drops: Mapping[str, list[tuple[str, str, int]]]) -> None:
+        for name, found in drops.items():
+            self.status.drops[name] = Counter({(input_name, reason): n for input_name, reason, n in found})
 
     def _cover(self) -> None:
         """Tells the feeds how far everything is done."""
@@ -447,10 +454,9 @@ class Supervisor:
             streams=dict(sorted(streams.items())),
             operators=dict(self.status.operators),
             drops={
-                node: tuple((i, why, n) for i, why, n in drops)
-                for r in reports.values()
-                for node, drops in r.get("drops", {}).items()
-                if drops
+                node: tuple((i, why, n) for (i, why), n in sorted(self.status.drops[node].items()))
+                for node in self.status.operators
+                if self.status.drops.get(node)
             },
             summaries={node: s for r in reports.values() for node, s in r.get("summaries", {}).items()},
             transport={label: r["transport"] for label, r in reports.items() if "transport" in r},

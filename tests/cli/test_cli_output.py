@@ -143,7 +143,7 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
         graph="rgbd_perception",
         streams={},
         operators={"trajectory_metrics": OperatorCounts(1_234_567, 7_654_321, 1_000, 10**12)},
-        drops={"trajectory_metrics": (("ground_truth", "unmatched", 1_000),)},
+        drops={"camera": (("", "past", 7),), "trajectory_metrics": (("ground_truth", "unmatched", 1_000),)},
         summaries={"trajectory_metrics": {"ate_rmse_m": 0.0123, "ate": "not computed: " + "too few poses " * 12}},
         transport={},
         verifications=(),
@@ -161,6 +161,7 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
     lines = file.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert any(line.split() == ["ate", "rmse", "0.0123", "m"] for line in lines)
+    assert ["camera", "7", "past"] in [line.split() for line in lines]
     assert "10.0 s of event time in 5.00 s, 2.00 × real time" in lines[0]
     assert "wrote out/run.mcap (1 message, 5.0 MB)" in lines
 

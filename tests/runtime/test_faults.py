@@ -69,6 +69,18 @@ class Ran:
         found = self.report.drops.get(operator, ())
         return sum(n for name, why, n in found if why == reason and input in (None, name))
 
+    def recorded(self, source: str, reason: str) -> int:
+        """How many steps a source has not sent, by its firing records."""
+        with Recording(self.path) as recording:
+            return sum(r.detail.get(reason, 0) for r in recorded_firings(recording, source))
+
+    def diagnosed(self, operator: str) -> dict[str, str]:
+        """What the last diagnostics say of an operator."""
+        with Recording(self.path) as recording:
+            *_, last = (r.message for r in recording.messages([diagnostics_key("test")]))
+        assert isinstance(last, Diagnostics)
+        return last.pairs(last.names.index(operator))
+
     def is_repeated(self) -> bool:
         return verify(self.path, placement="one_host").identical
 
@@ -228,7 +240,7 @@ def test_without_a_policy_a_leak_ends_the_run_before_the_machine_does(path: Path
 def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> None:
     graph = robot(
         "slow: {use: runtime_operators:Smooth, inputs: {x: left/fast}, live: {queue: newest, size: 1}}",
-        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
         count=250,
     )
     slow = {"kind": "slow", "operator": "slow", "by": "1500ms", "for": "1s", "at": "200ms"}
@@ -258,17 +270,19 @@ def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
 def test_a_source_that_stops_holds_up_no_other(path: Path) -> None:
     graph = robot(
         "right: {use: runtime_operators:Counter, params: {count: 250}}",
-        "one: {use: runtime_operators:Sum, inputs: {x: left/fast}}",
-        "other: {use: runtime_operators:Sum, inputs: {x: right/fast}}",
+        "one: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
+        f"other: {{use: runtime_operators:Sum, inputs: {{x: right/fast}}, live: {{queue: block, {AGAIN}}}}}",
         count=250,
     )
-    stop = {"kind": "stop", "operator": "right", "for": "1500ms", "at": "300ms"}
+    stop = {"kind": "stop", "operator": "right", "for": "1300ms", "at": "900ms"}
+    kill = {"kind": "kill", "operator": "other", "at": "1100ms"}
 
-    ran = Ran(graph, path, stop, window=(64, 64 << 20))  # less than the other gives in that time
+    ran = Ran(graph, path, stop, kill, window=(64, 64 << 20))  # less than the other gives in that time
 
+    assert ran.report.restarts == {"other": 1}
     assert ran.report.operators["left"].dropped == 0
     assert ran.report.summaries["one"]["count"] == 250
-    assert ran.report.summaries["other"]["count"] < 150
+    assert len(ran.numbers("test/right/fast")) < 150
     assert ran.is_repeated()
 
 
@@ -284,6 +298,37 @@ def test_a_flood_is_dropped_where_it_is_too_much_and_counted(path: Path) -> None
 
     assert len(ran.numbers("test/left/fast")) > 500
     assert ran.dropped("slow", "overflow", "x") > 300
+    assert ran.is_repeated()
+
+
+def test_what_a_source_drops_is_counted_with_its_reason_everywhere(path: Path) -> None:
+    graph = robot(
+        "slow: {use: runtime_operators:Smooth, params: {sleep: 0.05}, inputs: {x: left/fast}, live: {queue: block}}",
+        count=250,
+    )
+
+    ran = Ran(graph, path, window=(8, 64 << 20))
+
+    dropped = ran.dropped("left", "overflow", "")
+    assert dropped == ran.report.operators["left"].dropped == ran.recorded("left", "overflow") > 50
+    assert dropped + len(ran.numbers("test/left/fast")) == 250
+    assert 0 < int(ran.diagnosed("left")["dropped.overflow"]) <= dropped
+    assert ran.is_repeated()
+
+
+def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -> None:
+    graph = robot(
+        f"slow: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, live: {{queue: newest, size: 1, {AGAIN}}}}}",
+        count=250,
+    )
+    slow = {"kind": "slow", "operator": "slow", "by": "100ms", "for": "1s", "at": "200ms"}
+
+    ran = Ran(graph, path, slow, {"kind": "kill", "operator": "slow", "at": "1700ms"})
+
+    assert ran.report.restarts == {"slow": 1}
+    assert ran.dropped("slow", "overflow", "x") > 50
+    assert ran.report.operators["slow"].dropped == sum(n for _, _, n in ran.report.drops["slow"])
+    assert int(ran.diagnosed("slow")["dropped.x.overflow"]) > 50
     assert ran.is_repeated()
 
 
@@ -313,7 +358,7 @@ def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:
 def test_a_message_with_a_stamp_in_the_past_is_dropped_and_counted(path: Path) -> None:
     ran = Ran(robot(SMOOTH), path, {"kind": "past", "operator": "left", "by": "200ms", "every": "200ms"})
 
-    assert ran.dropped("left", "past") >= 1
+    assert ran.dropped("left", "past") == ran.recorded("left", "past") >= 1
     assert len(ran.numbers("test/left/fast")) == 100
     assert not ran.events("clock_jump")
     assert ran.is_repeated()

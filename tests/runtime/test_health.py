@@ -80,6 +80,17 @@ def test_counts_that_begin_anew_with_a_new_process_are_no_negative_rates() -> No
     assert (again.state, again.rate, again.drop_rate, round(again.load, 6)) == ("running", 3.0, 0.0, 0.1)
 
 
+def test_drops_are_told_by_input_and_reason() -> None:
+    monitor = HealthMonitor()
+    drops = {"op": {("image", "overflow"): 3, ("image", "late"): 1, ("", "past"): 2}}
+
+    values = only(monitor.update({"op": (5, 5, 6, 0)}, 0.0, drops=drops)).values()
+
+    assert values["dropped"] == "6"
+    told = {key: count for key, count in values.items() if key.startswith("dropped.")}
+    assert told == {"dropped.image.overflow": "3", "dropped.image.late": "1", "dropped.past": "2"}
+
+
 def test_the_diagnostics_stream_says_the_same() -> None:
     healths = [
         Health("camera", "silent", 7, 7, 0, 0.0, 0.0, 0.0, 0, "nothing for 3.0 s"),

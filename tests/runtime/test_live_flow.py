@@ -61,6 +61,7 @@ def test_an_operator_is_behind_by_what_its_sources_have_given() -> None:
     assert behind.lags("merge", 290) == (10, 210)
     assert behind.lags("merge", FOREVER) == (0, 0)
     assert behind.lags("merge", NEVER) == (201, 401)  # all that was given
+    assert (behind.given("merge"), behind.given("mix")) == (500, 300)
     assert behind.covered(["left", "right"], 30) == 470
     assert behind.covered(["right"], 30) == 270
 
