@@ -256,7 +256,7 @@ def test_a_slow_operator_drops_by_its_policy_and_holds_up_nobody(path: Path) -> 
 
 
 def test_a_source_that_stops_is_an_event_in_the_diagnostics(path: Path) -> None:
-    graph = robot(SMOOTH, "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}", count=400)
+    graph = robot(SMOOTH, "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}", count=1000)
 
     ran = Ran(graph, path, {"kind": "stop", "operator": "left", "for": "2500ms", "at": "500ms"})
 
