@@ -117,7 +117,7 @@ def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, 
     if role == "walker":
         add_walker(builder, rng, places((0.0, 0.0), (0.03, 0.35), (0.0, 0.7), (0.0, 1.0)))
     elif role == "ball":
-        a, b = places((0.0, 0.0), (0.0, 1.0))
+        a, b = places((0.0, 0.1), (0.0, 0.9))
         add_ball(builder, rng, a, b, radius=rng.uniform(0.09, 0.15), seconds=rng.uniform(4, 6))
     else:
         angle = np.linspace(0, 2 * math.pi, 8, endpoint=False)
