@@ -152,8 +152,9 @@ class SimulatedRobot(Source):
         self._stereo_optics = optics(rig.width, rig.height, rig.focal)
         mount: Mount = camera.mount or world.camera_mount
         self._T_base_color = mounted(mount) @ BODY_TO_OPTICAL
-        self._T_base_depth = self._T_base_color @ _shift(*other.offset)
-        self._T_base_right = self._T_base_color @ _shift(rig.baseline, 0, 0)
+        self._T_base_depth = self._T_base_color @ mounted((*other.offset, *other.rotation))
+        self._T_base_left = mounted(rig.mount) @ BODY_TO_OPTICAL if rig.mount else self._T_base_color
+        self._T_base_right = self._T_base_left @ _shift(rig.baseline, 0, 0)
         wants_graph = self.truth.relations > 0
         self._graph = TrueGraph(world, with_spatial=self.truth.spatial) if wants_graph else None
 
@@ -291,7 +292,7 @@ class SimulatedRobot(Source):
     def _stereo(self, t: float, tick: Tick, rng: Rng) -> Messages:
         rig, messages = self.stereo, {}
         dark = rng.random() < rig.black
-        for port, T in (("left", self._T_base_color), ("right", self._T_base_right)):
+        for port, T in (("left", self._T_base_left), ("right", self._T_base_right)):
             view = self._stage.view(t, T, self._stereo_optics, color=True)
             assert view.color is not None
             light = color.expose(view.color if rig.color else color.grey(view.color), 0.0 if dark else rig.exposure)
@@ -348,7 +349,7 @@ class SimulatedRobot(Source):
             placed.append((base, self.depth_frame, self._T_base_depth))
             placed.append((self.depth_frame, self.image_frame, np.linalg.inv(self._T_base_depth) @ self._T_base_color))
         if self.stereo.rate:
-            placed.append((base, "stereo_left_optical", self._T_base_color))
+            placed.append((base, "stereo_left_optical", self._T_base_left))
             placed.append(("stereo_left_optical", "stereo_right_optical", _shift(self.stereo.baseline, 0, 0)))
         placed += [
             (base, frame, mounted(sensor.mount))

@@ -89,7 +89,7 @@ class Body:
         shoulder = self.shoulder(posture, side)
         forward, left, _ = _axes(posture.yaw, posture.lean)
         out = (1 - 2 * side) * left
-        bend = -0.7 * forward + 0.5 * out - np.array([0, 0, 0.6])
+        bend = -0.7 * forward + 0.1 * out - np.array([0, 0, 0.5])
         elbow, hand = _two_bones(
             shoulder, posture.hands[side], _UPPER * self.height, (_FORE + _HAND * 0.6) * self.height, bend
         )

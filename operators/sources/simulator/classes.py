@@ -23,6 +23,9 @@ SURFACES = ("floor", "wall", "ceiling")
 """A picture, a window or a whiteboard counts as the wall it hangs on."""
 
 CLASSES = THINGS + SURFACES
+VOID = 255
+"""The class id of a pixel that shows nothing."""
+
 CLASS_IDS = {name: k for k, name in enumerate(CLASSES)}
 
 ACTIVITIES = (

@@ -36,14 +36,15 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     outer = _ring(x, y, height, inside=True)
     inner = _ring(block_x, block_y, height, inside=False)
     roles = [str(role) for role in rng.permutation(["walker", "walker", "ball", "rover"])] if movers else [""] * 4
-    for k, wall in enumerate(outer):
+    for wall, role in zip(outer, roles, strict=True):
+        if role:
+            _inhabit(builder, rng, wall, role, wall.length / 2 - 1.9)
+    for wall in outer:
         half = wall.length / 2 - 0.6
         raise_wall(builder, wall, style)
         spans = _doors(builder, rng, wall, half, int(rng.integers(1, 3)))
         line_wall(builder, rng, wall, _between(spans, half - width + 0.6), depth=0.5)
         decorate(builder, rng, wall, windows=rng.uniform() < 0.5, taken=spans)
-        if roles[k]:
-            _inhabit(builder, rng, wall, roles[k], half - 1.3)
     for wall in inner:
         half = wall.length / 2 - 0.2
         raise_wall(builder, wall, style, accent=True)
@@ -72,6 +73,7 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0),
         tuple(builder.placements),
         tuple(builder.scripts),
+        lanes=tuple(builder.lanes),
     )
 
 

@@ -219,7 +219,7 @@ def put_desk(
     if chair:
         seat, _ = furniture.chair(rng)
         T_chair = T @ pose(
-            depth / 2 + rng.uniform(0.2, 0.38), offset + rng.uniform(-0.1, 0.1), 0, math.pi + rng.uniform(-0.5, 0.5)
+            depth / 2 + rng.uniform(0.12, 0.26), offset + rng.uniform(-0.1, 0.1), 0, math.pi + rng.uniform(-0.5, 0.5)
         )
         builder.put("chair", seat, T_chair, on=FLOOR)
     return Desk(id, T, surface)
@@ -270,7 +270,10 @@ def put_on_floor(builder: Builder, label: str, shape: Shape, T: Array) -> int:
 def line_wall(
     builder: Builder, rng: Rng, wall: Wall, free: Sequence[tuple[float, float]], *, depth: float = 1.55
 ) -> None:
-    """Stands furniture along the free spans (from, to) of a wall, none farther from it than `depth` metres."""
+    """Stands furniture along the free spans (from, to) of a wall, none farther from it than `depth` metres.
+
+    What would stand in a lane is left out.
+    """
     for start, end in free:
         cursor = start + rng.uniform(0.05, 0.3)
         while end - cursor > 0.5:
@@ -282,8 +285,10 @@ def line_wall(
             width = {"shelf": min(room, rng.uniform(0.7, 1.4)), "desk": min(room, rng.uniform(1.2, 1.7))}.get(
                 name, 0.55
             )
-            _stand(builder, rng, wall, name, cursor + width / 2, width, depth)
-            cursor += width + rng.uniform(0.08, 0.45)
+            piece = builder.draft()
+            _stand(piece, rng, wall, name, cursor + width / 2, width, depth)
+            gap = rng.uniform(0.08, 0.45)
+            cursor += width + gap if builder.keep(piece) else gap
 
 
 def _stand(builder: Builder, rng: Rng, wall: Wall, name: str, along: float, width: float, depth: float) -> None:

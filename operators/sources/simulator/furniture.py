@@ -236,7 +236,8 @@ def rover(rng: Rng) -> Shape:
     if rng.uniform() < 0.5:
         r = rng.uniform(0.17, 0.22)
         h = rng.uniform(0.42, 0.62)
-        shape = lathe([(0, 0.03), (r, 0.03), (r, 0.14), (r * 0.62, 0.2)], shell, segments=20)
+        shape = cylinder(r * 0.88, 0.03, black, segments=20)
+        shape += lathe([(0, 0.03), (r, 0.03), (r, 0.14), (r * 0.62, 0.2)], shell, segments=20)
         shape += at(
             lathe(
                 [(r * 0.62, 0.0), (r * 0.5, h - 0.3), (r * 0.72, h - 0.2), (r * 0.6, h - 0.08), (0, h - 0.04)], shell
@@ -252,7 +253,7 @@ def rover(rng: Rng) -> Shape:
             for sy in (-1, 1):
                 turn = np.eye(4)
                 turn[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
-                wheel = moved(cylinder(0.07, 0.05, black, segments=14), turn)
+                wheel = moved(cylinder(0.07, 0.05, black, segments=16), turn)
                 shape += at(wheel, sx * length * 0.32, sy * (w / 2 + 0.02) + 0.025, 0.07)
         mast = rng.uniform(0.25, 0.45)
         shape += at(cylinder(0.02, mast, black, segments=8), -length * 0.2, 0, 0.06 + h)

@@ -11,10 +11,12 @@ from operators.sources.simulator import furniture, objects
 from operators.sources.simulator.body import drawn_body
 from operators.sources.simulator.furnishing import FLOOR, Wall, put_desk
 from operators.sources.simulator.furniture import Surface
+from operators.sources.simulator.lanes import ROVER, WALKER
 from operators.sources.simulator.movers import (
     Carried,
     Driving,
     Person,
+    Polyline,
     Rolling,
     Seat,
     Timeline,
@@ -29,7 +31,7 @@ from operators.sources.simulator.trajectory import Trajectory
 
 Rng = np.random.Generator
 
-_BESIDE = 0.43  # metres between the table's edge and the middle of a chair that stands beside it
+_BESIDE = 0.48  # metres between the table's edge and the middle of a chair that stands beside it
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,9 +66,9 @@ def set_place(
     return Place(chair, table, mug, T_mug, T_pelvis[:3, 3], heading, 0 if sense > 0 else 1, stand)
 
 
-def mug_spot(surface: Surface, along: float, sense: int) -> tuple[float, float, float]:
-    """The circle (x, y, radius) on the table that a place's mug needs."""
-    return surface.x + surface.half_x - 0.06, along + sense * 0.3, 0.1
+def arm_room(surface: Surface, along: float, sense: int) -> list[tuple[float, float, float]]:
+    """Circles (x, y, radius) on the table that the mug of a place needs, and the arm that reaches for it."""
+    return [(surface.x + surface.half_x - 0.06, along + sense * ahead, 0.2) for ahead in (-0.05, 0.1, 0.25, 0.4)]
 
 
 def seat_person(builder: Builder, rng: Rng, place: Place, path: Array, timeline: Timeline) -> int:
@@ -91,6 +93,7 @@ def seat_person(builder: Builder, rng: Rng, place: Place, path: Array, timeline:
     builder.relate(id, "on", FLOOR, lambda t: not person.seated(t))
     builder.relate(id, "reaching_for", place.mug, lambda t: timeline.at(t)[0].activity == "reaching")
     builder.scripts.append(lambda t: person_doing(id, person, t))
+    builder.reserve(id, np.concatenate([Polyline(path).line(), place.pelvis[None, :2]]), WALKER)
     return id
 
 
@@ -99,7 +102,7 @@ def add_desk_worker(builder: Builder, rng: Rng, wall: Wall, along: float, sense:
     surface_guess = Surface(0, 0, 0.74, 0.34, 0.7)
     T = wall.place(0.42, along)
     desk = put_desk(
-        builder, rng, T, rng.uniform(1.3, 1.6), items=4, chair=False, keep_free=[mug_spot(surface_guess, 0.0, sense)]
+        builder, rng, T, rng.uniform(1.3, 1.6), items=4, chair=False, keep_free=arm_room(surface_guess, 0.0, sense)
     )
     place = set_place(builder, rng, desk.id, T, desk.surface, 0.0, sense)
     waypoints = [(out, far), (out, along + 0.6 * (far - along)), (out - 0.05, along + sense * 1.25)]
@@ -122,6 +125,7 @@ def add_walker(builder: Builder, rng: Rng, path: Array) -> int:
     body = drawn_body(rng)
     person = Person(body, path, pacing(path, walk=rng.uniform(0.55, 0.75), phase=rng.uniform(0, 30)))
     id = builder.move("person", body.parts, person)
+    builder.reserve(id, Polyline(path).line(), WALKER)
     builder.relate(id, "on", FLOOR)
     builder.scripts.append(lambda t: person_doing(id, person, t))
     return id
@@ -142,6 +146,7 @@ def add_ball(
     rolling = Rolling(a, b, radius, z=z, seconds=seconds, phase=rng.uniform(0, 10))
     shape = objects.ball(rng, radius)
     id = builder.move("ball", (shape,), rolling)
+    builder.reserve(id, np.array([a, b]), radius)
     builder.relate(id, "on", on)
     builder.scripts.append(lambda t: rolling.doing(id, t))
     return id
@@ -153,6 +158,7 @@ def add_rover(builder: Builder, rng: Rng, waypoints: Array, *, speed: float = 0.
     driving = Driving(path, phase=rng.uniform(0, path.period))
     shape = furniture.rover(rng)
     id = builder.move("robot", (shape,), driving)
+    builder.reserve(id, path.outline(), ROVER)
     builder.relate(id, "on", FLOOR)
     builder.scripts.append(lambda t: driving.doing(id, t))
     return id

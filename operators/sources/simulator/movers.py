@@ -140,7 +140,7 @@ class Person:
         if self._grasp is not None and (reach > 0 or _mix(act.lift, x) > 0):
             posture = Posture(pelvis, yaw, lean, feet, hands)
             goal = self._grasp + _mix(act.lift, x) * (self.body.mouth(posture) - self._grasp)
-            arc = np.array([0, 0, 0.12 * math.sin(math.pi * reach)])
+            arc = np.array([0, 0, 0.2 * math.sin(math.pi * reach)])
             hands = hands.copy()
             hands[self._hand] += reach * (goal - hands[self._hand]) + arc
         return Posture(pelvis, yaw, lean, feet, hands)
@@ -199,6 +199,10 @@ class Polyline:
         fine = np.linspace(0, chord[-1], 400)
         walked = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(self._spline(fine), axis=0), axis=1))])
         self._run, self._at, self.length = walked, fine, float(walked[-1])
+
+    def line(self) -> Array:
+        """Points (N, 2) along the path."""
+        return self._points if self._spline is None else np.asarray(self._spline(self._at))
 
     def at(self, along: float) -> tuple[Array, float]:
         """Place (2,) and heading."""

@@ -20,12 +20,16 @@ from operators.sources.simulator.furnishing import (
     small_items,
 )
 from operators.sources.simulator.inhabitants import add_ball, add_desk_worker, add_rover, add_walker
+from operators.sources.simulator.lanes import WALKER
 from operators.sources.simulator.scene import Builder, Light, World
 from operators.sources.simulator.shapes import Array, pose
 from operators.sources.simulator.trajectory import Trajectory
 
 REACH = 2.45
 """Metres between the walls and the robot's path: furniture, then room for those who walk, roll or drive there."""
+
+OUT = 1.8
+"""Metres between a wall and the middle of its lane."""
 
 
 def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
@@ -39,26 +43,26 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     accent = int(rng.integers(4))
     door_wall = int(rng.integers(4))
     roles = [str(role) for role in rng.permutation(["worker", "walker", "ball", "rover"])] if movers else [""] * 4
+    if roles[door_wall] == "worker":
+        door_wall = (door_wall + 1) % 4
+    turn = int(rng.choice([-1, 1]))
+    desks = [
+        _inhabit(builder, rng, wall, role, turn) if role else None for wall, role in zip(walls, roles, strict=True)
+    ]
     for k, wall in enumerate(walls):
         raise_wall(builder, wall, style, accent=k == accent)
         half = wall.length / 2 - 0.75  # the corners stay free: furniture of two walls would meet there
         free = [(-half, half)]
         taken: list[tuple[float, float]] = []
-        if roles[k] == "worker" and k == door_wall:
-            door_wall = (k + 1) % 4 if k < 3 else -1
         if k == door_wall:
             middle, width = rng.uniform(-0.4, 0.4) * half, rng.uniform(0.85, 0.95)
             shape = furniture.door(rng, width, rng.uniform(2.0, 2.1), rng.uniform(0.0, 0.9))
             put_on_floor(builder, "door", shape, wall.place(0.0, middle))
             free = [(-half, middle - 0.75), (middle + 0.75, half)]
             taken.append((middle - 0.65, middle + 0.65))
-        if roles[k] == "worker":
-            sense = int(rng.choice([-1, 1]))
-            along = sense * -0.35 * half
-            add_desk_worker(builder, rng, wall, along, sense, sense * (half - 0.5), 1.75)
-            free = [(-half, along - 1.2), (along + 1.2, half)]
-        elif roles[k]:
-            _inhabit(builder, rng, wall, roles[k], half)
+        desk = desks[k]
+        if desk is not None:
+            free = [(-half, desk - 1.2), (desk + 1.2, half)]
         line_wall(builder, rng, wall, free)
         decorate(builder, rng, wall, windows=k in (0, 2), taken=taken)
 
@@ -82,6 +86,7 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, pitch, 0.0),
         tuple(builder.placements),
         tuple(builder.scripts),
+        lanes=tuple(builder.lanes),
     )
 
 
@@ -92,24 +97,32 @@ def _loop(rng: np.random.Generator, a: float, b: float) -> Array:
     return np.stack([a * wobble * np.cos(angle), b * wobble * np.sin(angle)], axis=1)
 
 
-def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, half: float) -> None:
-    """Someone or something that moves along a wall, between its furniture and the robot's path."""
-    out = 1.78
+def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, turn: int) -> float | None:
+    """Someone or something that moves along a wall, between its furniture and the robot's path.
+
+    Lanes lie like the vanes of a pinwheel that turns by `turn` (1 or -1): each goes on into the corner at one end of
+    its wall and stops at the other before the lane that comes from there. Returns where along the wall a desk stands.
+    """
+    corner = wall.length / 2 - 1.25
+    stop = -(wall.length / 2 - OUT - 2 * WALKER - 0.1)
 
     def places(*points: tuple[float, float]) -> Array:
-        return np.array([wall.place(d, s)[:2, 3] for d, s in points])
+        """(N, 2) of (metres from `OUT` to the robot's path, share of the way from `stop` to `corner`)."""
+        return np.array([wall.place(OUT + d, turn * (stop + s * (corner - stop)))[:2, 3] for d, s in points])
 
-    reach = min(half - 0.6, 2.4)
+    if role == "worker":
+        desk = turn * max(-0.35 * (wall.length / 2 - 0.75), 3.1 - wall.length / 2)
+        add_desk_worker(builder, rng, wall, desk, turn, turn * corner, OUT)
+        return desk
     if role == "walker":
-        add_walker(builder, rng, places((out, -reach), (out + 0.05, -0.3 * reach), (out, 0.4 * reach), (out, reach)))
+        add_walker(builder, rng, places((0.0, 0.0), (0.03, 0.35), (0.0, 0.7), (0.0, 1.0)))
     elif role == "ball":
-        radius = rng.uniform(0.09, 0.15)
-        a, b = places((out, -reach * 0.8), (out, reach * 0.8))
-        add_ball(builder, rng, a, b, radius=radius, seconds=rng.uniform(4, 6))
+        a, b = places((0.0, 0.1), (0.0, 0.9))
+        add_ball(builder, rng, a, b, radius=rng.uniform(0.09, 0.15), seconds=rng.uniform(4, 6))
     else:
         angle = np.linspace(0, 2 * math.pi, 8, endpoint=False)
-        points = [(out + 0.16 * math.sin(a), 0.7 * reach * math.cos(a)) for a in angle]
-        add_rover(builder, rng, places(*points))
+        add_rover(builder, rng, places(*((0.14 * math.sin(a) - 0.03, 0.5 + 0.5 * math.cos(a)) for a in angle)))
+    return None
 
 
 def _island(builder: Builder, rng: np.random.Generator, radius: float) -> None:

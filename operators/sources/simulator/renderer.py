@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
-from operators.sources.simulator.classes import CLASS_IDS
+from operators.sources.simulator.classes import CLASS_IDS, VOID
 from operators.sources.simulator.native import open3d
 from operators.sources.simulator.scene import Light, World
 from operators.sources.simulator.shapes import Array, Patch
@@ -86,8 +86,8 @@ class View:
     """What a camera sees, without noise.
 
     `depth` (H, W) metres along z, infinite where nothing is hit; `cosine` (H, W) of the angle between ray and surface
-    normal; `triangle` (H, W) index of what is hit; `instances` and `classes` (H, W); `color` (H, W, 3) RGB 0 to 255 and
-    beyond, or None where it was not asked for.
+    normal; `triangle` (H, W) index of what is hit; `instances` and `classes` (H, W), 0 and `VOID` where nothing is
+    hit; `color` (H, W, 3) RGB 0 to 255 and beyond, or None where it was not asked for.
     """
 
     depth: F32
@@ -174,8 +174,8 @@ class Renderer:
         light = np.where(self._mesh.glow > 0, self._mesh.glow, received).astype(np.float32)
         both = (self._mesh, self._moving)
         self._thing_of_triangle = np.concatenate([m.thing_of_triangle for m in both])
-        self._id_of_thing = np.array([thing.id for thing in things], np.uint16)
-        self._class_of_thing = np.array([CLASS_IDS[thing.label] for thing in things], np.uint8)
+        self._id_of_thing = np.array([*(thing.id for thing in things), 0], np.uint16)
+        self._class_of_thing = np.array([*(CLASS_IDS[thing.label] for thing in things), VOID], np.uint8)
         uv = np.concatenate([m.uv for m in both])
         edges = [uv[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]]
         self._uv = [np.ascontiguousarray(e[:, k]) for k in (0, 1) for e in edges]  # u0, du1, du2, v0, dv1, dv2
@@ -225,7 +225,7 @@ class Renderer:
             weights[rows, columns][nearer] = w[nearer]
             normals[rows, columns][nearer] = n[nearer]
         cosine = np.abs(np.einsum("hwi,hwi->hw", normals, rays[..., 3:])) * _inverse_lengths(optics)
-        things = self._thing_of_triangle.take(triangle, mode="clip")
+        things = np.where(np.isfinite(depth), self._thing_of_triangle.take(triangle, mode="clip"), -1)
         instances = self._id_of_thing.take(things)
         classes = self._class_of_thing.take(things)
         pixels = self._shade(triangle, weights, depth, cosine, optics) if color else None

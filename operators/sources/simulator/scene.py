@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.sources.simulator.lanes import Lane
 from operators.sources.simulator.shapes import Array, Shape, bounds
 from operators.sources.simulator.trajectory import Trajectory
 
@@ -135,6 +136,7 @@ class World:
     placements: tuple[Placement, ...]
     scripts: tuple[Callable[[float], Doing], ...] = ()
     floor_id: int = 0
+    lanes: tuple[Lane, ...] = ()
 
     def relations(self, t: float) -> list[Relation]:
         """The relations of placement and contact that hold at a time."""
@@ -163,6 +165,7 @@ class Builder:
     things: list[Thing] = field(default_factory=list)
     placements: list[Placement] = field(default_factory=list)
     scripts: list[Callable[[float], Doing]] = field(default_factory=list)
+    lanes: list[Lane] = field(default_factory=list)
     _next: int = 1
 
     def surface(self, label: str, shape: Shape) -> None:
@@ -188,6 +191,27 @@ class Builder:
         id = self.new_id() if id is None else id
         self.things.append(Thing(id, label, parts, mover))
         return id
+
+    def reserve(self, mover: int, line: Array, radius: float) -> None:
+        """Gives a mover the floor within `radius` metres of a line (N, 2). Raises ValueError if another has it."""
+        lane = Lane(mover, line, radius)
+        for other in self.lanes:
+            if lane.apart(other) < 0:
+                raise ValueError(f"the lanes of things {other.mover} and {mover} overlap by {-lane.apart(other):.2f} m")
+        self.lanes.append(lane)
+
+    def draft(self) -> Builder:
+        """An empty builder that goes on with the ids, for what is not sure to be kept."""
+        return Builder(_next=self._next)
+
+    def keep(self, draft: Builder) -> bool:
+        """Adds a draft's still things, unless one stands in a lane; tells whether it did."""
+        if any(lane.gap(thing.vertices(0.0)[:, :2]) < 0 for thing in draft.things for lane in self.lanes):
+            return False
+        self.things += draft.things
+        self.placements += draft.placements
+        self._next = draft._next
+        return True
 
     def relate(self, subject: int, predicate: str, object: int, holds: Callable[[float], bool] | None = None) -> None:
         self.placements.append(Placement(Relation(subject, predicate, object), holds))

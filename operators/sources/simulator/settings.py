@@ -60,6 +60,9 @@ class DepthCamera(Sensor):
     offset: tuple[float, float, float] = Field(
         (0.0, 0.0, 0.0), description="of the depth camera in the colour camera's optical frame, metres; 0 is registered"
     )
+    rotation: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0), description="of the depth camera in that frame, radians about its fixed x, then y, then z axis"
+    )
     output: Literal["raw", "png", "both"] = Field("raw", description="ports that it feeds: depth, depth_png or both")
     min_range: float = Field(0.25, gt=0, description="nearer things have no return, metres")
     max_range: float = Field(6.0, gt=0, description="farther things have no return, metres")
@@ -74,11 +77,12 @@ class DepthCamera(Sensor):
 
 
 class StereoRig(Sensor):
-    """Two parallel cameras; the left one sits where the colour camera does."""
+    """Two parallel cameras."""
 
     width: int = Field(320, ge=16, le=4096, description="columns")
     height: int = Field(240, ge=16, le=4096, description="rows")
     focal: float = Field(0.85, gt=0.1, le=10, description="focal length as a share of the width")
+    mount: Mount | None = Field(None, description="place of the left camera on the robot; the colour camera's if none")
     baseline: float = Field(0.12, gt=0, description="distance of the right camera from the left one, metres")
     color: bool = Field(False, description="RGB instead of grey")
     exposure: float = Field(1.0, gt=0, description="brightness")
@@ -131,6 +135,9 @@ class Wheels(Sensor):
     ticks_per_turn: int = Field(2048, ge=1, description="encoder counts a turn of the wheel")
     scale_error: float = Field(
         0.01, ge=0, lt=0.5, description="standard deviation of each wheel's constant scale error"
+    )
+    bias: tuple[float, float] = Field(
+        (0.0, 0.0), description="left and right: what is counted is too long by this share of the way"
     )
     slip: float = Field(
         0.006, ge=0, description="standard deviation of a wheel's error after 1 m; grows with √distance"

@@ -19,7 +19,7 @@ from operators.sources.simulator.furnishing import (
     scatter,
     small_items,
 )
-from operators.sources.simulator.inhabitants import add_ball, add_drinker, add_walker, mug_spot
+from operators.sources.simulator.inhabitants import add_ball, add_drinker, add_walker, arm_room
 from operators.sources.simulator.scene import Builder, Light, World
 from operators.sources.simulator.shapes import Array, pose
 from operators.sources.simulator.trajectory import Trajectory
@@ -34,6 +34,9 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
     walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
     walked, door_wall = (int(k) for k in rng.permutation(4)[:2])
+    if movers:
+        ways = [walls[walked].place(0.88, s * (walls[walked].length / 2 - 1.3)) for s in (-1.0, -0.3, 0.4, 1.0)]
+        add_walker(builder, rng, np.array([T[:2, 3] for T in ways]))
     for k, wall in enumerate(walls):
         raise_wall(builder, wall, style, accent=k == 0)
         half = wall.length / 2 - 0.6
@@ -44,9 +47,6 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
             taken, free = [(-0.6, 0.6)], [(-half, -0.65), (0.65, half)]
         line_wall(builder, rng, wall, free, depth=0.55)
         decorate(builder, rng, wall, windows=k % 2 == 0, taken=taken)
-        if movers and k == walked:
-            way = np.array([wall.place(1.0, s * half)[:2, 3] for s in (-0.8, -0.25, 0.3, 0.8)])
-            add_walker(builder, rng, way)
     _lay_table(builder, rng, movers)
     lights = tuple(
         Light((0.9 * math.cos(a), 0.9 * math.sin(a), height - 0.1), rng.uniform(1.4, 1.9))
@@ -69,6 +69,7 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2),
         tuple(builder.placements),
         tuple(builder.scripts),
+        lanes=tuple(builder.lanes),
     )
 
 
@@ -87,7 +88,7 @@ def _lay_table(builder: Builder, rng: np.random.Generator, movers: bool) -> None
     lane = -surface.half_x * rng.uniform(0.25, 0.5)
     if movers:
         sense = int(rng.choice([-1, 1]))
-        taken.append(mug_spot(surface, -0.15 * sense, sense))
+        taken += arm_room(surface, -0.15 * sense, sense)
         add_drinker(builder, rng, id, T, surface, -0.15 * sense, sense)
         radius = rng.uniform(0.035, 0.06)
         ends = [(T @ pose(lane, s * surface.half_y * 0.75))[:2, 3] for s in (-1, 1)]

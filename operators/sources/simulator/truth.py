@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Activity, Boxes3D, Detections2D, Odometry, SceneGraph, SegmentationMap
 from dataflow.messages.geometry import matrix_to_quaternion
-from operators.sources.simulator.classes import ACTIVITIES, ACTIVITY_IDS, CLASS_IDS, CLASSES, THINGS
+from operators.sources.simulator.classes import ACTIVITIES, ACTIVITY_IDS, CLASS_IDS, CLASSES, THINGS, VOID
 from operators.sources.simulator.furnishing import FLOOR
 from operators.sources.simulator.relations import Nearness, spatial
 from operators.sources.simulator.renderer import Optics, Renderer, View
@@ -104,9 +104,9 @@ def velocity(thing: Thing, t: float) -> Array:
 
 
 def masks(view: View, stamp: int, frame: str) -> SegmentationMap:
-    """Class and instance of every pixel; surfaces (floor, walls, ceiling) have classes but no instances."""
+    """Class and instance of every pixel; surfaces (floor, walls, ceiling) have no instances, nothing is void."""
     return SegmentationMap(
-        stamp=stamp, frame=frame, class_names=CLASSES, classes=view.classes, instances=view.instances
+        stamp=stamp, frame=frame, class_names=CLASSES, void=VOID, classes=view.classes, instances=view.instances
     )
 
 

@@ -20,7 +20,7 @@ class WheelModel:
 
     def __init__(self, wheels: Wheels, seed: int) -> None:
         self._wheels = wheels
-        self._scale = 1 + np.random.default_rng([seed, 31]).normal(0, wheels.scale_error, 2)
+        self._scale = 1 + np.array(wheels.bias) + np.random.default_rng([seed, 31]).normal(0, wheels.scale_error, 2)
         self._time: float | None = None
         self._turned = np.zeros(2)  # metres at the rim: left, right
         self._counts = np.zeros(2, np.int64)
@@ -35,12 +35,17 @@ class WheelModel:
         since = t if self._time is None else self._time
         rolled = _rolled(path, wheels.track, since, t)
         self._time = t
-        self._turned += rolled * self._scale + rng.standard_normal(2) * wheels.slip * np.sqrt(np.abs(rolled))
+        slips = rng.standard_normal(2) * wheels.slip
+        self._turned += rolled * self._scale + slips * np.sqrt(np.abs(rolled))
         counts = np.floor(self._turned / metres_per_count).astype(np.int64)
         left, right = (counts - self._counts) * metres_per_count
         self._counts = counts
         self._advance(float(left), float(right))
-        elapsed = max(t - since, 1e-9)
+        elapsed = t - since
+        if elapsed == 0:  # nothing has been counted yet: the rate is that of a period at the present speed
+            elapsed = 1 / (wheels.rate or 1)
+            rolled = _rim_speeds(path, wheels.track, np.array([t]))[:, 0] * elapsed
+            left, right = rolled * self._scale + slips * np.sqrt(np.abs(rolled))
         speed, rate = (left + right) / 2 / elapsed, (right - left) / wheels.track / elapsed
         ticks = WheelTicks(
             stamp=stamp,
@@ -81,10 +86,15 @@ def _rolled(path: Trajectory, track: float, start: float, end: float) -> Array:
     """What the left and the right wheel roll between two times, metres: Gauss-Legendre quadrature of their speeds."""
     if end <= start:
         return np.zeros(2)
-    motion = path.at(start + (end - start) * (_NODES + 1) / 2)
+    speeds = _rim_speeds(path, track, start + (end - start) * (_NODES + 1) / 2)
+    return np.asarray(speeds @ _WEIGHTS / 2 * (end - start))
+
+
+def _rim_speeds(path: Trajectory, track: float, times: Array) -> Array:
+    """m/s (2, N) of the left and the right wheel on the floor."""
+    motion = path.at(times)
     speed, turn = motion.speed(), motion.yaw_rate * track / 2
-    share = _WEIGHTS / 2 * (end - start)
-    return np.array([(speed - turn) @ share, (speed + turn) @ share])
+    return np.array([speed - turn, speed + turn])
 
 
 def _spatial(planar: Array) -> Array:

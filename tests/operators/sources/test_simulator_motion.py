@@ -10,9 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from operators.sources.simulator import corridor, office, table_top
 from operators.sources.simulator.inertial import true_reading
 from operators.sources.simulator.movers import Person
-from operators.sources.simulator.scene import World
+from operators.sources.simulator.native import open3d
+from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.settings import Inertial
 from operators.sources.simulator.trajectory import Trajectory
 from operators.sources.simulator.worlds import NAMES, make_world
@@ -109,6 +111,82 @@ def test_the_robot_touches_nothing(name: str, seed: int) -> None:
                 v = thing.vertices(t)
                 gap = np.hypot(*(v[v[:, 2] < ROBOT_HEIGHT, :2] - p).T).min(initial=9)
                 assert gap > ROBOT_RADIUS, f"{thing.label} {thing.id} comes within {gap:.2f} m at {t} s"
+
+
+@pytest.fixture
+def unfurnished(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Worlds without what stands along their walls: their movers are as they would be, and they are made quickly."""
+    for module in (office, corridor, table_top):
+        monkeypatch.setattr(module, "line_wall", lambda *args, **kwargs: None)
+        monkeypatch.setattr(module, "decorate", lambda *args, **kwargs: None)
+
+
+@pytest.mark.usefixtures("unfurnished")
+@pytest.mark.parametrize(("name", "seeds"), [("office", 15), ("corridor", 4), ("table_top", 4)])
+def test_lanes_lie_apart_and_off_the_path_of_the_robot(name: str, seeds: int) -> None:
+    for seed in range(seeds):
+        here = make_world(name, seed, speed=0.5, hold=0.0, movers=True)
+        assert len(here.lanes) == len(here.scripts)
+        for k, lane in enumerate(here.lanes):
+            assert lane.gap(here.path.outline()) > ROBOT_RADIUS, (seed, lane.mover)
+            assert all(lane.apart(other) > 0 for other in here.lanes[k + 1 :]), (seed, lane.mover)
+
+
+@pytest.mark.usefixtures("unfurnished")
+@pytest.mark.parametrize(("name", "seeds"), [("office", 6), ("corridor", 3), ("table_top", 3)])
+def test_movers_never_meet(name: str, seeds: int) -> None:
+    """Axis to axis, for two minutes."""
+    for seed in range(seeds):
+        here = make_world(name, seed, speed=0.5, hold=0.0, movers=True)
+        movers = [here.thing(lane.mover) for lane in here.lanes]
+        tracks = np.array([[thing.mover.frame(t)[:2, 3] for thing in movers] for t in np.arange(0, 120, 0.25)])
+        for i, first in enumerate(movers):
+            for j, second in enumerate(movers[:i]):
+                gap = np.linalg.norm(tracks[:, i] - tracks[:, j], axis=1).min()
+                assert gap > (0.7 if {first.label, second.label} <= {"person", "robot"} else 0.4), (seed, first.label)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("seed", [0, 3])
+def test_movers_keep_to_their_lanes(name: str, seed: int) -> None:
+    here = world(name, seed)
+    for lane in here.lanes:
+        thing = here.thing(lane.mover)
+        for t in np.arange(0, 45, 0.5):
+            at_table = isinstance(thing.mover, Person) and thing.mover.timeline.at(t)[0].sit != (0.0, 0.0)
+            if not at_table:
+                assert lane.holds(thing.vertices(t)[:, :2]), (thing.label, t)
+
+
+@pytest.mark.parametrize(
+    ("name", "seed"), [("office", 0), ("office", 2), ("office", 5), ("table_top", 1), ("corridor", 0)]
+)
+def test_persons_pass_through_no_furniture(name: str, seed: int) -> None:
+    """Not one edge of a body meets a triangle of what stands still, except of the chair that it sits on."""
+    here = world(name, seed)
+    seats = {p.relation.object for p in here.placements if p.relation.predicate == "sitting_on"}
+    obstacles = [thing for thing in here.objects() if thing.still and thing.id not in seats]
+    o3d = open3d()
+    scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+    ids = {}
+    for thing in obstacles:
+        triangles = o3d.core.Tensor(triangles_of(thing).astype(np.uint32))
+        ids[int(scene.add_triangles(o3d.core.Tensor(thing.vertices(0.0).astype(np.float32)), triangles))] = thing
+    for person in (thing for thing in here.objects() if thing.label == "person"):
+        ends = triangles_of(person)
+        edges = np.unique(np.sort(np.concatenate([ends[:, [0, 1]], ends[:, [1, 2]], ends[:, [2, 0]]]), axis=1), axis=0)
+        for t in np.arange(0, person.mover.timeline.period, 0.4):  # type: ignore[attr-defined]
+            a, b = person.vertices(t)[edges].transpose(1, 0, 2)
+            hits = scene.cast_rays(o3d.core.Tensor(np.concatenate([a, b - a], axis=1).astype(np.float32)), nthreads=1)
+            met = hits["geometry_ids"].numpy()[hits["t_hit"].numpy() < 1]
+            assert not len(met), (t, {f"{ids[int(k)].label} {ids[int(k)].id}" for k in met})
+
+
+def triangles_of(thing: Thing) -> np.ndarray:
+    """Corners (T, 3) of a thing's triangles as indices into its vertices."""
+    patches = [patch for part in thing.parts for patch in part]
+    firsts = np.cumsum([0, *(len(patch.vertices) for patch in patches)])
+    return np.concatenate([patch.triangles + first for patch, first in zip(patches, firsts, strict=False)])
 
 
 @pytest.mark.parametrize("name", NAMES)

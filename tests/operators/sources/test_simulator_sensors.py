@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.messages import Message
-from dataflow.messages.geometry import invert, transform_points
+from dataflow.messages.geometry import invert, transform_matrix, transform_points
 from operators.sources import SimulatedRobot
 from operators.sources.simulator import color, depth, radar
 from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
@@ -185,6 +185,39 @@ def test_the_stereo_pair_sees_points_at_the_disparity_of_their_depth() -> None:
     assert np.median(apart) < 0.5 * np.median(unshifted)
 
 
+def placed(source: SimulatedRobot) -> dict[str, Array]:
+    """`T_parent_child` (4, 4) of the extrinsics by child."""
+    message: Any = source.static_outputs()["extrinsics"]
+    return dict(zip(message.child_frames, transform_matrix(message.translations, message.rotations), strict=True))
+
+
+def test_the_depth_camera_can_be_turned_in_the_colour_camera() -> None:
+    on = {"color_camera": {"rate": 1}, "stereo": {"rate": 1}}
+    plain = placed(robot(**on, depth_camera={"rate": 1}))
+    turned = placed(robot(**on, depth_camera={"rate": 1, "offset": [0.03, 0, 0.01], "rotation": [0.1, -0.2, 0.3]}))
+    np.testing.assert_allclose(
+        invert(plain["camera_depth_optical"]) @ turned["camera_depth_optical"],
+        mounted((0.03, 0, 0.01, 0.1, -0.2, 0.3)), atol=1e-9,
+    )  # fmt: skip
+    np.testing.assert_allclose(
+        turned["camera_depth_optical"] @ turned["camera_color_optical"], plain["stereo_left_optical"], atol=1e-9
+    )
+
+
+def test_the_stereo_pair_sees_from_its_own_mount() -> None:
+    mount = (0.2, -0.1, 0.9, 0.05, 0.1, 0.4)
+    size = {"width": 64, "height": 48}
+    clean = {"read_noise": 0, "shot_noise": 0}
+    source = robot(
+        duration="100ms",
+        color_camera={"rate": 10, "mount": mount, "exposure_change": 0, **size, **clean},
+        stereo={"rate": 10, "color": True, "mount": mount, **size, **clean},
+    )
+    np.testing.assert_allclose(placed(source)["stereo_left_optical"], mounted(mount) @ BODY_TO_OPTICAL, atol=1e-9)
+    step: Any = next(iter(source.stream()))
+    np.testing.assert_array_equal(step["left"].data, step["image"].data)
+
+
 def test_a_moving_lidar_says_when_it_measured() -> None:
     (cloud,) = stream(robot(duration="200ms", lidar={"rate": 5, "columns": 60, "rings": 2, "motion": True}), "points")
     assert cloud.time_offsets.min() >= -0.2  # type: ignore[attr-defined]
@@ -269,6 +302,36 @@ def test_wheel_ticks_are_the_way_each_wheel_rolls() -> None:
     last: Any = stream(source, "wheel_ticks")[-1]
     np.testing.assert_allclose(last.ticks, expected, atol=1.5)
     assert last.names == ("left", "right")
+
+
+def test_wheel_odometry_has_the_true_rate_from_its_first_message() -> None:
+    source = robot(duration="100ms", wheels={"rate": 20, "scale_error": 0, "slip": 0})
+    true = source._stage.world.path.at([0.0])
+    first: Any = stream(source, "wheel_odometry")[0]
+    assert true.speed()[0] > 0.2
+    assert first.linear[0] == pytest.approx(true.speed()[0], rel=1e-6)
+    assert first.angular[2] == pytest.approx(true.yaw_rate[0], rel=1e-6)
+    np.testing.assert_array_equal(first.position, 0)
+
+
+def test_the_first_wheel_rate_errs_as_later_ones_do() -> None:
+    path, rates = Trajectory(SQUARE, speed=0.5), []
+    for seed in range(200):
+        model = WheelModel(Wheels(rate=10, scale_error=0, slip=0.02, ticks_per_turn=1 << 20), seed)
+        rng = np.random.default_rng(seed)
+        measured: list[Any] = [model.measure(path, k * 0.1, rng, k, "odom", "base")[1] for k in range(4)]
+        rates.append([message.linear[0] for message in measured])
+    spread = np.std(rates, axis=0)
+    np.testing.assert_allclose(spread[0], spread[1:].mean(), rtol=0.2)
+
+
+def test_a_wheel_with_a_bias_counts_too_much_by_that_share() -> None:
+    quiet = {"rate": 10, "scale_error": 0, "slip": 0}
+    ends: list[Any] = [
+        stream(robot(duration="5s", wheels={**quiet, **bias}), "wheel_ticks")[-1]
+        for bias in ({}, {"bias": [0.05, -0.02]})
+    ]
+    np.testing.assert_allclose(ends[1].ticks / ends[0].ticks, [1.05, 0.98], atol=1e-3)
 
 
 def test_wheel_errors_are_as_large_as_stated() -> None:

@@ -16,12 +16,14 @@ from dataflow.messages.geometry import invert, quaternion_to_matrix, transform_p
 from operators.sources import SimulatedRobot
 from operators.sources.simulator.classes import ACTIVITIES, THINGS
 from operators.sources.simulator.furnishing import FLOOR
+from operators.sources.simulator.furniture import rover
 from operators.sources.simulator.movers import Carried, Person
 from operators.sources.simulator.relations import PLACEMENT, SPATIAL
 from operators.sources.simulator.renderer import Optics, Renderer
 from operators.sources.simulator.scene import Builder, Light, Still, World
-from operators.sources.simulator.shapes import Material, box, pose
+from operators.sources.simulator.shapes import Material, bounds, box, pose
 from operators.sources.simulator.trajectory import Trajectory
+from operators.sources.simulator.truth import masks
 from operators.sources.simulator.worlds import NAMES, make_world
 
 WORLDS = ("office", "table_top")
@@ -158,6 +160,27 @@ def test_the_visible_share_is_that_of_the_whole_object(places: list[tuple[float,
     seen = (renderer.view(LOOKING, WIDE, color=False).instances == 1).sum()
     (alone,) = renderer.silhouette([1], LOOKING, WIDE)
     assert seen / alone == pytest.approx(share, abs=0.06)
+
+
+def test_a_pixel_that_shows_nothing_is_void() -> None:
+    builder = Builder()
+    builder.surface("floor", box((1, 1, 0.1), Material("plain"), center=(0, 0, -5)))
+    builder.put("box", box((0.4, 0.4, 0.4), Material("plain")), pose(2.0, 0, 0.8), on=FLOOR)
+    world = replace(simple_world(), things=tuple(builder.things))
+    view = Renderer(world, 0).view(LOOKING, WIDE, color=False)
+    message = masks(view, 0, "camera")
+    assert message.instances is not None
+    nothing = ~np.isfinite(view.depth)
+    assert 0 < nothing.sum() < nothing.size
+    assert (message.classes[nothing] == message.void).all()
+    assert (message.instances[nothing] == 0).all()
+    assert (message.classes[~nothing] == THINGS.index("box")).all()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_robot_stands_on_the_floor(seed: int) -> None:
+    low, _ = bounds(rover(np.random.default_rng(seed)))
+    assert low[2] == pytest.approx(0, abs=1e-3)
 
 
 def test_relations_use_known_words_and_objects(steps: list[dict[str, Any]]) -> None:
