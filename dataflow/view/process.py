@@ -52,10 +52,10 @@ def start(arguments: Sequence[str], ports: Sequence[int], *, outlive: bool) -> s
     `outlive`: it stays when this process ends (a window that somebody looks at); otherwise, on Linux, the kernel ends
     it with this process, however that dies.
     """
+    command = [str(executable()), "--bind", LOOPBACK, *arguments]
     taken = [port for port in ports if listening(port)]
     if taken:
         raise ViewerError(f"port {taken[0]} of {LOOPBACK} is in use: another viewer? Choose another port")
-    command = [str(executable()), "--bind", LOOPBACK, *arguments]
     child = subprocess.Popen(
         command,
         stdin=subprocess.DEVNULL,
