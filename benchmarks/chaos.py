@@ -1,6 +1,6 @@
 """Live runs under fault plans with different seeds, each verified in another placement than it ran in.
 
-usage: python benchmarks/chaos.py [--runs 50] [--first 1] [--duration 5s]
+usage: python benchmarks/chaos.py [--runs 50] [--first 1] [--duration 10s]
 
 Every run: graphs/chaos/robot.yaml live with cameras at 20 Hz, in one host or a host each by turns, with the faults of
 benchmarks/chaos_plan.yaml, another seed each. In one host operators fail instead of being killed: that would kill the
@@ -72,7 +72,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=50, help="how many seeds")
     parser.add_argument("--first", type=int, default=1, help="the first seed")
-    parser.add_argument("--duration", default="5s", help="event time of a run")
+    parser.add_argument("--duration", default="10s", help="event time of a run")
     arguments = parser.parse_args()
     started = time.monotonic()
     print(COLUMNS)
