@@ -57,9 +57,18 @@ class SourceRunner:
         return None if self._next is None else step_stamp(self._next)
 
     def take(self) -> dict[str, Message] | None:
-        """The next step without emitting it, None at the end: for the thread that reads a source in a live run."""
+        """The next step without emitting it, None at the end: for the thread that reads a source in a live run.
+
+        What counts as work is that thread's CPU time: a device is mostly waited for.
+        """
         step, self._next = self._next, None
-        return self.pull() if step is None else step
+        if step is not None:
+            return step
+        started = time.thread_time_ns()
+        try:
+            return self.pull()
+        finally:
+            self.busy_ns += time.thread_time_ns() - started
 
     def pull(self) -> dict[str, Message] | None:
         """Reads the source's next non-empty step; for live sources called on the reader's own thread."""

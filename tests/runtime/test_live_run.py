@@ -9,8 +9,11 @@ import pytest
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.runtime.execute import run
+from dataflow.runtime.firings import FiringRecord
 from dataflow.runtime.reexecute import recorded_firings
+from dataflow.runtime.source import SourceRunner
 from dataflow.runtime.verify import verify
+from dataflow.sync import Entry
 
 HERE = Path(__file__).resolve().parent
 
@@ -38,3 +41,32 @@ def test_live_runs_do_differ_from_each_other_so_verification_says_something(tmp_
     digests = {run(graph, live=True, placement="one_host").streams["test/slow/mean"] for _ in range(3)}
 
     assert len(digests) > 1
+
+
+def test_what_a_source_computes_counts_as_its_work() -> None:
+    """In a live run it is read by a thread of its own."""
+    graph = load_graph(HERE / "live.yaml", settings=["count=60"], live=True)
+    source = SourceRunner(graph.nodes["left"], Outlets(), live=True)
+    source.setup()
+    assert source.busy_ns == 0
+
+    while source.take() is not None:
+        pass
+
+    assert source.busy_ns > 0
+
+
+class Outlets:
+    """Takes everything that a runner gives, and leaves it."""
+
+    def message(self, stream: str, entry: Entry) -> None:
+        pass
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        pass
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        pass
+
+    def record(self, record: FiringRecord) -> None:
+        pass
