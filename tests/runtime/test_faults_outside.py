@@ -18,11 +18,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from background_run import Background
 
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
 from dataflow.runtime.attach import find_running
-from dataflow.runtime.execute import run
 from dataflow.runtime.live import LiveSupervisor
 from dataflow.runtime.plan import RunPlan
 from dataflow.runtime.reexecute import recorded_firings
@@ -117,23 +117,6 @@ def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_p
 
 
 # A viewer that dies
-
-
-class Background:
-    """A run on a thread of its own."""
-
-    def __init__(self, graph: Graph, **options: Any) -> None:
-        self.report: RunReport | None = None
-        self.thread = threading.Thread(target=self._run, args=(graph, options))
-        self.thread.start()
-
-    def _run(self, graph: Graph, options: dict[str, Any]) -> None:
-        self.report = run(graph, **options)
-
-    def end(self) -> RunReport:
-        self.thread.join(60)
-        assert self.report is not None
-        return self.report
 
 
 def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:

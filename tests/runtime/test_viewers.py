@@ -6,36 +6,18 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from pathlib import Path
 
 import pytest
+from background_run import Background
 from tests_runtime_graphs import chain
 
 from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.runtime.attach import NotRunning, find_running, graph_of, still_runs, tap
 from dataflow.runtime.execute import run
-from dataflow.runtime.report import RunReport
 
 HERE = Path(__file__).resolve().parent
-
-
-class Background:
-    """A run on a thread of its own, that tools can attach to."""
-
-    def __init__(self, graph: Graph, **options: object) -> None:
-        self.report: RunReport | None = None
-        self.thread = threading.Thread(target=self._run, args=(graph, options))
-        self.thread.start()
-
-    def _run(self, graph: Graph, options: dict[str, object]) -> None:
-        self.report = run(graph, **options)
-
-    def end(self) -> RunReport:
-        self.thread.join(60)
-        assert self.report is not None
-        return self.report
 
 
 @pytest.fixture(autouse=True)

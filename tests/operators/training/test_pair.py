@@ -23,13 +23,6 @@ from operators.training.pair import PairTask  # noqa: E402
 SIZE = (160, 128)
 
 
-@pytest.fixture(scope="module")
-def worlds(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "worlds"
-    simulated_worlds.main([str(folder), "--worlds", "1", "--validation", "1", "--frames", "4"])
-    return folder
-
-
 def pair(folder: Path, variation: Variation | None = None) -> PairTask:
     boxes, masks = read_detection_data(folder, 0), read_segmentation_data(folder, 0)
     return PairTask(boxes, masks, SIZE, width=0.25, variation=variation)

@@ -15,7 +15,6 @@ pytest.importorskip("torch", reason="training needs the extra [train]")
 from dataflow.cli.main import app
 from operators.detection.custom.dataset import read_detection_data
 from operators.segmentation.dataset import read_segmentation_data
-from operators.training import simulated_worlds
 from operators.training.loop import Settings, train
 from operators.training.pair import PairTask
 from operators.training.quantization import quantize_network
@@ -25,31 +24,24 @@ SIZE = (160, 128)
 
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("data") / "worlds"
-    simulated_worlds.main([str(folder), "--worlds", "1", "--validation", "1", "--frames", "4"])
-    return folder
-
-
-@pytest.fixture(scope="module")
-def trained(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(worlds: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with detector.onnx and segmenter.onnx."""
     folder = tmp_path_factory.mktemp("networks")
-    task = PairTask(read_detection_data(data), read_segmentation_data(data), SIZE, width=0.25)
+    task = PairTask(read_detection_data(worlds), read_segmentation_data(worlds), SIZE, width=0.25)
     train(task, Settings(epochs=2, batch=4, threads=1), folder / "pair.onnx")
     return folder
 
 
-def views(data: Path) -> list[NDArray[np.uint8]]:
-    return [image.read() for image in read_detection_data(data).training]
+def views(worlds: Path) -> list[NDArray[np.uint8]]:
+    return [image.read() for image in read_detection_data(worlds).training]
 
 
 @pytest.mark.parametrize("kind", ["detector", "segmenter"])
 def test_the_answers_differ_little_and_keep_their_precision(
-    trained: Path, data: Path, tmp_path: Path, kind: str
+    trained: Path, worlds: Path, tmp_path: Path, kind: str
 ) -> None:
     file, out = trained / f"{kind}.onnx", tmp_path / "small.onnx"
-    quantize_network(file, views(data), out)
+    quantize_network(file, views(worlds), out)
     assert out.stat().st_size < file.stat().st_size
     assert read_facts(out) == read_facts(file) | {"arithmetic": "int8", "calibration_images": 4}
     image = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
@@ -62,28 +54,28 @@ def test_the_answers_differ_little_and_keep_their_precision(
             assert (before == after).mean() > 0.9
 
 
-def test_the_same_images_give_the_same_bytes(trained: Path, data: Path, tmp_path: Path) -> None:
+def test_the_same_images_give_the_same_bytes(trained: Path, worlds: Path, tmp_path: Path) -> None:
     for name in ("a.onnx", "b.onnx"):
-        quantize_network(trained / "detector.onnx", views(data), tmp_path / name)
+        quantize_network(trained / "detector.onnx", views(worlds), tmp_path / name)
     assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
 
 
-def test_what_cannot_be_done_is_said_and_leaves_no_file(trained: Path, data: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_done_is_said_and_leaves_no_file(trained: Path, worlds: Path, tmp_path: Path) -> None:
     small = tmp_path / "small.onnx"
     with pytest.raises(ValueError, match="measured on images, and there is none"):
         quantize_network(trained / "detector.onnx", [], small)
     with pytest.raises(FileNotFoundError, match=r"absent\.onnx"):
-        quantize_network(tmp_path / "absent.onnx", views(data), small)
+        quantize_network(tmp_path / "absent.onnx", views(worlds), small)
     assert not list(tmp_path.iterdir())
-    quantize_network(trained / "detector.onnx", views(data), small)
+    quantize_network(trained / "detector.onnx", views(worlds), small)
     with pytest.raises(NetworkFileError, match="in 8 bits already; give the file that training wrote"):
-        quantize_network(small, views(data), tmp_path / "smaller.onnx")
+        quantize_network(small, views(worlds), tmp_path / "smaller.onnx")
     assert list(tmp_path.iterdir()) == [small]
 
 
 @pytest.mark.parametrize(("kind", "score"), [("detector", "ap50"), ("segmenter", "miou")])
-def test_the_command_scores_both_files(trained: Path, data: Path, tmp_path: Path, kind: str, score: str) -> None:
-    arguments = ["train", "quantize", str(trained / f"{kind}.onnx"), str(data), "--out", str(tmp_path / "small.onnx")]
+def test_the_command_scores_both_files(trained: Path, worlds: Path, tmp_path: Path, kind: str, score: str) -> None:
+    arguments = ["train", "quantize", str(trained / f"{kind}.onnx"), str(worlds), "--out", str(tmp_path / "small.onnx")]
     result = CliRunner().invoke(app, [*arguments, "--images", "2", "--json"])
     assert result.exit_code == 0, result.output
     compared = json.loads(result.stdout)["files"]
