@@ -200,6 +200,7 @@ class SinkHost:
         """
         assert self.sink is not None
         batch = decode_batch(data)
+        last = batch.records[-1]
         following = self._recorded.get(batch.operator, (-1, 0))
         lacking = self._lacking.setdefault(batch.operator, set())
         places = [(r.incarnation, r.index) for r in batch.records]
@@ -210,7 +211,7 @@ class SinkHost:
         lacking.difference_update(places)
         self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
         for part in consecutive(fresh):
-            self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last))
+            self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last and part[-1] is last))
         return batch.last
 
     def _note_taken(self, operator: str, stamp: int) -> None:
