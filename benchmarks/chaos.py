@@ -20,12 +20,12 @@ from pathlib import Path
 
 from ruamel.yaml import YAML
 
+from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.chaos import plan_of
-from dataflow.runtime.execute import run
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.verify import verify
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision.run import run
+from dataflow.verification.verify import verify
 
 ROOT = Path(__file__).resolve().parent.parent
 GRAPH, PLAN = ROOT / "graphs" / "chaos" / "robot.yaml", ROOT / "benchmarks" / "chaos_plan.yaml"

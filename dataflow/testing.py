@@ -10,12 +10,12 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dataflow.firing.runner import OperatorRunner
+from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Live, Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator, Source
-from dataflow.runtime.firings import FiringRecord
-from dataflow.runtime.runner import OperatorRunner
-from dataflow.runtime.source import SourceRunner
+from dataflow.records.firing import FiringRecord
 from dataflow.sync import Entry
 
 NAMESPACE = "test"

@@ -27,8 +27,8 @@ from dataflow.cli.output import DIFFERENT, INTERRUPTED, err, fail, friendly_erro
 if TYPE_CHECKING:
     from dataflow.graph import Graph
     from dataflow.recording import Recording
-    from dataflow.runtime.execute import Watch
-    from dataflow.runtime.report import RunReport
+    from dataflow.supervision.report import RunReport
+    from dataflow.supervision.run import Watch
 
 _PLACEMENT, _OUTPUT = "Placement", "Results"
 
@@ -160,9 +160,9 @@ def run(
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
+    from dataflow.chaos.plan import load_plan
     from dataflow.graph import load_graph
-    from dataflow.runtime.chaos import load_plan
-    from dataflow.runtime.execute import run as run_graph
+    from dataflow.supervision.run import run as run_graph
 
     with friendly_errors():
         if chaos_seed is not None and chaos is None:
@@ -236,8 +236,9 @@ def replay(
     """
     from dataflow.graph import load_graph
     from dataflow.recording import Recording
-    from dataflow.runtime.execute import replay as replay_recording
-    from dataflow.runtime.replay import plan_replay, recorded_graph
+    from dataflow.reexecution.recorded_run import recorded_graph
+    from dataflow.supervision.replay import plan_replay
+    from dataflow.supervision.run import replay as replay_recording
 
     with friendly_errors():
         existing(recording, "a recording")
@@ -282,7 +283,7 @@ def replay(
 
 def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
     """With --start: which operators cannot have the state they had then."""
-    from dataflow.runtime.warmup import fresh_because
+    from dataflow.reexecution.warm_start import fresh_because
 
     for node in graph.nodes.values():
         if not node.source and (reason := fresh_because(recording, graph, node)) is not None:
@@ -292,7 +293,7 @@ def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
 def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.verdicts import print_completion
-    from dataflow.runtime.completion import complete
+    from dataflow.verification.complete import complete
 
     if file.exists() and file.samefile(recording):
         raise fail(f"--complete {file} is the recording that is to be completed; name another file")
@@ -378,7 +379,7 @@ def _execute(
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.report import print_report, report_json
     from dataflow.cli.viewing import attached_viewer, open_saved
-    from dataflow.runtime.report import RunFailed
+    from dataflow.supervision.report import RunFailed
 
     before = {file: _written(file) for file in (outputs.record, outputs.view_file) if file is not None}
     display = RunDisplay(err, sources=[node.name for node in graph.sources()], span=shown_span)

@@ -52,7 +52,7 @@ HISTORY = 2000
 
 def running_graph(name: str | None, wait: float) -> RunningGraph:
     """The running graph of that name, or the only one; says so when it has to wait. Raises `NotRunning`."""
-    from dataflow.runtime.attach import NotRunning, find_running
+    from dataflow.client.attach import NotRunning, find_running
 
     if not 0 <= wait < 1e9:
         raise fail(f"--wait {wait:g}: expected seconds, 0 or more")
@@ -68,7 +68,7 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
 @contextmanager
 def tapped(streams: list[str] | None, name: str | None, wait: float) -> Iterator[tuple[RunningGraph, TapClient]]:
     """The running graph, and a lossy copy of those of its streams that were asked for."""
-    from dataflow.runtime.attach import graph_of, tap
+    from dataflow.client.attach import graph_of, tap
 
     found = running_graph(name, wait)
     graph = graph_of(found)
@@ -85,7 +85,7 @@ def list_running(json: Json = False) -> None:
       dataflow list
       dataflow list --json
     """
-    from dataflow.runtime.attach import graph_of
+    from dataflow.client.attach import graph_of
     from dataflow.transport.registry import running
 
     with friendly_errors():
@@ -114,7 +114,7 @@ def list_running(json: Json = False) -> None:
 
 
 def _listed(found: RunningGraph) -> dict[str, Any]:
-    from dataflow.runtime.attach import graph_of
+    from dataflow.client.attach import graph_of
 
     graph = graph_of(found)
     return {
@@ -150,7 +150,7 @@ def echo(
       dataflow echo "camera/*" -n 10
       dataflow echo odometry/odometry --json | jq .position
     """
-    from dataflow.runtime.attach import still_runs
+    from dataflow.client.attach import still_runs
 
     if limit is not None and limit < 1:
         raise fail(f"--count {limit}: expected 1 or more")
@@ -271,7 +271,7 @@ def hz(
     """
     from rich.live import Live
 
-    from dataflow.runtime.attach import still_runs
+    from dataflow.client.attach import still_runs
 
     if duration is not None and not 0 < duration < 1e9:
         raise fail(f"--seconds {duration:g}: expected seconds, more than 0")

@@ -106,14 +106,14 @@ def friendly_errors() -> Iterator[None]:
 
 def _explained(error: Exception) -> tuple[str, str, int] | None:
     """(message, details, exit code) of an error that users can do something about; None for a bug."""
+    from dataflow.chaos.plan import ChaosError
+    from dataflow.client.attach import NotRunning
     from dataflow.graph import GraphError, OperatorImportError
     from dataflow.messages import MessageError
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
-    from dataflow.runtime.attach import NotRunning
-    from dataflow.runtime.chaos import ChaosError
-    from dataflow.runtime.replay import ReplayError
-    from dataflow.runtime.report import RunFailed
+    from dataflow.reexecution.recorded_run import ReplayError
+    from dataflow.supervision.report import RunFailed
     from dataflow.transport.registry import RegistryError
 
     known = (

@@ -13,8 +13,8 @@ from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, say, table
 
 if TYPE_CHECKING:
+    from dataflow.client.processes import Parameter
     from dataflow.graph import Graph
-    from dataflow.runtime.inquiry import Parameter
 
 Timeout = Annotated[float, typer.Option("--timeout", metavar="SECONDS", help="Wait so long for an answer.")]
 
@@ -39,7 +39,7 @@ def set_(
       dataflow param set detector.score_threshold 0.5
       dataflow param set front/cloud.stride 4 --graph two_cameras
     """
-    from dataflow.runtime.inquiry import NoAnswer, Refused, hosts_of
+    from dataflow.client.processes import NoAnswer, Refused, hosts_of
 
     _check(timeout)
     with friendly_errors():
@@ -143,7 +143,7 @@ def _check(timeout: float) -> None:
 
 
 def _graph(found: Any) -> Graph:
-    from dataflow.runtime.attach import graph_of
+    from dataflow.client.attach import graph_of
 
     return graph_of(found)
 
@@ -181,7 +181,7 @@ def _asked(
     word: str | None, name: str | None, wait: float, timeout: float
 ) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
     """The operators that were asked, the parameter (or none), and what they answered."""
-    from dataflow.runtime.inquiry import hosts_of
+    from dataflow.client.processes import hosts_of
 
     _check(timeout)
     found = running_graph(name, wait)

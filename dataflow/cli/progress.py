@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from dataflow.cli.output import count, seconds
-from dataflow.runtime.execute import Watch
-from dataflow.runtime.report import OperatorCounts, Status
+from dataflow.supervision.report import OperatorCounts, Status
+from dataflow.supervision.run import Watch
 from dataflow.sync import FOREVER, NEVER
 
 RATE_OVER = 0.8

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dataflow.cli.output import count, figure, plural, seconds, size, table
-from dataflow.runtime.report import RunReport
+from dataflow.supervision.report import RunReport
 
 _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""

@@ -16,7 +16,7 @@ from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import INTERRUPTED, count, err, fail, friendly_errors, out, print_json, seconds
 
 if TYPE_CHECKING:
-    from dataflow.runtime.inquiry import HostStatus
+    from dataflow.client.processes import HostStatus
 
 ANSWER_WITHIN = 1.0
 """Seconds after which a host counts as silent."""
@@ -62,7 +62,7 @@ class Board:
 
     def update(self, statuses: Sequence[HostStatus], now: float) -> list[Row]:
         """`now`: seconds, never going back."""
-        from dataflow.runtime.health import HealthMonitor
+        from dataflow.supervision.health import HealthMonitor
 
         if self._monitor is None:
             self._monitor = HealthMonitor()
@@ -128,8 +128,8 @@ def top(
     """
     from rich.live import Live
 
-    from dataflow.runtime.attach import graph_of, still_runs
-    from dataflow.runtime.inquiry import hosts_of
+    from dataflow.client.attach import graph_of, still_runs
+    from dataflow.client.processes import hosts_of
 
     if not 0.05 <= every < 1e6:
         raise fail(f"--every {every:g}: expected seconds, 0.05 or more")

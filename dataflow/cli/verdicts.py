@@ -9,12 +9,12 @@ from rich.text import Text
 
 from dataflow.cli.output import count, plural, seconds, size, table
 from dataflow.recording.diff import FieldDifference
-from dataflow.runtime.completion import Completion
-from dataflow.runtime.gate import Checked, Judged
-from dataflow.runtime.outputs import OutputComparison
-from dataflow.runtime.reexecute import Difference, Verification
-from dataflow.runtime.verify import VerifyReport
+from dataflow.reexecution.recorded import Difference, Verification
 from dataflow.sync.stamps import format_stamp
+from dataflow.verification.compare import OutputComparison
+from dataflow.verification.complete import Completion
+from dataflow.verification.gate import Checked, Judged
+from dataflow.verification.verify import VerifyReport
 
 STYLES = {
     "identical": "green",

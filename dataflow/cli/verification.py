@@ -25,8 +25,8 @@ from dataflow.cli.output import (
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dataflow.runtime.gate import Baseline, Checked
-    from dataflow.runtime.verify import VerifyReport
+    from dataflow.verification.gate import Baseline, Checked
+    from dataflow.verification.verify import VerifyReport
 
 _GATE = "Regression gate"
 
@@ -112,7 +112,7 @@ def verify(
       dataflow verify runs/ --baseline runs/accepted.json --accept
     """
     from dataflow.graph import load_graph
-    from dataflow.runtime.gate import Baseline, BaselineError, recordings_in
+    from dataflow.verification.gate import Baseline, BaselineError, recordings_in
 
     with friendly_errors():
         if one_host and host_each:
@@ -161,7 +161,7 @@ def verify(
 def _check(
     targets: list[tuple[Path, str]], known: Baseline | None, options: dict[str, Any], *, quiet: bool, single: bool
 ) -> list[Checked]:
-    from dataflow.runtime.gate import check
+    from dataflow.verification.gate import check
 
     checked = []
     for number, (path, name) in enumerate(targets, start=1):
@@ -178,7 +178,7 @@ def _check(
 
 def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], VerifyReport]:
     from dataflow.cli.progress import RunDisplay, shown
-    from dataflow.runtime.verify import verify as verify_recording
+    from dataflow.verification.verify import verify as verify_recording
 
     def verifier(path: Path) -> VerifyReport:
         with shown(err, RunDisplay(err), quiet=quiet) as watch:

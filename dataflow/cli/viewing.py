@@ -104,7 +104,7 @@ def _view_recording(
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dataflow.recording import Recording
-    from dataflow.runtime.replay import ReplayError, recorded_graph
+    from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
     from dataflow.view import Serve, from_recording
 
     with Recording(path) as opened:
@@ -177,8 +177,8 @@ class _Announcer:
 def _view_running(
     sink: ViewerSink, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool
 ) -> None:
+    from dataflow.client.attach import graph_of, still_runs, tap
     from dataflow.messages import message_type
-    from dataflow.runtime.attach import graph_of, still_runs, tap
     from dataflow.view import Serve
 
     found = running_graph(name, wait)

@@ -9,6 +9,11 @@ from typing import Final
 FORMAT: Final = "1"
 RECORDING: Final = "recording"
 DIGESTS: Final = "digests"
+GRAPH: Final = "dataflow:graph"
+RUN: Final = "dataflow:run"
+ENDS: Final = "dataflow:ends"
+OUTCOME: Final = "dataflow:outcome"
+COMPLETED: Final = "dataflow:completed"
 RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})
 COMPANION_SUFFIX: Final = "/@companion"
 SEQUENCE_SPAN: Final = 2**32

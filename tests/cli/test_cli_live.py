@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
+from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
-from dataflow.runtime.attach import find_running
-from dataflow.runtime.plan import RunPlan
-from dataflow.runtime.supervisor import Supervisor
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.supervisor import Supervisor
 
 
 class Background:

@@ -17,7 +17,7 @@ from dataflow.cli.arguments import chosen_streams, existing, output_file, window
 from dataflow.cli.output import figure, jsonable, plural, seconds, size
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report
-from dataflow.runtime.report import OperatorCounts, RunReport, Status
+from dataflow.supervision.report import OperatorCounts, RunReport, Status
 
 
 @pytest.mark.parametrize(

@@ -14,14 +14,14 @@ import psutil
 import pytest
 
 from dataflow.cli.top import Board, _table, _title
+from dataflow.client.attach import find_running
+from dataflow.client.processes import HostStatus
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.attach import find_running
-from dataflow.runtime.inquiry import HostStatus
-from dataflow.runtime.live import LiveSupervisor
-from dataflow.runtime.plan import RunPlan
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.report import RunReport
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision.live import LiveSupervisor
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.report import RunReport
 from dataflow.sync import NEVER
 
 GRAPH = """\

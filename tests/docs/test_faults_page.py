@@ -8,9 +8,9 @@ from itertools import islice
 from pathlib import Path
 from typing import get_args
 
+from dataflow.chaos import plan as chaos
 from dataflow.graph import load_graph
-from dataflow.runtime import chaos
-from dataflow.runtime.health import LEVELS
+from dataflow.supervision.health import LEVELS
 
 
 def page(repository: Path) -> str:

@@ -6,8 +6,8 @@ import threading
 from typing import Any
 
 from dataflow.graph import Graph
-from dataflow.runtime.execute import run
-from dataflow.runtime.report import RunReport
+from dataflow.supervision.report import RunReport
+from dataflow.supervision.run import run
 
 
 class Background:

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataflow.chaos.faults import SourceFaults
+from dataflow.chaos.plan import ChaosError, Fault, load_plan, plan_of
 from dataflow.graph import Graph, load_graph
 from dataflow.messages import FeatureVector, Message
-from dataflow.runtime.chaos import ChaosError, Fault, SourceFaults, load_plan, plan_of
 
 HERE = Path(__file__).resolve().parent
 KILL = {"kind": "kill", "operator": "smooth", "every": "700ms"}

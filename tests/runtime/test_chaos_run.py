@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
 from dataflow.messages import Diagnostics
+from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
-from dataflow.runtime.chaos import plan_of
-from dataflow.runtime.execute import run
-from dataflow.runtime.keys import diagnostics_key
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.verify import verify
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision.run import run
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 

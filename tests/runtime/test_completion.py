@@ -10,12 +10,12 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter, diff
 from dataflow.recording.layout import RESERVED_METADATA
-from dataflow.runtime.completion import complete
-from dataflow.runtime.execute import replay as replay_recording
-from dataflow.runtime.execute import run
-from dataflow.runtime.firings import decode_batch
-from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.verify import verify
+from dataflow.records.firing import decode_batch
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.run import replay as replay_recording
+from dataflow.supervision.run import run
+from dataflow.verification.complete import complete
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 SENSORS = tuple(f"test/{source}/{port}" for source in ("left", "right") for port in ("fast", "slow", "constant"))

@@ -16,11 +16,11 @@ from tests_runtime_graphs import chain
 
 from dataflow.graph import Graph
 from dataflow.recording import Recording
-from dataflow.runtime.live import supervisor_of
-from dataflow.runtime.plan import RunPlan
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.report import RunFailed
-from dataflow.runtime.supervisor import Supervisor
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision.live import supervisor_of
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.report import RunFailed
+from dataflow.supervision.supervisor import Supervisor
 
 HERE = Path(__file__).resolve().parent
 

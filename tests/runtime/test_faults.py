@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
+from dataflow.chaos.plan import plan_of
 from dataflow.graph import Graph, load_graph
 from dataflow.messages import Diagnostics
+from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
-from dataflow.runtime import live
-from dataflow.runtime.chaos import plan_of
-from dataflow.runtime.execute import run
-from dataflow.runtime.keys import diagnostics_key
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.report import RunFailed, RunReport
-from dataflow.runtime.verify import verify
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision import live
+from dataflow.supervision.report import RunFailed, RunReport
+from dataflow.supervision.run import run
+from dataflow.verification.verify import verify
 
 AGAIN = "restart: {max: 5, backoff: 20ms}"
 

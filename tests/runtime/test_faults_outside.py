@@ -20,14 +20,14 @@ from typing import Any
 import pytest
 from background_run import Background
 
+from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.attach import find_running
-from dataflow.runtime.live import LiveSupervisor
-from dataflow.runtime.plan import RunPlan
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.report import RunReport
-from dataflow.runtime.verify import verify
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision.live import LiveSupervisor
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.report import RunReport
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.runtime.firings import (
+from dataflow.records.firing import (
     DropRecord,
     Emission,
     FiringRecord,

@@ -7,7 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.runtime.gate import (
+from dataflow.reexecution.recorded import Difference, Verification
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.report import RunFailed
+from dataflow.verification.compare import OutputComparison
+from dataflow.verification.gate import (
     Baseline,
     BaselineError,
     Checked,
@@ -16,11 +20,7 @@ from dataflow.runtime.gate import (
     judge,
     recordings_in,
 )
-from dataflow.runtime.outputs import OutputComparison
-from dataflow.runtime.reexecute import Difference, Verification
-from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.report import RunFailed
-from dataflow.runtime.verify import VerifyReport
+from dataflow.verification.verify import VerifyReport
 
 Outcomes = dict[str, str | None]
 """Operator → what came out otherwise (any word), None for nothing."""

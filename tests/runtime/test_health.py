@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dataflow.messages import Diagnostics, Level
-from dataflow.runtime.health import SILENT_AFTER, Health, HealthMonitor, diagnostics_fields
-from dataflow.runtime.sink import _diagnostics
+from dataflow.process.sink import _diagnostics
+from dataflow.supervision.health import SILENT_AFTER, Health, HealthMonitor, diagnostics_fields
 
 Counts = dict[str, tuple[int, int, int, int]]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from dataflow.runtime.firings import WITHHELD, Emission, FiringRecord, encode_batch
-from dataflow.runtime.held import HeldRecords
+from dataflow.records.firing import WITHHELD, Emission, FiringRecord, encode_batch
+from dataflow.supervision.held_records import HeldRecords
 
 
 def param(index: int, name: str, value: object, incarnation: int = 0) -> bytes:

@@ -10,14 +10,13 @@ import pytest
 
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.recording.layout import RESERVED_METADATA
-from dataflow.runtime.completion import complete
-from dataflow.runtime.execute import run
-from dataflow.runtime.firings import FiringRecord, consecutive, encode_batch
-from dataflow.runtime.recorder import OUTCOME
-from dataflow.runtime.reexecute import Verification, recorded_firings
-from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.verify import VerifyReport, verify
+from dataflow.recording.layout import OUTCOME, RESERVED_METADATA
+from dataflow.records.firing import FiringRecord, consecutive, encode_batch
+from dataflow.reexecution.recorded import Verification, recorded_firings
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.run import run
+from dataflow.verification.complete import complete
+from dataflow.verification.verify import VerifyReport, verify
 
 HERE = Path(__file__).resolve().parent
 

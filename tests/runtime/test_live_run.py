@@ -6,14 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from dataflow.firing.source import SourceRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.execute import run
-from dataflow.runtime.firings import FiringRecord
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.source import SourceRunner
-from dataflow.runtime.verify import verify
+from dataflow.records.firing import FiringRecord
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.supervision.run import run
 from dataflow.sync import Entry
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
+from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.chaos import plan_of
-from dataflow.runtime.execute import replay, run
-from dataflow.runtime.reexecute import recorded_firings
-from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.verify import verify
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.run import replay, run
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 

@@ -13,7 +13,7 @@ from tests_runtime_graphs import chain
 
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.execute import replay, run
+from dataflow.supervision.run import replay, run
 
 HERE = Path(__file__).resolve().parent
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dataflow.firing.restarts import LONGEST_BACKOFF, MOST_DOUBLINGS, Restarts
 from dataflow.graph.model import Restart
-from dataflow.runtime.restarts import LONGEST_BACKOFF, MOST_DOUBLINGS, Restarts
 
 
 class Clock:

@@ -10,9 +10,9 @@ from tests_runtime_graphs import chain
 
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.runtime.execute import run
-from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.verify import VerifyReport, verify
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.run import run
+from dataflow.verification.verify import VerifyReport, verify
 
 HERE = Path(__file__).resolve().parent
 

@@ -9,13 +9,13 @@ import pytest
 
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, machine_facts
-from dataflow.runtime import verify as verification
-from dataflow.runtime.apart import apart
-from dataflow.runtime.execute import run
-from dataflow.runtime.outputs import compare_outputs
-from dataflow.runtime.replay import ReplayError
-from dataflow.runtime.report import RunFailed
-from dataflow.runtime.verify import VerifyReport, verify
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.report import RunFailed
+from dataflow.supervision.run import run
+from dataflow.verification import verify as verification
+from dataflow.verification.compare import compare_outputs
+from dataflow.verification.verify import VerifyReport, verify
+from dataflow.verification.worker import apart
 
 HERE = Path(__file__).resolve().parent
 SETTINGS = ["count=30"]

@@ -12,10 +12,10 @@ import pytest
 from background_run import Background
 from tests_runtime_graphs import chain
 
+from dataflow.client.attach import NotRunning, find_running, graph_of, still_runs, tap
 from dataflow.graph import Graph
 from dataflow.recording import Recording
-from dataflow.runtime.attach import NotRunning, find_running, graph_of, still_runs, tap
-from dataflow.runtime.execute import run
+from dataflow.supervision.run import run
 
 HERE = Path(__file__).resolve().parent
 

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
 from dataflow.messages.geometry import invert
-from dataflow.runtime.states import pack_state, unpack_state
 from operators.odometry import VisualOdometry, se3
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, Status, TrackResult

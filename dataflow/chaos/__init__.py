@@ -1,0 +1,1 @@
+"""Faults on purpose, planned by a seed."""

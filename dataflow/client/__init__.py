@@ -1,0 +1,1 @@
+"""Tools outside a running graph."""

@@ -1,0 +1,1 @@
+"""What puts messages into a graph: windows, sources, recordings."""

@@ -1,0 +1,171 @@
+"""A recording as a feed: its streams stand in for the sources that made them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+from dataflow.firing.runner import Emitter, Recorder
+from dataflow.messages.digest import StreamDigest
+from dataflow.recording import Recorded, Recording
+from dataflow.records.firing import Emission
+from dataflow.sync import NEVER, Entry
+
+
+@dataclass(slots=True)
+class _LoggedStream:
+    name: str
+    node: str
+    final: int
+    promised: int = NEVER
+    ended: bool = False
+    incarnation: int = 0
+    count: int = 0
+    digest: StreamDigest = field(default_factory=StreamDigest)
+
+
+class LogFeed:
+    """The recorded streams of a graph's sources, merged by (stamp, stream).
+
+    `streams` maps each stream to the node that made it. `finals` holds the stamps that streams ended with in the
+    recorded run, where known. `start` and `end` (ns, inclusive) cut the recording; static streams are always given.
+    Without `promises` nothing is said of stamps to come, so that they may go back, as after a jump of a clock: enough
+    for operators that are driven by their records.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        streams: Mapping[str, str],
+        emitter: Emitter,
+        *,
+        ports: Mapping[str, tuple[str, ...]],
+        finals: Mapping[str, int],
+        start: int | None = None,
+        end: int | None = None,
+        promises: bool = True,
+    ) -> None:
+        self.recording, self.emitter, self._promises = recording, emitter, promises
+        self._ports = ports
+        self._records = {node: Recorder(node, emitter) for node in sorted(set(streams.values()))}
+        self._static = {s for s in streams if recording.streams[s].static}
+        self._streams = {
+            name: _LoggedStream(name, node, self._final(name, finals, end))
+            for name, node in streams.items()
+            if name not in self._static
+        }
+        self._nodes = dict(streams)
+        self._messages = iter(recording.messages(streams=list(streams), start=start, end=end))
+        self._step: list[Recorded] = []
+        self._following: Recorded | None = None
+        self.last = NEVER
+        self.firings = 0
+        self.ended = False
+        self.busy_ns = 0
+        self.static_digests: dict[str, StreamDigest] = {}
+
+    def _final(self, name: str, finals: Mapping[str, int], end: int | None) -> int:
+        last = self.recording.streams[name].last
+        final = finals.get(name, last if last is not None else NEVER)
+        return final if end is None else min(final, end)
+
+    def setup(self) -> None:
+        """Gives the static streams, and ends the ones that hold nothing."""
+        emitted: dict[str, dict[str, Emission]] = {node: {} for node in self._records}
+        for item in self._messages:
+            if item.stream not in self._static:
+                self._following = item
+                break
+            digest = item.message.digest()
+            self.static_digests.setdefault(item.stream, StreamDigest()).update(digest)
+            entry = Entry(item.message.stamp, item.message, item.seq, item.incarnation, digest, item.stream)
+            self.emitter.message(item.stream, entry)
+            emitted[self._nodes[item.stream]][item.stream] = Emission(item.seq, item.message.stamp, digest)
+        for stream in sorted(self._static):
+            self.emitter.end(stream, None, "static")
+        for node, records in self._records.items():
+            outputs = tuple(emitted[node].get(stream) for stream in self._ports[node])
+            records.add("setup", NEVER + 1, time.time_ns(), outputs=outputs, detail={"replayed": True})
+
+    def look_ahead(self) -> int | None:
+        if not self._step and not self.ended:
+            started = time.time_ns()
+            first = self._following or next(self._messages, None)
+            self._following = None
+            if first is not None:
+                self._step.append(first)
+                for item in self._messages:
+                    if item.message.stamp != first.message.stamp:
+                        self._following = item
+                        break
+                    self._step.append(item)
+            self.busy_ns += time.time_ns() - started
+        return self._step[0].message.stamp if self._step else None
+
+    def admit(self) -> tuple[int, int]:
+        step, self._step = self._step, []
+        stamp = step[0].message.stamp
+        self._end_before(stamp)
+        by_node: dict[str, dict[str, Emission]] = {}
+        nbytes = 0
+        for item in step:
+            state = self._streams[item.stream]
+            digest = item.message.digest()
+            state.digest.update(digest)
+            state.count += 1
+            state.promised, state.incarnation = stamp, item.incarnation
+            nbytes += item.message.nbytes()
+            self.emitter.message(
+                item.stream, Entry(stamp, item.message, item.seq, item.incarnation, digest, item.stream)
+            )
+            by_node.setdefault(state.node, {})[item.stream] = Emission(item.seq, stamp, digest)
+        self.last = stamp
+        self.firings += 1
+        started = time.time_ns()
+        for node, emitted in by_node.items():
+            self._records[node].add("fire", stamp, started, outputs=tuple(emitted.get(s) for s in self._ports[node]))
+        return len(step), nbytes
+
+    def promise(self) -> None:
+        """Every stream of a log is known up to the last stamp that was read, so sparse streams hold nobody up."""
+        if not self._promises:
+            return
+        self._end_before(self.last)
+        for state in self._streams.values():
+            if not state.ended and state.promised < self.last:
+                state.promised = self.last
+                self.emitter.frontier(state.name, self.last)
+
+    def _end_before(self, stamp: int) -> None:
+        if not self._promises:
+            return
+        for state in self._streams.values():
+            if not state.ended and state.final < stamp:
+                self._end(state, state.final, "end of stream")
+
+    def _end(self, state: _LoggedStream, final: int, reason: str) -> None:
+        state.ended = True
+        reached = max(final, state.promised)
+        self.emitter.end(state.name, None if reached == NEVER else reached, reason)
+
+    def finish(self, reason: str = "end of recording") -> None:
+        if self.ended:
+            return
+        self.ended = True
+        for state in self._streams.values():
+            if not state.ended:
+                final = state.final if self._following is None and not self._step else self.last
+                self._end(state, final, reason)
+        for node, records in self._records.items():
+            records.add("finish", self.last, time.time_ns(), outputs=(None,) * len(self._ports[node]))
+
+    def close(self) -> None:
+        self.recording.__exit__(None, None, None)
+
+    def counts(self) -> Iterable[tuple[str, int, str]]:
+        """(stream, messages, digest) of all streams."""
+        for name, digest in self.static_digests.items():
+            yield name, digest.count, digest.hexdigest()
+        for state in self._streams.values():
+            yield state.name, state.count, state.digest.hexdigest()

@@ -1,0 +1,1 @@
+"""One operator, without processes: its calls, its ports, its log."""

@@ -1,0 +1,191 @@
+"""Runs one source: `stream()` is read step by step, numbered and recorded; in a live run its clock may jump."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from dataflow.firing.runner import Emitter, OperatorFailure, OutputPorts, Recorder, change_parameter, set_up
+from dataflow.graph.model import Node
+from dataflow.messages.base import Message
+from dataflow.operator import OutputError, Source, outputs_of
+from dataflow.sync import NEVER
+
+JUMP_AFTER = 3
+"""So many steps in a row with stamps in the past are a clock that has jumped back; fewer are stray messages."""
+
+
+class SourceRunner:
+    """One source: `stream()` is read one step at a time, with one step of look-ahead."""
+
+    def __init__(
+        self, node: Node, emitter: Emitter, *, seed: int = 0, operator: Source | None = None, live: bool = False
+    ) -> None:
+        self.node, self.seed = node, seed
+        self.operator = node.make() if operator is None else operator
+        assert isinstance(self.operator, Source)
+        self.source: Source = self.operator
+        self.ports = OutputPorts(node, self.operator.spec, emitter, lossy=live)
+        self.refused: Counter[str] = Counter()
+        """Steps of a live run that were not sent, by reason: `overflow`, `past`, `repeated`."""
+        self._recorded: Counter[str] = Counter()
+        self._backwards: list[int] = []
+        self._resumed = False
+        self.records = Recorder(node.name, emitter)
+        self.firings = 0
+        self.ended = False
+        self.busy_ns = 0
+        self.last = NEVER
+        self._steps: Iterator[Mapping[str, Message]] = iter(())
+        self._next: dict[str, Message] | None = None
+
+    def setup(self) -> None:
+        set_up(self.operator, self.ports, self.records, self.node, self.seed)
+        try:
+            self._steps = iter(self.source.stream())
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "stream()", error) from error
+
+    def look_ahead(self) -> int | None:
+        """The stamp of the next step, or None at the end. Raises `OperatorFailure`."""
+        if self._next is None and not self.ended:
+            started = time.time_ns()
+            self._next = self.pull()
+            self.busy_ns += time.time_ns() - started
+        return None if self._next is None else step_stamp(self._next)
+
+    def take(self) -> dict[str, Message] | None:
+        """The next step without emitting it, None at the end: for the thread that reads a source in a live run.
+
+        What counts as work is that thread's CPU time: a device is mostly waited for.
+        """
+        step, self._next = self._next, None
+        if step is not None:
+            return step
+        started = time.thread_time_ns()
+        try:
+            return self.pull()
+        finally:
+            self.busy_ns += time.thread_time_ns() - started
+
+    def pull(self) -> dict[str, Message] | None:
+        """Reads the source's next non-empty step; for live sources called on the reader's own thread."""
+        try:
+            for step in self._steps:
+                messages = outputs_of(self.operator, step)
+                if messages:
+                    stamps = {m.stamp for m in messages.values()}
+                    if len(stamps) != 1:
+                        raise OutputError(
+                            f"{self.node.name} yielded stamps {sorted(stamps)} together; "
+                            "one step of stream() has one stamp"
+                        )
+                    return messages
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+        return None
+
+    def admit(self) -> tuple[int, int]:
+        """Emits the step that was looked at; returns how many messages and bytes it was."""
+        assert self._next is not None
+        step, self._next = self._next, None
+        return self.emit(step)
+
+    def promise(self) -> None:
+        """Every port is known up to the last step, so sparse ports hold nobody up."""
+        self.ports.promise(self.last)
+
+    def emit(self, step: Mapping[str, Message]) -> tuple[int, int]:
+        started = time.time_ns()
+        stamp = step_stamp(step)
+        if stamp <= self.last:
+            error = OutputError(f"{self.node.name} yielded stamp {stamp} after {self.last}: stamps strictly increase")
+            raise OperatorFailure(self.node.name, "stream()", error)
+        self.last = stamp
+        try:
+            emissions = self.ports.prepare(step, stamp)
+        except OutputError as error:
+            raise OperatorFailure(self.node.name, "stream()", error) from error
+        self.firings += 1
+        self.records.add("fire", stamp, started, outputs=emissions, detail=self._take_refused())
+        self.ports.publish()
+        return step_size(step)
+
+    def _take_refused(self) -> dict[str, int]:
+        """How many steps were not sent since the last record that says so, by reason."""
+        fresh, self._recorded = self.refused - self._recorded, self.refused.copy()
+        return dict(fresh)
+
+    def emit_live(self, step: Mapping[str, Message]) -> tuple[int, int] | None:
+        """As `emit`, for a source whose stamps may go back: returns None for a step that is not sent.
+
+        One step with a stamp in the past is dropped as `past`. Where the next ones lie there too, and go on from it,
+        the clock has jumped back: the streams begin a new incarnation. A source that was started again and gives what
+        it gave before is not listened to until it is past that (`repeated`).
+        """
+        stamp = step_stamp(step)
+        if stamp > self.last:
+            self._backwards.clear()
+            self._resumed = False
+            return self.emit(step)
+        if self._resumed:
+            self.refused["repeated"] += 1
+            return None
+        if self._backwards and stamp <= self._backwards[-1]:
+            self._backwards.clear()
+        self._backwards.append(stamp)
+        if len(self._backwards) < JUMP_AFTER:
+            self.refused["past"] += 1
+            return None
+        self._backwards.clear()
+        self._begin_after_jump(stamp)
+        return self.emit(step)
+
+    def _begin_after_jump(self, stamp: int) -> None:
+        incarnation = self.records.incarnation + 1
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation, stamps_go_back=True)
+        self.records.add("reset", stamp, time.time_ns(), detail={"last": self.last})
+        self.last = NEVER
+
+    def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
+        """Takes the place of a source whose process died; to be called before `setup()`."""
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.resume(incarnation, last)
+        self.last = max(last.values(), default=NEVER)
+        self._resumed = not self.source.live
+        for name, value in changed.items():
+            self.operator.set_parameter(name, value)
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`."""
+        return change_parameter(self.operator, self.records, name, value, max(self.last, NEVER + 1))
+
+    def finish(self, reason: str = "end of source") -> None:
+        """Ends the streams; the source is done."""
+        if not self.ended:
+            self.ended = True
+            self._next = None
+            none = (None,) * len(self.ports.states)
+            self.records.add("finish", self.last, time.time_ns(), outputs=none, detail=self._take_refused())
+            self.ports.end(None if self.last == NEVER else self.last, reason)
+
+    def close_stream(self) -> None:
+        """Ends `stream()` where it stands, so that its `finally` runs; on the thread that reads it."""
+        close = getattr(self._steps, "close", None)
+        if close is not None:
+            try:
+                close()
+            except Exception as error:
+                raise OperatorFailure(self.node.name, "the end of stream()", error) from error
+
+
+def step_stamp(step: Mapping[str, Message]) -> int:
+    return next(iter(step.values())).stamp
+
+
+def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
+    """How many messages and bytes a step is."""
+    return len(step), sum(m.nbytes() for m in step.values())

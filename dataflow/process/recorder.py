@@ -1,0 +1,94 @@
+"""The recorder: whole streams and firing records into one MCAP file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dataflow.graph.model import Graph
+from dataflow.messages import Diagnostics
+from dataflow.messages.base import Message
+from dataflow.names import diagnostics_key
+from dataflow.process.sink import stream_types
+from dataflow.recording import RecordingWriter
+from dataflow.recording.layout import ENDS, OUTCOME
+
+
+class RecorderSink:
+    """Writes everything it is given; how streams ended and how the run ended go into metadata when it closes."""
+
+    def __init__(self, path: Path, graph: Graph, streams: list[str], options: Mapping[str, Any]) -> None:
+        self.path = path
+        self.graph = graph
+        self.writer = RecordingWriter(
+            path,
+            metadata=options["metadata"],
+            namespace=graph.namespace,
+            compression=options["compression"],
+            overwrite=options["overwrite"],
+        )
+        self._added: set[str] = set()
+        self._ends: dict[str, dict[str, Any]] = {}
+        self.messages = 0
+        self._diagnosed = 0
+        self._clock = 0
+        self._early: list[tuple[str, bytes]] = []
+        for stream in streams:
+            types = stream_types(graph, stream)
+            if len(types) == 1:
+                self._add(stream, types[0])
+
+    def _add(self, stream: str, message_type: type[Message]) -> None:
+        made = self.graph.streams[stream]
+        extra = {"operator": made.node, "port": made.port}
+        self.writer.add_stream(stream, message_type, static=made.static, extra=extra)
+        self._added.add(stream)
+
+    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
+        if message.stamp > 0:
+            self._clock = message.stamp
+            self._write_early()
+        if stream not in self._added:
+            self._add(stream, type(message))
+        self.messages += 1
+        self.writer.write(stream, message, seq=seq, incarnation=incarnation)
+
+    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
+        """`setup()` has no stamp; its record is stored at the stamp of the first message, so that viewers of the file
+        show no long nothing before it."""
+        if stamp > 0 or self._clock > 0:
+            self.writer.write_firings(operator, stamp if stamp > 0 else self._clock, payload)
+        else:
+            self._early.append((operator, payload))
+
+    def _write_early(self) -> None:
+        early, self._early = self._early, []
+        for operator, payload in early:
+            self.writer.write_firings(operator, max(self._clock, 0), payload)
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self._ends[stream] = {"final": final_stamp, "reason": reason}
+
+    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
+        self.writer.write_event(name, stamp, data)
+
+    def diagnostics(self, message: Diagnostics) -> None:
+        stream = diagnostics_key(self.graph.namespace)
+        if stream not in self._added:
+            self.writer.add_stream(stream, Diagnostics, static=False, extra={})
+            self._added.add(stream)
+        self.writer.write(stream, message, seq=self._diagnosed, incarnation=0)
+        self._diagnosed += 1
+
+    def flush(self) -> None:
+        self.writer.flush()
+
+    def close(self, outcome: str) -> Mapping[str, Any]:
+        self._write_early()
+        self.writer.flush()  # an outcome is said of what is there already
+        self.writer.add_metadata(ENDS, {stream: json.dumps(end) for stream, end in sorted(self._ends.items())})
+        self.writer.add_metadata(OUTCOME, {"outcome": outcome})
+        self.writer.close()
+        return {"path": str(self.path), "messages": self.messages, "bytes": self.path.stat().st_size}

@@ -1,0 +1,324 @@
+"""A sink host: a process that takes whole streams losslessly, in arrival order, without aligning them.
+
+The recorder is one, and so is the writer of a viewer file. What they have taken counts towards the flow control of
+feeds, so neither can be outrun.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from dataflow.graph.model import Graph
+from dataflow.messages import Diagnostics
+from dataflow.messages.base import Message, message_type
+from dataflow.names import firings_key
+from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.network import network_config
+from dataflow.records.firing import consecutive, decode_batch, encode_batch
+from dataflow.sync import FOREVER, NEVER
+from dataflow.transport import Bus, DecodeError, Kind, decode
+from dataflow.transport.codec import MAGIC
+
+IDLE_WAIT = 0.1
+REPORT_EVERY = 0.01
+FLUSH_EVERY = 1.0
+DRAIN_QUIET = 0.2
+DRAIN_WITHIN = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class SinkConfig:
+    """What the supervisor tells a sink host to be: `kind` is "record" or "view", `options` belong to the kind."""
+
+    label: str
+    kind: str
+    graph: dict[str, Any]
+    streams: list[str]
+    firings: list[str]
+    connect: list[str]
+    options: dict[str, Any]
+    live: bool = False
+
+
+class StreamSink(Protocol):
+    """What a sink host feeds."""
+
+    def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None: ...
+
+    def firings(self, operator: str, stamp: int, payload: bytes) -> None: ...
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
+
+    def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
+        """Something happened to the run: an operator was started again, a fault was planned."""
+
+    def diagnostics(self, message: Diagnostics) -> None:
+        """How every operator fares."""
+
+    def flush(self) -> None: ...
+
+    def close(self, outcome: str) -> Mapping[str, Any]:
+        """Completes the output; `outcome` is "complete" or says why the run ended. Returns what it wrote."""
+
+
+class SinkFailure(RuntimeError):
+    """A stream reached the sink damaged, or the sink could not store it."""
+
+
+class SinkHost:
+    """Takes streams until all have ended or the supervisor says so."""
+
+    def __init__(
+        self,
+        config: SinkConfig,
+        channel: Channel,
+        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        make_sink: Callable[[SinkConfig, Graph], StreamSink],
+    ) -> None:
+        self.config, self.channel, self.inbox = config, channel, inbox
+        self.graph = Graph.from_json(config.graph)
+        self.make_sink = make_sink
+        self.frontiers = dict.fromkeys(config.streams, NEVER)
+        self.firings_open = {firings_key(self.graph.namespace, o): o for o in config.firings}
+        self.sink: StreamSink | None = None
+        self.received = 0
+        self.written = 0
+        self._expected: dict[str, tuple[int, int]] = {}
+        self._recorded: dict[str, tuple[int, int]] = {}  # operator → the record that follows those stored
+        self._lacking: dict[str, set[tuple[int, int]]] = {}  # operator → records before it that did not come
+        self._probed: set[str] = set()
+        taken = [*(self.graph.streams[s].node for s in config.streams), *config.firings]
+        self._taken = {name: NEVER for name in taken if self.graph.nodes[name].source}
+        self._told: dict[str, int] = {}
+        self._done = NEVER
+        self._report_due = 0.0
+        self._flush_due = 0.0
+        self._busy_ns = 0
+        self._ended = False
+        self._left = False
+        self._outcome = "the supervisor is gone"
+
+    def open(self) -> None:
+        self.bus = Bus(network_config(self.graph.network, [], self.config.connect))
+        for key in (*self.frontiers, *self.firings_open):
+            self.bus.subscribe(key, self._receiver(key))
+        self.channel.send("joined")
+        self.sink = self.make_sink(self.config, self.graph)
+        self.channel.send("ready", first=None, steps=None)
+
+    def _receiver(self, key: str) -> Callable[[Any], None]:
+        put = self.inbox.put
+
+        def receive(payload: Any) -> None:
+            put(("envelope", key, payload))
+
+        return receive
+
+    def run(self) -> None:
+        assert self.sink is not None
+        while not self._left:
+            idle = False
+            try:
+                item = self.inbox.get(timeout=IDLE_WAIT)
+            except queue.Empty:
+                idle = True
+            else:
+                self._handle(item)
+            now = time.monotonic()
+            if now >= self._flush_due:
+                self._flush_due = now + FLUSH_EVERY
+                self.sink.flush()
+            if idle or self.inbox.empty() or now >= self._report_due:
+                self._report(now)
+
+    def _handle(self, item: tuple[Any, ...]) -> None:
+        match item:
+            case ("envelope", key, payload):
+                started = time.perf_counter_ns()
+                self._receive(key, payload)
+                self._busy_ns += time.perf_counter_ns() - started
+            case ("control", kind, fields):
+                self._control(kind, fields)
+
+    def _receive(self, key: str, payload: Any) -> None:
+        assert self.sink is not None
+        if key in self.firings_open and bytes(payload[: len(MAGIC)]) != MAGIC:
+            self.received += 1
+            if self._take_records(bytes(payload)):
+                self.firings_open.pop(key)
+            return
+        try:
+            envelope = decode(payload)
+        except DecodeError as error:  # from outside: of our own, the next number would show the gap
+            print(f"dropped a malformed message on {key!r}: {error}", file=sys.stderr)
+            return
+        match envelope.kind:
+            case Kind.PROBE:
+                if key not in self._probed:
+                    self._probed.add(key)
+                    self.channel.send("seen", stream=key)
+                return
+            case Kind.MESSAGE if self.graph.streams[key].static and key in self._expected:
+                self.received += 1  # its operator was started again; the stream goes on as it is
+                return
+            case Kind.MESSAGE:
+                incarnation, expected = self._expected.get(key, (envelope.incarnation, envelope.seq))
+                if incarnation == envelope.incarnation and expected != envelope.seq:
+                    if self.config.live:
+                        self.channel.send("gap", stream=key, first=expected, following=envelope.seq)
+                    else:
+                        self._lost(key, expected, envelope.seq)
+                self._expected[key] = (envelope.incarnation, envelope.seq + 1)
+                assert envelope.message is not None
+                self.sink.message(key, envelope.message, envelope.seq, envelope.incarnation)
+                self.written += 1
+                self._note_taken(self.graph.streams[key].node, envelope.stamp)
+                self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
+            case Kind.FRONTIER:
+                self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
+            case Kind.END:
+                self.frontiers[key] = FOREVER
+                self.sink.end(key, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
+        self.received += 1
+
+    def _lost(self, stream: str, due: int, came: int) -> None:
+        raise SinkFailure(f"stream {stream!r} lost messages: number {due} was due, {came} came")
+
+    def _take_records(self, data: bytes) -> bool:
+        """Stores a batch of firing records, those of it that are not stored yet; True for an operator's last batch.
+
+        Records come twice when their operator's process has died or the run has failed, and when some were lost on
+        their way: once from the operator and once from the supervisor, which is asked for what is lacking.
+        """
+        assert self.sink is not None
+        batch = decode_batch(data)
+        last = batch.records[-1]
+        following = self._recorded.get(batch.operator, (-1, 0))
+        lacking = self._lacking.setdefault(batch.operator, set())
+        places = [(r.incarnation, r.index) for r in batch.records]
+        if places[0][0] == following[0] and places[0] > following:
+            lacking.update((batch.incarnation, index) for index in range(following[1], places[0][1]))
+            self.channel.send("lacks", operator=batch.operator)
+        fresh = [r for r, place in zip(batch.records, places, strict=True) if place >= following or place in lacking]
+        lacking.difference_update(places)
+        self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
+        for part in consecutive(fresh):
+            self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last and part[-1] is last))
+        return batch.last
+
+    def _note_taken(self, operator: str, stamp: int) -> None:
+        if operator in self._taken and stamp > 0:
+            self._taken[operator] = stamp
+
+    def _report(self, now: float) -> None:
+        """Tells how far it is: up to which stamp in all streams, or, in a live run, of each source it takes from."""
+        dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
+        self._done = min(dynamic, default=FOREVER)
+        done = dict(self._taken) if self.config.live else {self.config.label: self._done}
+        if done != self._told:
+            self._told = done
+            self._report_due = now + REPORT_EVERY
+            self.channel.send("progress", done=done, counts=self._counts())
+        if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
+            self._ended = True
+            self.channel.send("ended", report={"counts": self._counts()})
+
+    def _counts(self) -> dict[str, list[int]]:
+        return {self.config.label: [0, self.written, 0, self._busy_ns, self._done]}
+
+    def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
+        match kind:
+            case "poll":
+                self.channel.send(
+                    "state",
+                    round=fields["round"],
+                    idle=self.inbox.empty(),
+                    sent=0,
+                    received=self.received,
+                    full=False,
+                    waiting={},
+                )
+            case "records":
+                assert self.sink is not None
+                for data in fields["batches"]:
+                    self._take_records(data)
+            case "expect":
+                self._probed.difference_update(fields["streams"])
+            case "event":
+                assert self.sink is not None
+                self.sink.event(fields["name"], fields["stamp"], fields["data"])
+            case "diagnostics":
+                assert self.sink is not None
+                self.sink.diagnostics(_diagnostics(fields))
+            case "leave":
+                self._outcome = fields["outcome"]
+                self._left = True
+                if self._outcome != "complete":
+                    self._drain()
+            case "lost":
+                self._drain()
+                raise ChannelClosed("the supervisor is gone")
+
+    def _drain(self) -> None:
+        """Takes what is still on its way after the run has ended early."""
+        deadline = time.monotonic() + DRAIN_WITHIN
+        while time.monotonic() < deadline:
+            try:
+                item = self.inbox.get(timeout=DRAIN_QUIET)
+            except queue.Empty:
+                return
+            if item[0] == "envelope":
+                self._handle(item)
+
+    def hand_over(self) -> None:
+        """A sink keeps nothing that another process needs."""
+
+    def close(self) -> Mapping[str, Any]:
+        facts: Mapping[str, Any] = {}
+        if self.sink is not None:
+            facts = self.sink.close(self._outcome)
+        self.bus.close()
+        return facts
+
+
+def _diagnostics(fields: Mapping[str, Any]) -> Diagnostics:
+    pairs = [(k, name, str(value)) for k, values in enumerate(fields["values"]) for name, value in values.items()]
+    return Diagnostics(
+        stamp=fields["stamp"],
+        names=tuple(fields["names"]),
+        messages=tuple(fields["messages"]),
+        keys=tuple(name for _, name, _ in pairs),
+        values=tuple(value for _, _, value in pairs),
+        levels=np.array(fields["levels"], np.uint8),
+        owners=np.array([k for k, _, _ in pairs], np.int32) if pairs else None,
+    )
+
+
+def recorder(config: SinkConfig, graph: Graph) -> StreamSink:
+    """The sink that writes an MCAP recording; options: `path`, `metadata`, `compression`."""
+    from dataflow.process.recorder import RecorderSink
+
+    return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)
+
+
+def viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
+    """The sink that writes a viewer file; options: `path`."""
+    from dataflow.process.viewer_file import ViewerFileSink
+
+    return ViewerFileSink(config.options["path"], graph, config.streams)
+
+
+SINKS: Mapping[str, Callable[[SinkConfig, Graph], StreamSink]] = {"record": recorder, "view": viewer_file}
+
+
+def stream_types(graph: Graph, stream: str) -> tuple[type[Message], ...]:
+    """The message classes that a stream may carry."""
+    return tuple(message_type(schema) for schema in graph.streams[stream].types)

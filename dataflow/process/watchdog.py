@@ -1,0 +1,62 @@
+"""A host's watchdog: tells the supervisor a few times a second that the process lives, how much memory it takes, and
+whether a firing takes longer than its operator's deadline. It runs on a thread of its own, since the main one may hang.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+
+import psutil  # type: ignore[import-untyped]
+
+from dataflow.firing.runner import OperatorRunner
+from dataflow.process.channel import Channel, ChannelClosed
+
+PERIOD = 0.05
+BEAT_EVERY = 0.25
+
+
+class Watchdog:
+    """Watches the operators of this host until `stop`."""
+
+    def __init__(self, channel: Channel, runners: Sequence[OperatorRunner], *, deadlines: bool) -> None:
+        self._channel, self._runners, self._deadlines = channel, runners, deadlines
+        self._process = psutil.Process()
+        self._over = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="watchdog", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the watching; waits (bounded) for the thread."""
+        self._over.set()
+        self._thread.join(timeout=1.0)
+
+    def _work(self, now: float) -> tuple[str, int, float] | None:
+        """The call that has taken more than a second, if any: operator, stamp, seconds."""
+        for runner in self._runners:
+            since = runner.working_since
+            if since is not None and now - since > 1.0:
+                return runner.node.name, runner.working_stamp, now - since
+        return None
+
+    def _run(self) -> None:
+        told: set[str] = set()
+        beat_due = 0.0
+        try:
+            while not self._over.wait(PERIOD):
+                now = time.monotonic()
+                for runner in self._runners:
+                    deadline, since = runner.node.live.deadline, runner.working_since
+                    if not self._deadlines or deadline is None or since is None or now - since <= deadline * 1e-9:
+                        told.discard(runner.node.name)
+                    elif runner.node.name not in told:
+                        told.add(runner.node.name)
+                        self._channel.send(
+                            "overdue", operator=runner.node.name, stamp=runner.working_stamp, seconds=now - since
+                        )
+                if now >= beat_due:
+                    beat_due = now + BEAT_EVERY
+                    self._channel.send("beat", memory=self._process.memory_info().rss, work=self._work(now))
+        except ChannelClosed:  # the supervisor is gone: the control thread sees to it
+            return

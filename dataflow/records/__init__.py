@@ -1,0 +1,1 @@
+"""Firing records: what each call of an operator was given and what it gave."""

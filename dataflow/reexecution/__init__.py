@@ -1,0 +1,1 @@
+"""Records and a recording give the same calls again, in one process."""

@@ -1,0 +1,268 @@
+"""Re-executes recorded operators in this process, in sight of whoever wants their messages.
+
+`verify` compares digests wherever operators run; this is for what needs the messages themselves: to say which field of
+one differs, and to store them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from dataflow.feeds.log import LogFeed
+from dataflow.firing.threads import limit_threads
+from dataflow.graph.model import Graph, Node
+from dataflow.recording import Recording
+from dataflow.records.firing import FiringRecord
+from dataflow.reexecution.recorded import (
+    CALLS,
+    RecordedRunner,
+    Verification,
+    beginning,
+    needed_from,
+    recorded_digests,
+    recorded_firings,
+    whole,
+)
+from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
+from dataflow.sync import Entry
+
+Take = Callable[[str, Entry], None]
+"""Is given every message of a stream, in stream order."""
+End = Callable[[str, int | None, str], None]
+"""Is told of the end of every stream: its final stamp and the reason."""
+
+
+class Stuck(RuntimeError):
+    """No recorded firing can be made, and nothing is left to read: a fault of the records or of the engine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Feeding:
+    """What is re-executed and what is read: operators in graph order, and the recorded streams that feed them."""
+
+    operators: tuple[str, ...]
+    streams: tuple[str, ...]
+
+
+def plan_feeding(recording: Recording, graph: Graph, operators: Collection[str]) -> Feeding:
+    """Feeds operators from the recording wherever it holds what they take; else what makes it runs too.
+
+    Raises `ReplayError` when a stream of a source or an external operator is needed and was not recorded.
+    """
+    chosen, streams = set(operators), set[str]()
+    left = list(operators)
+    while left:
+        node = graph.nodes[left.pop()]
+        for stream in {s for taken in node.inputs.values() for s in taken}:
+            maker = graph.nodes[graph.streams[stream].node]
+            if stream in recording.streams:
+                check_type(recording, graph, stream)
+                streams.add(stream)
+            elif maker.source or maker.external:
+                raise ReplayError(
+                    f"{recording.path}: stream {stream!r} was not recorded, but {node.name!r} takes it and "
+                    f"{maker.name!r} cannot make it again"
+                )
+            elif maker.name not in chosen:
+                chosen.add(maker.name)
+                left.append(maker.name)
+    return Feeding(tuple(name for name in graph.nodes if name in chosen), tuple(sorted(streams)))
+
+
+class Recomputation:
+    """Recorded operators, driven by their records on one thread.
+
+    Re-execution begins at the stamp `begin` (see `reexecute.beginning`) and ends before the firings from `end` on.
+    `made` is given every message that the operators make, `read` every message that is read for them; `ended` the ends
+    of the streams that are made.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        graph: Graph,
+        feeding: Feeding,
+        *,
+        made: Take,
+        read: Take | None = None,
+        ended: End | None = None,
+        begin: int | None = None,
+        end: int | None = None,
+    ) -> None:
+        self._fed = frozenset(feeding.streams)
+        self._consumers: dict[str, list[RecordedRunner]] = {}
+        self.records = {name: list(_until(recorded_firings(recording, name), end)) for name in feeding.operators}
+        outlet = _Outlet(self._consumers, self._fed, made, ended)
+        begins = {} if begin is None else _begins(graph, self.records, self._fed, begin)
+        self.runners = {
+            name: _runner(recording, graph, graph.nodes[name], self.records[name], outlet, begins.get(name))
+            for name in feeding.operators
+        }
+        for runner in self.runners.values():
+            for stream in {s for taken in runner.node.inputs.values() for s in taken}:
+                self._consumers.setdefault(stream, []).append(runner)
+        makers = {stream: graph.streams[stream].node for stream in feeding.streams}
+        self._feed = LogFeed(
+            recording,
+            makers,
+            _Outlet(self._consumers, frozenset(), read or _nowhere, None),
+            ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
+            finals=final_stamps(recording, feeding.streams),
+            start=None if begin is None else _first_stamp(recording, graph, self.runners.values()),
+            end=end,
+            promises=False,
+        )
+        self._threads = graph.threads
+
+    def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
+        """Makes the recorded firings, to the end or until `until()`, asked after every round; then closes.
+
+        Raises `OperatorFailure`, `RecordingError`, `Stuck`.
+        """
+        limit_threads(self._threads)
+        runners = list(self.runners.values())
+        try:
+            for runner in runners:
+                runner.setup()
+            self._feed.setup()
+            while not until():
+                if any(runner.step() for runner in runners):
+                    continue
+                if self._feed.ended:
+                    break
+                if self._feed.look_ahead() is None:
+                    self._feed.finish()
+                else:
+                    self._feed.admit()
+            else:
+                return self.results()
+        finally:
+            for runner in runners:
+                if close:
+                    runner.operator.close()
+        if waiting := [r.node.name for r in runners if not r.ended]:
+            raise Stuck(f"everything is read and {', '.join(waiting)} still wait: {self.runners[waiting[0]].waiting()}")
+        return self.results()
+
+    def results(self) -> Mapping[str, Verification]:
+        """What re-executing each operator has come to so far."""
+        return {name: runner.result for name, runner in self.runners.items()}
+
+
+def _runner(
+    recording: Recording,
+    graph: Graph,
+    node: Node,
+    records: Iterable[FiringRecord],
+    outlet: _Outlet,
+    begin: int | None,
+) -> RecordedRunner:
+    inputs = frozenset(s for taken in node.inputs.values() for s in taken)
+    producers = [graph.nodes[name] for name in {graph.streams[s].node for s in inputs}]
+    return RecordedRunner(
+        node,
+        outlet,
+        static=frozenset(name for name, stream in graph.streams.items() if stream.static),
+        records=records,
+        inputs=recorded_digests(recording, producers, inputs),
+        seed=graph.seed,
+        begin=begin,
+    )
+
+
+def _begins(
+    graph: Graph, records: Mapping[str, Sequence[FiringRecord]], fed: frozenset[str], begin: int
+) -> dict[str, int]:
+    """From which stamp on each operator is to be repeated: `begin`, or before what those need that take its messages,
+    where the recording does not hold them."""
+    begins = dict.fromkeys(records, begin)
+    moved = list(records)
+    while moved:
+        node = graph.nodes[moved.pop()]
+        kept, _ = whole(records[node.name])
+        repeated = beginning(kept, begins[node.name], stateless=node.operator.stateless)[1]
+        for stream, place in needed_from(repeated).items():
+            maker = graph.streams[stream].node
+            if stream in fed or maker not in begins:
+                continue
+            made = _stamp_of(records[maker], list(graph.nodes[maker].outputs.values()).index(stream), place)
+            if made is not None and made <= begins[maker]:
+                begins[maker] = made - 1
+                moved.append(maker)
+    return begins
+
+
+def _stamp_of(records: Iterable[FiringRecord], port: int, place: tuple[int, int]) -> int | None:
+    """The stamp of the call that emitted a message; None for `setup`, which is always repeated."""
+    for record in records:
+        emission = record.outputs[port] if record.outputs else None
+        if emission is not None and (record.incarnation, emission.seq) == place:
+            return record.stamp if record.kind in CALLS else None
+    return None
+
+
+def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringRecord]:
+    """The records before the first call at or after the stamp `end`."""
+    for record in records:
+        if end is not None and record.kind in CALLS and record.stamp >= end:
+            return
+        yield record
+
+
+def _first_stamp(recording: Recording, graph: Graph, runners: Iterable[RecordedRunner]) -> int | None:
+    """The stamp from which the recording must be read; None where that is not known: then from its start."""
+    needed: dict[str, tuple[int, int]] = {}
+    for runner in runners:
+        for stream, place in runner.needs_from().items():
+            needed[stream] = min(place, needed.get(stream, place))
+    stamps: list[int] = []
+    for maker in {graph.streams[stream].node for stream in needed}:
+        streams = list(graph.nodes[maker].outputs.values())
+        known: set[str] = set()
+        for record in recorded_firings(recording, maker):
+            if record.kind == "reset":
+                return None  # stamps went back there
+            for stream, emission in zip(streams, record.outputs, strict=False):
+                if emission is not None and needed.get(stream) == (record.incarnation, emission.seq):
+                    stamps.append(emission.stamp)
+                    known.add(stream)
+        if not needed.keys() & set(streams) <= known:
+            return None
+    return min((s for s in stamps if s >= 0), default=None)
+
+
+def _nowhere(stream: str, entry: Entry) -> None:
+    """Takes a message that nobody asked for."""
+
+
+class _Outlet:
+    """Hands messages to `take` and to the operators that take them, unless those of that stream are fed otherwise."""
+
+    def __init__(
+        self,
+        consumers: Mapping[str, list[RecordedRunner]],
+        elsewhere: frozenset[str],
+        take: Take,
+        ended: End | None,
+    ) -> None:
+        self._consumers, self._elsewhere, self._take, self._ended = consumers, elsewhere, take, ended
+
+    def message(self, stream: str, entry: Entry) -> None:
+        self._take(stream, entry)
+        if stream not in self._elsewhere:
+            for runner in self._consumers.get(stream, ()):
+                runner.push(stream, entry)
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        """Recorded firings wait for messages, not for promises."""
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        if self._ended is not None:
+            self._ended(stream, final_stamp, reason)
+        if stream not in self._elsewhere:
+            for runner in self._consumers.get(stream, ()):
+                runner.end(stream, final_stamp, reason)
+
+    def record(self, record: FiringRecord) -> None:
+        """The records are those of the recorded run; none are made."""

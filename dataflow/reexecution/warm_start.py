@@ -1,0 +1,108 @@
+"""Operators in the state that they had in the middle of a recorded run, and the messages that they held then."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataflow.graph.model import Graph, Node
+from dataflow.operator import Operator
+from dataflow.recording import Recording
+from dataflow.records.firing import FiringRecord
+from dataflow.reexecution.engine import Recomputation, plan_feeding
+from dataflow.reexecution.recorded import CALLS, messages_of, recorded_firings
+from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+from dataflow.sync import Entry
+
+
+@dataclass(frozen=True, slots=True)
+class WarmStart:
+    """An operator as it was just before a stamp. `began`: what was repeated to get there, as in `Verification`."""
+
+    operator: Operator
+    began: str
+
+
+def fresh_because(recording: Recording, graph: Graph, node: Node) -> str | None:
+    """Why an operator must begin with fresh state, in words; None where its recorded state can be had again."""
+    if node.operator.stateless:
+        return None
+    try:
+        recorded = recorded_graph(recording).nodes.get(node.name)
+    except ReplayError:
+        return "the recording does not hold the graph that made it"
+    if recorded is None or (recorded.use, recorded.params, recorded.inputs) != (node.use, node.params, node.inputs):
+        return "it is not the operator that was recorded"
+    if next(recorded_firings(recording, node.name), None) is None:
+        return "it left no firing records"
+    try:
+        plan_feeding(recording, graph, [node.name])
+    except ReplayError as error:
+        return str(error)
+    return None
+
+
+def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | None:
+    """The operator with the state it had before `stamp`: its last recorded snapshot, and the firings since repeated.
+
+    Without snapshots, or where its inputs were not recorded, everything before is repeated. None where it begins with
+    fresh state. Raises `OperatorFailure`.
+    """
+    with Recording(path) as recording:
+        if node.operator.stateless or fresh_because(recording, graph, node) is not None:
+            return None
+        feeding = plan_feeding(recording, graph, [node.name])
+        begin = stamp if feeding.operators == (node.name,) else None
+        work = Recomputation(recording, graph, feeding, made=lambda stream, entry: None, begin=begin, end=stamp)
+        results = work.run(close=False)
+        for name, runner in work.runners.items():
+            if name != node.name:
+                runner.operator.close()
+        result = results[node.name]
+        if result.unverifiable or result.lost_records:
+            work.runners[node.name].operator.close()
+            return None
+        return WarmStart(work.runners[node.name].operator, result.began)
+
+
+def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> tuple[list[Entry], bool]:
+    """What the operator's aligner held just before `stamp`, as far as it matters, and whether it had fired before.
+
+    By the firing records these are the messages that later firings took: partners of a join, the beginning of a batch,
+    samples. Without records, the last message before `stamp` on each stream that is only sampled.
+    """
+    sampled, others = set[str](), set[str]()
+    for port in node.operator.spec.inputs.values():
+        (sampled if port.kind == "sampled" else others).update(node.inputs.get(port.name, ()))
+    with Recording(path) as recording:
+        known = [
+            s for s in sorted((sampled | others) - static) if s in recording.streams and not recording.streams[s].static
+        ]
+        if not known:
+            return [], False
+        calls = [r for r in recorded_firings(recording, node.name) if r.kind in CALLS]
+        taken = _taken_from(calls, stamp)
+        held: list[Entry] = []
+        last: dict[str, Entry] = {}
+        for item in recording.messages(known, end=stamp - 1):
+            message = item.message
+            entry = Entry(message.stamp, message, item.seq, item.incarnation, message.digest(), item.stream)
+            if (item.stream, item.incarnation, item.seq) in taken:
+                held.append(entry)
+            if item.stream in sampled - others:
+                last[item.stream] = entry
+        had = {entry.stream for entry in held}
+        began = any(record.stamp < stamp for record in calls)
+        return [*held, *(entry for stream, entry in last.items() if stream not in had)], began
+
+
+def _taken_from(calls: Iterable[FiringRecord], stamp: int) -> set[tuple[str, int, int]]:
+    """(stream, incarnation, number) of what the recorded firings from `stamp` on took."""
+    return {
+        (message.stream, message.incarnation, message.seq)
+        for record in calls
+        if record.stamp >= stamp
+        for ref in record.inputs.values()
+        for message in messages_of(ref)
+    }

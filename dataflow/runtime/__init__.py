@@ -1,1 +1,0 @@
-"""Running graphs: hosts as processes, their supervisor, firing records, replay."""

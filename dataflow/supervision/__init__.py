@@ -1,0 +1,1 @@
+"""Starts the processes of a graph, watches over them, ends them."""

@@ -1,0 +1,166 @@
+"""What is to be run, and where: the pure part of the supervisor."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dataflow.chaos.plan import Fault
+from dataflow.graph.model import Graph, Placement
+from dataflow.names import firings_key
+
+LOG_HOST = "@log"
+RECORDER = "@recorder"
+VIEWER_FILE = "@view"
+
+
+@dataclass(frozen=True, slots=True)
+class LogPlan:
+    """Recorded streams that stand in for sources: stream names, the stamps they ended with, and the span (ns)."""
+
+    path: Path
+    streams: tuple[str, ...]
+    finals: Mapping[str, int] = field(default_factory=dict)
+    start: int | None = None
+    end: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunPlan:
+    """One execution of a graph.
+
+    - `placement`: see `Graph.hosts`.
+    - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
+    - `verify`: the operators that are driven by the firing records of `log`; the others do not run.
+    - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes
+      into the recording.
+    - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
+      `live:` policies apply.
+    - `faults`: what is to go wrong on purpose, by time (live runs only).
+    - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
+    - `window`: messages and bytes that feeds may be ahead of the graph.
+    - `paranoid`: re-digest inputs after each firing to catch operators that write into them.
+    - `start_timeout`, `stall_timeout`: seconds allowed for all hosts to become ready, and without any progress.
+    """
+
+    graph: Graph
+    placement: Placement | Mapping[str, str] = "graph"
+    log: LogPlan | None = None
+    record: Path | None = None
+    view_file: Path | None = None
+    metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    verify: frozenset[str] | None = None
+    live: bool = False
+    faults: Iterator[Fault] | None = None
+    rate: float | None = None
+    window: tuple[int, int] = (256, 64 << 20)
+    paranoid: bool = False
+    start_timeout: float = 120.0
+    stall_timeout: float = 120.0
+    compression: str = "zstd"
+    overwrite: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class HostPlan:
+    """One process: which operators it runs, what it sends to and takes from the others, and whom it connects to."""
+
+    label: str
+    nodes: tuple[str, ...]
+    publish: Mapping[str, int]
+    subscribe: tuple[str, ...]
+    upstream: tuple[str, ...]
+    has_log: bool = False
+    sink: str | None = None
+    streams: tuple[str, ...] = ()
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def has_feed(self) -> bool:
+        return self.sink is None
+
+
+def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
+    """The processes of a run, by label: hosts in graph order, then the recorder and the viewer file."""
+    graph = plan.graph
+    replaced = {graph.streams[s].node for s in plan.log.streams} if plan.log is not None else set()
+    labels = {node: label for label, nodes in graph.hosts(plan.placement).items() for node in nodes}
+    if plan.log is not None:
+        log_host = "all" if plan.placement == "one_host" else LOG_HOST
+        labels |= dict.fromkeys(replaced, log_host)
+
+    idle = set() if plan.verify is None else set(graph.nodes) - replaced - plan.verify
+    hosts: dict[str, list[str]] = {}
+    for node in graph.nodes:
+        if node in idle:
+            continue
+        hosts.setdefault(labels[node], []).append(node)
+
+    streams = set(graph.streams)
+    if plan.log is not None:
+        silent = {s for s in streams if graph.streams[s].node in replaced} - set(plan.log.streams)
+        streams -= silent
+    streams = {s for s in streams if graph.streams[s].node not in idle}
+
+    made_in = {stream: labels[graph.streams[stream].node] for stream in streams}
+    taken_in: dict[str, set[str]] = {stream: set() for stream in streams}
+    for edge in graph.edges():
+        if edge.stream in streams and edge.consumer not in idle | replaced:
+            taken_in[edge.stream].add(labels[edge.consumer])
+
+    sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
+    if plan.record is not None:
+        recorded = tuple(s for s in graph.record.streams if s in streams)
+        options: dict[str, Any] = {
+            "path": str(plan.record),
+            "metadata": {name: dict(values) for name, values in plan.metadata.items()},
+            "compression": plan.compression,
+            "overwrite": plan.overwrite,
+        }
+        sinks[RECORDER] = ("record", recorded, options)
+    if plan.view_file is not None:
+        shown = tuple(s for s in sorted(streams) if s not in graph.view.hide)
+        sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file)})
+    for label, (_, taken, _) in sinks.items():
+        for stream in taken:
+            taken_in[stream].add(label)
+
+    plans: dict[str, HostPlan] = {}
+    for label, nodes in hosts.items():
+        publish = {
+            s: len(taken_in[s] - {label}) for s in sorted(streams) if made_in[s] == label and taken_in[s] - {label}
+        }
+        if plan.record is not None:
+            publish |= {firings_key(graph.namespace, node): 1 for node in nodes}
+        subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
+        plans[label] = HostPlan(
+            label,
+            tuple(node for node in nodes if node not in replaced),
+            publish,
+            subscribe,
+            tuple(sorted({made_in[s] for s in subscribe})),
+            has_log=bool(replaced & set(nodes)),
+        )
+    for label, (kind, taken, chosen) in sinks.items():
+        upstream = {made_in[s] for s in taken}
+        if kind == "record":
+            upstream |= set(hosts)
+        plans[label] = HostPlan(
+            label, (), {}, (), tuple(sorted(upstream)), sink=kind, streams=tuple(sorted(taken)), options=chosen
+        )
+    return plans
+
+
+def expected_probes(plan: RunPlan, plans: Mapping[str, HostPlan]) -> dict[str, set[str]]:
+    """Label → the keys on which that process must have seen a probe before sources are released."""
+    expected = {}
+    for label, host in plans.items():
+        keys = set(host.subscribe)
+        if host.sink is not None:
+            keys = set(host.streams)
+            if host.sink == "record":
+                keys |= {firings_key(plan.graph.namespace, node) for node in plan.graph.nodes}
+        expected[label] = keys
+    return expected

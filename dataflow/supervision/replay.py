@@ -1,0 +1,56 @@
+"""Plans a replay: recorded streams replace the sources that made them, everything else runs again."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
+from dataflow.supervision.plan import LogPlan
+
+
+def plan_replay(
+    recording: Recording,
+    graph: Graph,
+    *,
+    replaced: Collection[str] | None = None,
+    start: float | None = None,
+    end: float | None = None,
+) -> LogPlan:
+    """Which recorded streams stand in for which operators: the sources, or those that `replaced` names.
+
+    `start`, `end`: seconds from the recording's first message. Raises `ReplayError`.
+    """
+    streams: list[str] = []
+    for node in graph.sources() if replaced is None else [graph.nodes[name] for name in sorted(replaced)]:
+        outputs = tuple(node.outputs.values())
+        recorded = [s for s in outputs if s in recording.streams]
+        if not recorded:
+            raise ReplayError(
+                f"{recording.path}: no stream of {node.name!r} is in the recording "
+                f"(looked for {', '.join(outputs)}; it holds {', '.join(recording.streams) or 'none'})"
+            )
+        missing = [s for s in outputs if s not in recording.streams and graph.consumers(s)]
+        if missing:
+            raise ReplayError(
+                f"{recording.path}: stream {missing[0]!r} of {node.name!r} was not recorded, "
+                f"but {graph.consumers(missing[0])[0][0].name!r} takes it; record it, or leave that operator out"
+            )
+        for stream in recorded:
+            check_type(recording, graph, stream)
+        streams += recorded
+    if not streams:
+        raise ReplayError(
+            f"nothing of {recording.path} can be played into graph {graph.name!r}: it has no sources, or what is to "
+            "run takes nothing from them; name another graph with --graph"
+        )
+    first = min((i.first for s in streams if (i := recording.streams[s]).first is not None and not i.static), default=0)
+    return LogPlan(
+        Path(recording.path),
+        tuple(sorted(streams)),
+        finals=final_stamps(recording, streams),
+        start=None if start is None else first + round(start * 1e9),
+        end=None if end is None else first + round(end * 1e9),
+    )

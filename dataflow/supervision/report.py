@@ -1,0 +1,99 @@
+"""What a run tells while it goes on and at its end."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dataflow.supervision.health import Health
+from dataflow.sync import NEVER
+
+
+@dataclass(frozen=True, slots=True)
+class OperatorCounts:
+    """Progress of one operator: counts so far, nanoseconds of work, and the stamp it has reached."""
+
+    firings: int = 0
+    emitted: int = 0
+    dropped: int = 0
+    busy_ns: int = 0
+    done: int = NEVER
+
+    def after(self, base: OperatorCounts) -> OperatorCounts:
+        """These counts and those of the process before."""
+        return OperatorCounts(
+            self.firings + base.firings,
+            self.emitted + base.emitted,
+            self.dropped + base.dropped,
+            self.busy_ns + base.busy_ns,
+            self.done,
+        )
+
+
+@dataclass(slots=True)
+class Status:
+    """What a progress display needs; updated in place while the graph runs."""
+
+    phase: str = "starting"
+    started: float = 0.0
+    operators: dict[str, OperatorCounts] = field(default_factory=dict)
+    drops: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
+    """By operator, how many messages were dropped by (input, reason); a source's input is ""."""
+    host_of: dict[str, str] = field(default_factory=dict)
+    first: int | None = None
+    steps: int | None = None
+    notes: list[str] = field(default_factory=list)
+    health: list[Health] = field(default_factory=list)
+    restarts: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def covered(self) -> int:
+        return min((c.done for c in self.operators.values()), default=NEVER)
+
+
+@dataclass(frozen=True, slots=True)
+class RunReport:
+    """What a run came to.
+
+    `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples, those of
+    processes that were started again included, with the input "" for what a source has not sent; `summaries` holds what
+    metrics sinks report; `wall` is in seconds from the release of the sources; `restarts` counts by operator.
+    """
+
+    graph: str
+    streams: Mapping[str, tuple[int, str]]
+    operators: Mapping[str, OperatorCounts]
+    drops: Mapping[str, tuple[tuple[str, str, int], ...]]
+    summaries: Mapping[str, Mapping[str, Any]]
+    transport: Mapping[str, Mapping[str, int]]
+    files: Mapping[str, Mapping[str, Any]]
+    verifications: tuple[Mapping[str, Any], ...]
+    first: int | None
+    last: int | None
+    wall: float
+    interrupted: bool
+    notes: tuple[str, ...]
+    restarts: Mapping[str, int] = field(default_factory=dict)
+
+    def digests(self) -> dict[str, str]:
+        return {stream: digest for stream, (_, digest) in sorted(self.streams.items())}
+
+
+class RunFailed(RuntimeError):
+    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words.
+
+    `interrupted`: it was asked to end.
+    """
+
+    def __init__(
+        self, message: str, details: str = "", operator: str | None = None, *, interrupted: bool = False
+    ) -> None:
+        super().__init__(message)
+        self.details, self.operator, self.interrupted = details, operator, interrupted
+
+    @property
+    def internal(self) -> bool:
+        """Whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
+        return self.operator is None and self.details.startswith("Traceback")

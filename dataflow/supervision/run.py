@@ -1,0 +1,117 @@
+"""Runs and replays graphs: what the command line, tests and other programs call."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from dataflow.firing.threads import environment
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.recording.facts import machine_facts
+from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
+from dataflow.supervision.live import supervisor_of
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.replay import plan_replay
+from dataflow.supervision.report import RunReport, Status
+from dataflow.supervision.supervisor import Supervisor
+
+Watch = Callable[[Status], None]
+
+
+def run(graph: Graph, *, watch: Watch | None = None, **options: Any) -> RunReport:
+    """Runs a graph's own sources. Options are the fields of `RunPlan`. Raises `RunFailed`."""
+    return execute(RunPlan(graph, **options), mode="run", watch=watch)
+
+
+def replay(
+    path: Path,
+    *,
+    graph: Graph | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    watch: Watch | None = None,
+    **options: Any,
+) -> RunReport:
+    """Replays a recording through the graph that made it, or another one with the same sources.
+
+    `start` and `end` are seconds from the recording's first message. Further options are the fields of `RunPlan`.
+    Raises `ReplayError`, `RunFailed`.
+    """
+    with Recording(path) as recording:
+        played = graph or recorded_graph(recording)
+        log = plan_replay(recording, played, start=start, end=end)
+    return execute(RunPlan(played, log=log, **options), mode="replay", watch=watch)
+
+
+def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunReport:
+    """Runs a plan under a supervisor; Ctrl-C asks it for an orderly end, a second one ends it at once."""
+    for file in (plan.record, plan.view_file):
+        if file is not None:
+            file.parent.mkdir(parents=True, exist_ok=True)
+    if plan.record is not None:
+        plan = replace(plan, metadata=_metadata(plan, mode))
+    supervisor = supervisor_of(plan)
+    with _interrupts(supervisor.stop), _watching(supervisor, watch):
+        return supervisor.run()
+
+
+def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
+    placed = {node: label for label, nodes in plan.graph.hosts(plan.placement).items() for node in nodes}
+    run_facts = {
+        "mode": mode,
+        "started": str(time.time_ns()),
+        "rate": "as fast as it goes" if plan.rate is None else str(plan.rate),
+        "seed": str(plan.graph.seed),
+        "threads": str(plan.graph.threads),
+        **{f"host of {node}": label for node, label in placed.items()},
+    }
+    facts = machine_facts(environment(plan.graph.threads))
+    return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}
+
+
+@contextmanager
+def _interrupts(stop: Callable[[], None]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM call `stop` while the graph runs (in the main thread; elsewhere they are left alone)."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        stop()
+
+    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _watching(supervisor: Supervisor, watch: Watch | None, period: float = 0.2) -> Iterator[None]:
+    """Calls `watch` with the status a few times a second, and once at the end."""
+    if watch is None:
+        yield
+        return
+    over = threading.Event()
+
+    def loop() -> None:
+        while not over.wait(period):
+            watch(supervisor.status)
+
+    thread = threading.Thread(target=loop, name="watch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join(timeout=2.0)
+        watch(supervisor.status)

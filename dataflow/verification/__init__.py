@@ -1,0 +1,1 @@
+"""Compares a re-execution with what was recorded."""

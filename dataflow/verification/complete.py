@@ -1,0 +1,219 @@
+"""Completes a thin recording: what was not recorded is computed again, by the recorded firings, and stored.
+
+The result holds what a full recording of the same run would: its drops, timeouts and late messages are repeated, since
+the firing records say which messages each call was given.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from dataflow.graph.model import Graph
+from dataflow.process.recorder import RecorderSink
+from dataflow.recording import Recording
+from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.records.firing import decode_batch
+from dataflow.reexecution.engine import Feeding, Recomputation
+from dataflow.reexecution.recorded import Verification
+from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+from dataflow.supervision.replay import plan_replay
+from dataflow.supervision.report import OperatorCounts, Status
+from dataflow.supervision.run import Watch
+from dataflow.sync import Entry
+from dataflow.verification.ledger import read_ledger
+from dataflow.verification.verify import require_records
+from dataflow.verification.worker import Tell, apart
+
+"""Metadata of a completed recording: what it was completed from, and by which version."""
+
+
+@dataclass(frozen=True, slots=True)
+class Completion:
+    """What completing a recording came to.
+
+    `added`: streams that the thin recording did not hold. `messages` of all streams; `kept` of them were recorded, but
+    no firing could be made again that made them, so they were taken over. Nothing is left at `path` when an operator
+    made anything other than recorded; where firings could not be made again, what was not recorded is missing.
+    """
+
+    path: Path
+    operators: tuple[Verification, ...]
+    added: tuple[str, ...]
+    messages: int
+    kept: int
+    nbytes: int
+    wall: float
+
+    @property
+    def stored(self) -> bool:
+        """Whether there is a file: everything that was made again is as recorded."""
+        return not any(v.first for v in self.operators)
+
+    @property
+    def whole(self) -> bool:
+        """Every firing of the run was made again, and made what it had made."""
+        return not self.kept and all(v.verdict == "identical" and not v.cut for v in self.operators)
+
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "path": str(self.path) if self.stored else None,
+            "stored": self.stored,
+            "whole": self.whole,
+            "added": list(self.added),
+            "messages": self.messages,
+            "kept": self.kept,
+            "bytes": self.nbytes,
+            "wall_s": self.wall,
+            "operators": [v.to_wire() | {"verdict": v.verdict} for v in self.operators],
+        }
+
+
+def complete(
+    path: Path, out: Path, *, graph: Graph | None = None, overwrite: bool = False, watch: Watch | None = None
+) -> Completion:
+    """Writes the complete recording of the run that the thin recording `path` is of.
+
+    The new file holds the recorded streams and firing records as they are, and every other stream as the operators make
+    it again. It appears under its name only when it is done and every message has the recorded digest.
+    Raises `ReplayError` when `path` lacks what is needed (a sensor stream, firing records), `RunFailed` when an
+    operator cannot run, `RecordingError` when the file cannot be written.
+    """
+    with Recording(path) as recording:
+        played = graph or recorded_graph(recording)
+        _plan(recording, played)  # refuses here what would fail there
+    part = out.with_name(f"{out.name}.part")
+    request = {"path": str(path), "part": str(part), "graph": played.to_json()}
+    status = Status(phase="running")
+    try:
+        found = apart(f"{__name__}:answer", request, threads=played.threads, told=_shows(status, watch))
+        made = Completion(
+            path=out,
+            operators=tuple(Verification.from_wire(v) for v in found["operators"]),
+            added=tuple(found["added"]),
+            messages=found["messages"],
+            kept=found["kept"],
+            nbytes=part.stat().st_size,
+            wall=found["wall"],
+        )
+        if made.stored:
+            if out.exists() and not overwrite:
+                raise FileExistsError(errno.EEXIST, "the file exists", str(out))
+            part.replace(out)
+        return made
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _plan(recording: Recording, graph: Graph) -> Feeding:
+    again = [name for name, node in graph.nodes.items() if not node.source and not node.external]
+    require_records(recording, again)
+    replaced = set(graph.nodes) - set(again)
+    return Feeding(tuple(again), plan_replay(recording, graph, replaced=replaced).streams)
+
+
+def _shows(status: Status, watch: Watch | None) -> Tell | None:
+    if watch is None:
+        return None
+
+    def told(fields: Mapping[str, Any]) -> None:
+        status.operators = {name: OperatorCounts(*counts) for name, counts in fields["counts"].items()}
+        watch(status)
+
+    return told
+
+
+def answer(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
+    """`complete`, in the process that does it."""
+    graph = Graph.from_json(request["graph"])
+    part = Path(request["part"])
+    started = time.monotonic()
+    with Recording(request["path"]) as recording:
+        feeding = _plan(recording, graph)
+        store = _Store(recording, graph, feeding, part)
+        work = Recomputation(recording, graph, feeding, made=store.take, read=store.take, ended=store.sink.end)
+
+        def progress() -> bool:
+            counts = {n: [r.firings, r.ports.emitted, 0, r.busy_ns, r.done] for n, r in work.runners.items()}
+            tell({"counts": counts})
+            return any(runner.result.first for runner in work.runners.values())
+
+        results = work.run(until=progress)
+        ledger = read_ledger(recording, graph, feeding.operators)
+        for result in results.values():
+            ledger.enter(result)
+        kept = store.keep(recording)
+        messages = store.close()
+        added = sorted(s for s in store.streams if s not in recording.streams)
+    return {
+        "operators": [results[name].to_wire() for name in feeding.operators],
+        "added": added,
+        "messages": messages,
+        "kept": kept,
+        "wall": time.monotonic() - started,
+    }
+
+
+class _Store:
+    """The new recording: metadata, events and firing records as they were, then every stream."""
+
+    def __init__(self, recording: Recording, graph: Graph, feeding: Feeding, part: Path) -> None:
+        made = {s for name in feeding.operators for s in graph.nodes[name].outputs.values()}
+        self.streams = sorted(made | set(feeding.streams))
+        self._outcome = recording.metadata.get(OUTCOME, {}).get("outcome", "unknown: the recording is torn")
+        metadata = {
+            name: dict(values)
+            for name, values in recording.metadata.items()
+            if name not in RESERVED_METADATA and name not in (ENDS, OUTCOME)
+        }
+        metadata[COMPLETED] = {"from": recording.path.name, "by": f"robot-dataflow {version('robot-dataflow')}"}
+        options = {"metadata": metadata, "compression": "zstd", "overwrite": True}
+        self.sink = RecorderSink(part, graph, self.streams, options)
+        for stream, end in recording.metadata.get(ENDS, {}).items():
+            known = json.loads(end)
+            self.sink.end(stream, known["final"], known["reason"])
+        for event in recording.events():
+            self.sink.writer.write_event(event.name, event.stamp, event.data)
+        for operator, payload in recording.firings():
+            self.sink.firings(operator, decode_batch(payload).records[-1].stamp, payload)
+        self._copied = 0
+        self._taken: dict[str, set[tuple[int, int]]] = {stream: set() for stream in self.streams}
+        for stream in sorted(recording.streams.keys() - graph.streams.keys()):
+            self._copy(recording, stream)
+
+    def _copy(self, recording: Recording, stream: str) -> None:
+        """A stream that no operator makes: the runtime's own, such as its diagnostics."""
+        info = recording.streams[stream]
+        if info.message_type is None:
+            raise ReplayError(f"{recording.path}: stream {stream!r} holds {info.schema}, which is not known here")
+        extra = {name: info.metadata[name] for name in ("operator", "port") if name in info.metadata}
+        self.sink.writer.add_stream(stream, info.message_type, static=info.static, extra=extra)
+        for found in recording.messages([stream]):
+            self.sink.writer.write(stream, found.message, seq=found.seq, incarnation=found.incarnation)
+            self._copied += 1
+
+    def take(self, stream: str, entry: Entry) -> None:
+        self._taken[stream].add((entry.incarnation, entry.seq))
+        self.sink.message(stream, entry.value, entry.seq, entry.incarnation)
+
+    def keep(self, recording: Recording) -> int:
+        """Takes over the recorded messages that were not made again; how many."""
+        kept = 0
+        for stream, taken in self._taken.items():
+            if sum(recording.counts(stream).values()) <= len(taken):
+                continue
+            for found in recording.messages([stream]):
+                if (found.incarnation, found.seq) not in taken:
+                    self.sink.message(stream, found.message, found.seq, found.incarnation)
+                    kept += 1
+        return kept
+
+    def close(self) -> int:
+        self.sink.close(self._outcome)
+        return self.sink.messages + self._copied

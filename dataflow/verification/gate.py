@@ -1,0 +1,301 @@
+"""The regression gate: many recordings verified, each judged against itself or against an accepted baseline."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import traceback
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from dataflow.graph.model import Graph
+from dataflow.messages import MessageError
+from dataflow.operator import ParameterError
+from dataflow.recording import Recording, RecordingError
+from dataflow.records.firing import FiringRecordError
+from dataflow.reexecution.recorded import Verification
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.report import RunFailed
+from dataflow.verification.verify import VerifyReport
+
+FORMAT = 1
+
+OperatorVerdict = Literal[
+    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "unverifiable"
+]
+RecordingVerdict = Literal[
+    "identical",
+    "identical up to the cut",
+    "within tolerance",
+    "accepted",
+    "different",
+    "not wholly verified",
+    "could not run",
+]
+PASSES = ("identical", "identical up to the cut", "within tolerance", "accepted")
+"""The verdicts with which the gate lets pass."""
+
+Outcome = Mapping[str, Any]
+"""What an operator that differs made here: digests of its streams, how much differs, and the first difference."""
+
+
+class BaselineError(ValueError):
+    """A baseline file that cannot be read: says what is wrong with it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Judged:
+    """One operator of one recording, measured by what is expected of it: the recording, or the accepted outcome.
+
+    `firm`: every call was repeated, and neither it nor what it depends on came out otherwise when run again. Only that
+    can be accepted.
+    """
+
+    operator: str
+    verdict: OperatorVerdict
+    outcome: Outcome | None = None
+    firm: bool = True
+
+    @property
+    def passed(self) -> bool:
+        return self.verdict in PASSES
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """One recording: its report and the verdicts, or why there is none. `wall`: seconds in all.
+
+    `internal`: `details` is a traceback of the runtime's own code. `not_in_graph`: recorded operators that the graph
+    lacks.
+    """
+
+    path: Path
+    name: str
+    report: VerifyReport | None
+    judged: tuple[Judged, ...] = ()
+    error: str = ""
+    details: str = ""
+    wall: float = 0.0
+    internal: bool = False
+    not_in_graph: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> RecordingVerdict:
+        found = {j.verdict for j in self.judged}
+        if self.report is None:
+            return "could not run"
+        if found & {"culprit", "downstream", "not as accepted"}:
+            return "different"
+        if "unverifiable" in found:
+            return "not wholly verified"
+        if "accepted" in found:
+            return "accepted"
+        if "within tolerance" in found:
+            return "within tolerance"
+        return "identical up to the cut" if self.report.cut else "identical"
+
+    @property
+    def passed(self) -> bool:
+        return self.verdict in PASSES
+
+    @property
+    def culprits(self) -> tuple[str, ...]:
+        """The operators to look at."""
+        return tuple(j.operator for j in self.judged if j.verdict in ("culprit", "not as accepted"))
+
+    def as_json(self) -> dict[str, Any]:
+        value = {"recording": self.name, "verdict": self.verdict, "passed": self.passed, "total_wall_s": self.wall}
+        if self.report is None:
+            return value | {"error": self.error}
+        report = self.report.as_json()
+        verdicts = {j.operator: j.verdict for j in self.judged}
+        for operator in report["operators"]:
+            operator["verdict"] = verdicts[operator["operator"]]
+        return value | report | {"culprits": list(self.culprits), "not_in_graph": list(self.not_in_graph)}
+
+
+@dataclass(slots=True)
+class Baseline:
+    """The outcomes that were accepted although they are not what was recorded: recording → operator → outcome.
+
+    Recordings go by their path from the baseline file's folder, so the file can be kept beside them under version
+    control and used from anywhere.
+    """
+
+    file: Path
+    accepted: dict[str, dict[str, Outcome]] = field(default_factory=dict)
+
+    @staticmethod
+    def load(file: Path) -> Baseline:
+        """Raises `BaselineError`, `OSError`. A file that does not exist accepts nothing."""
+        if not file.exists():
+            return Baseline(file)
+        try:
+            value = json.loads(file.read_text(encoding="utf-8"))
+            if value["format"] != FORMAT:
+                raise BaselineError(f"{file}: a baseline of format {value['format']!r}; this version reads {FORMAT}")
+            accepted = {str(name): dict(operators) for name, operators in value["accepted"].items()}
+        except BaselineError:
+            raise
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise BaselineError(
+                f"{file} is not a baseline: {type(error).__name__}: {error}; `dataflow verify ... --accept` writes one"
+            ) from error
+        return Baseline(file, accepted)
+
+    def save(self) -> None:
+        text = json.dumps({"format": FORMAT, "accepted": self.accepted}, indent=2, sort_keys=True, ensure_ascii=False)
+        self.file.parent.mkdir(parents=True, exist_ok=True)
+        part = self.file.with_name(f"{self.file.name}.part")
+        part.write_text(text + "\n", encoding="utf-8")
+        part.replace(self.file)
+
+    def name_of(self, recording: Path) -> str:
+        return Path(os.path.relpath(recording.resolve(), self.file.parent.resolve())).as_posix()
+
+    def of(self, recording: Path) -> Mapping[str, Outcome]:
+        return self.accepted.get(self.name_of(recording), {})
+
+    def accept(self, checked: Checked) -> tuple[list[str], list[str]]:
+        """Takes over what a recording came to. (operators accepted anew or otherwise, operators that cannot be)."""
+        outcomes = {j.operator: j.outcome for j in checked.judged if j.outcome is not None and j.firm}
+        refused = [
+            j.operator for j in checked.judged if not j.firm and (j.outcome is not None or j.verdict == "unverifiable")
+        ]
+        before = self.of(checked.path)
+        changed = [name for name in {**before, **outcomes} if before.get(name) != outcomes.get(name)]
+        name = self.name_of(checked.path)
+        if outcomes:
+            self.accepted[name] = outcomes
+        else:
+            self.accepted.pop(name, None)
+        return sorted(changed), refused
+
+    def unused(self, checked: Iterable[Checked]) -> list[str]:
+        """Recordings that the baseline names and that were not among those verified."""
+        return sorted(self.accepted.keys() - {self.name_of(c.path) for c in checked})
+
+
+def recordings_in(targets: Sequence[Path]) -> list[tuple[Path, str]]:
+    """Files as they are, of folders every .mcap in them, at any depth: (path, name to show).
+
+    Raises `ReplayError` for what is not there, and for a folder that holds no recording.
+    """
+    found: dict[Path, str] = {}
+    for target in targets:
+        if target.is_dir():
+            inside = sorted(p for p in target.rglob("*.mcap") if p.is_file())
+            if not inside:
+                raise ReplayError(f"folder {target} holds no recording (no .mcap file, at any depth)")
+            found |= {path: path.relative_to(target).as_posix() for path in inside if path not in found}
+        elif target.exists():
+            found.setdefault(target, target.name)
+        else:
+            raise ReplayError(f"no file or folder {target}")
+    names = list(found.values())
+    return [(path, name if names.count(name) == 1 else str(path)) for path, name in found.items()]
+
+
+def check(
+    path: Path,
+    name: str,
+    verify: Callable[[Path], VerifyReport],
+    accepted: Mapping[str, Outcome] | None = None,
+    graph: Graph | None = None,
+) -> Checked:
+    """Verifies one recording and judges it; whatever prevents that becomes its `error`.
+
+    `graph`: the one that it is verified against, where that is not the recorded one.
+
+    Raises only `RunFailed` for a run that was interrupted.
+    """
+    started = time.monotonic()
+
+    def could_not(error: str, details: str = "", *, internal: bool = False) -> Checked:
+        return Checked(path, name, None, (), error, details, time.monotonic() - started, internal)
+
+    try:
+        report = verify(path)
+    except RunFailed as failure:
+        if failure.interrupted:
+            raise
+        return could_not(str(failure), failure.details, internal=failure.internal)
+    except (RecordingError, ReplayError, FiringRecordError, MessageError, ParameterError, OSError) as error:
+        return could_not(str(error))
+    except (
+        Exception
+    ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
+        return could_not(f"{type(error).__name__}: {error}", traceback.format_exc(), internal=True)
+    missing = () if graph is None else recorded_but_not_in(graph, path)
+    judged = judge(report, accepted or {})
+    return Checked(path, name, report, judged, wall=time.monotonic() - started, not_in_graph=missing)
+
+
+def recorded_but_not_in(graph: Graph, path: Path) -> tuple[str, ...]:
+    """The operators with firing records in a recording that a graph does not have."""
+    with Recording(path) as recording:
+        return tuple(name for name in recording.firing_batches() if name not in graph.nodes)
+
+
+def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged, ...]:
+    """The verdict on each operator, given what has been accepted.
+
+    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well. Where
+    calls could not be repeated, neither a tolerance nor an accepted outcome lets it pass.
+    """
+    outcomes = {v.operator: outcome_of(report, v) for v in report.operators}
+    unexpected = {
+        v.operator
+        for v in report.operators
+        if outcomes[v.operator] is not None and outcomes[v.operator] != accepted.get(v.operator)
+    }
+    unsteady = {v.operator for v in report.operators if report.repeats(v.operator) is False}
+    judged = []
+    for v in report.operators:
+        own, outcome = report.verdict(v), outcomes[v.operator]
+        verdict: OperatorVerdict = own
+        if v.operator in accepted and outcome is None and v.whole:
+            verdict = "not as accepted"
+        elif outcome is not None and v.operator not in unexpected:
+            verdict = "accepted"
+        elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
+            verdict = "culprit"
+        if verdict in PASSES and not v.whole:
+            verdict = "unverifiable"
+        steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
+        judged.append(Judged(v.operator, verdict, outcome, v.whole and steady))
+    return tuple(judged)
+
+
+def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | None:
+    """What an operator made here, where that is not what was recorded."""
+    first = verification.first
+    if first is None or report.verdict(verification) == "within tolerance":
+        return None
+    streams = {s: report.digests[s] for s in report.outputs.get(verification.operator, ()) if s in report.digests}
+    return {
+        "streams": {stream: {"messages": count, "digest": digest} for stream, (count, digest) in streams.items()},
+        "differing": verification.differing,
+        "first": {"firing": first.index, "stamp": first.stamp, "port": first.port, "got": first.got},
+    }
+
+
+def _led_astray(operator: str, unexpected: Collection[str], producers: Mapping[str, frozenset[str]]) -> bool:
+    """Whether an operator depends on an unexpected one that does not in turn depend on it."""
+    return any(
+        other != operator and operator not in _upstream(other, producers)
+        for other in _upstream(operator, producers) & set(unexpected)
+    )
+
+
+def _upstream(operator: str, producers: Mapping[str, frozenset[str]]) -> set[str]:
+    found: set[str] = set()
+    left = [operator]
+    while left:
+        new = producers.get(left.pop(), frozenset()) - found
+        found |= new
+        left += new
+    return found
