@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from dataflow.graph.expand import Expander
+from dataflow.graph.limits import MAX_BUNDLE, MAX_TEXT
 from dataflow.graph.model import Bundle, Graph
 from dataflow.graph.problems import Place, Problems
 from dataflow.graph.resolve import Resolver
@@ -37,6 +39,8 @@ def load_text(
 def load_bundle(bundle: str) -> Graph:
     """The graph that `Graph.bundle()` packed, without its files and environment. Raises `GraphError`."""
     try:
+        if len(bundle) > MAX_BUNDLE:
+            raise ValueError(f"it has {len(bundle):,} characters; it may have {MAX_BUNDLE:,}")
         data = json.loads(bundle)
         if data["format"] != BUNDLE_FORMAT:
             raise ValueError(f"its format is {data['format']!r}, this version reads {BUNDLE_FORMAT!r}")
@@ -46,7 +50,7 @@ def load_bundle(bundle: str) -> Graph:
             tuple(str(word) for word in data["settings"]),
             {str(name): None if word is None else str(word) for name, word in data["environment"].items()},
         )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         problems = Problems()
         problems.add(Place("bundle", 1, 1), f"not a graph bundle: {type(error).__name__}: {error}")
         problems.check()
@@ -84,7 +88,16 @@ def _load(
 
 
 def _reader(folder: Path) -> Callable[[str], str]:
-    return lambda key: (folder / key).read_text(encoding="utf-8")
+    """Reads no more of a file than tells that it is too long, and no device or pipe."""
+
+    def read(key: str) -> str:
+        path = folder / key
+        if path.exists() and not path.is_file():
+            raise OSError(errno.EINVAL, "not a regular file")
+        with path.open(encoding="utf-8") as file:
+            return file.read(MAX_TEXT + 1)
+
+    return read
 
 
 def _from(texts: Mapping[str, str], key: str) -> str:
