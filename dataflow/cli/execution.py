@@ -14,10 +14,12 @@ from dataflow.cli.arguments import (
     FLAG,
     End,
     GraphFile,
+    ModuleFolders,
     RecordingFile,
     Settings,
     Start,
     existing,
+    find_modules_in,
     output_file,
     span,
     window,
@@ -124,6 +126,7 @@ class _Outputs:
 def run(
     graph: GraphFile,
     settings: Settings = None,
+    path: ModuleFolders = None,
     rate: Rate = None,
     patience: Patience = 120.0,
     live: Live = False,
@@ -167,6 +170,7 @@ def run(
     with friendly_errors():
         if chaos_seed is not None and chaos is None:
             raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+        find_modules_in(path)
         live = live or chaos is not None
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
         outputs = _outputs(record, view, open_view, overwrite)
@@ -184,6 +188,7 @@ def replay(
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
     settings: Settings = None,
+    path: ModuleFolders = None,
     start: Start = None,
     end: End = None,
     rate: Rate = None,
@@ -246,6 +251,7 @@ def replay(
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
         with Recording(recording) as opened:
             if graph is None:
                 loaded = recorded_graph(opened)

@@ -9,7 +9,7 @@ import typer
 from rich.padding import Padding
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, GraphFile, Json, Settings, existing
+from dataflow.cli.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, existing, find_modules_in
 from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say
 
 if TYPE_CHECKING:
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 def check(
     graphs: Annotated[list[Path], typer.Argument(metavar="GRAPH...", help="Graph files (.yaml).")],
     settings: Settings = None,
+    path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
     """Check graph files wholly, without running them.
@@ -35,24 +36,25 @@ def check(
 
     faults: list[Problem] = []
     faulty = 0
-    for path in graphs:
-        existing(path, "a graph file")
-    for path in graphs:
+    for file in graphs:
+        existing(file, "a graph file")
+    find_modules_in(path)
+    for file in graphs:
         with friendly_errors():
             try:
-                graph = load_graph(path, settings=settings or ())
+                graph = load_graph(file, settings=settings or ())
             except GraphError as error:
                 faults += error.problems
                 faulty += 1
                 if not json:
                     out.print(
-                        Text.assemble(("faults", "bold red"), f"  {path}: {plural(len(error.problems), 'fault')}")
+                        Text.assemble(("faults", "bold red"), f"  {file}: {plural(len(error.problems), 'fault')}")
                     )
                     out.print(Text(str(error)), soft_wrap=True)
                 continue
         if not json:
             what = f"{plural(len(graph.nodes), 'operator')}, {plural(len(graph.streams), 'stream')}"
-            out.print(Text.assemble(("ok", "green"), f"  {path}: {what}"), soft_wrap=True)
+            out.print(Text.assemble(("ok", "green"), f"  {file}: {what}"), soft_wrap=True)
     if json:
         print_json({"ok": not faults, "problems": [problem.to_json() for problem in faults]})
     elif len(graphs) > 1 and faulty:
@@ -64,6 +66,7 @@ def check(
 def show(
     graph: GraphFile,
     settings: Settings = None,
+    path: ModuleFolders = None,
     mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
     svg: Annotated[Path | None, typer.Option("--svg", metavar="FILE.svg", help="Write a picture.")] = None,
     json: Json = False,
@@ -83,6 +86,7 @@ def show(
             raise fail("--json, --mermaid and --svg exclude each other")
         if svg is not None and svg.suffix != ".svg":
             raise fail(f"--svg {svg}: expected a file name that ends in .svg")
+        find_modules_in(path)
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
         if json:
             print_json(loaded.to_json())
@@ -101,6 +105,7 @@ def operators(
         str | None,
         typer.Argument(metavar="NAME", help="One operator: its ports, parameters and documentation."),
     ] = None,
+    path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
     """List the operators that are installed, or describe one.
@@ -114,6 +119,7 @@ def operators(
     from dataflow.graph import catalogue
 
     with friendly_errors():
+        find_modules_in(path)
         found = catalogue.discover()
         if name is None:
             if json:

@@ -112,9 +112,7 @@ app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 
 def main() -> None:
-    """The console script. Operators may lie in the folder it is called from."""
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
+    """The console script."""
     try:
         app()
     except Exception as error:  # a fault of ours, or of a plug-in
@@ -127,4 +125,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    if not sys.flags.safe_path:
+        del sys.path[0]  # the current folder: what lies there must not replace installed modules
     main()

@@ -132,6 +132,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
             return f"\n{error}", "", COULD_NOT_RUN
         case RunFailed():
             details = own_traceback(error.details) if error.internal else error.details
+            if _about_a_file(error.details) and not wants_traceback():
+                details = ""  # the message names the file; where in the operator it was opened does not help
             return str(error), details, INTERRUPTED if error.interrupted else DIFFERENT
         case BrokenPipeError():
             return None
@@ -140,6 +142,15 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         case _ if isinstance(error, known) or (viewer is not None and isinstance(error, viewer.ViewerError)):
             return str(error), "", COULD_NOT_RUN
     return None
+
+
+_FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", "PermissionError", "DatasetError")
+
+
+def _about_a_file(details: str) -> bool:
+    """Whether a traceback ends with a file that is missing or cannot be read."""
+    last = details.rstrip().rpartition("\n")[2].partition(":")[0]
+    return details.startswith("Traceback") and last.rpartition(".")[2] in _FILE_ERRORS
 
 
 def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from dataflow.cli.arguments import FLAG, Json, Settings, check_offset, existing, output_file
+from dataflow.cli.arguments import (
+    FLAG,
+    Json,
+    ModuleFolders,
+    Settings,
+    check_offset,
+    existing,
+    find_modules_in,
+    output_file,
+)
 from dataflow.cli.execution import HostEach, OneHost, Quiet
 from dataflow.cli.output import (
     COULD_NOT_RUN,
@@ -40,6 +49,7 @@ def verify(
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
     settings: Settings = None,
+    path: ModuleFolders = None,
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
     ] = None,
@@ -141,6 +151,7 @@ def verify(
             known = None if baseline is None else Baseline.load(baseline)
         except BaselineError as error:
             raise fail(str(error)) from None
+        find_modules_in(path)
         loaded = None if graph is None else load_graph(existing(graph, "a graph file"), settings=settings or ())
         options: dict[str, Any] = {
             "graph": loaded,

@@ -104,7 +104,7 @@ def _view_recording(
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+    from dataflow.reexecution.recorded_run import wiring
     from dataflow.view import Serve, from_recording
 
     with Recording(path) as opened:
@@ -115,10 +115,9 @@ def _view_recording(
         chosen = chosen_streams(streams, readable, namespace)
         if not any(opened.streams[name].count for name in chosen):
             raise fail(f"{path} holds no message of {', '.join(chosen)}")
-        try:
-            graph = _showing(recorded_graph(opened), streams and chosen)
-        except ReplayError:
-            graph = None  # somebody else's recording: drawn without a graph
+        graph = wiring(opened)
+        if graph is not None:
+            graph = _showing(graph, streams and chosen)
         whole = span(opened, chosen)
         begin, finish = window(whole, start, end, path)
         first, last = whole or (0, 0)
@@ -258,15 +257,18 @@ def attached_viewer(target: str | None) -> Iterator[None]:
     if target is None:
         yield
         return
+    from dataflow.graph.search import import_path
+
     say(f"[dim]starting the viewer ({target})[/]")
     words = ["view", "--graph", str(os.getpid()), "--to", target, "--wait", "3600", "--until-end"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "dataflow.cli.main", *words],
+        [sys.executable, "-P", "-m", "dataflow.cli.main", *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         process_group=0,
+        env={**os.environ, "PYTHONPATH": import_path()},
     )
     ready, following = threading.Event(), threading.Event()
     reader = threading.Thread(target=_relay, args=(process, ready, following), daemon=True)

@@ -29,6 +29,9 @@ TOP_KEYS = (
 )  # fmt: skip
 OPERATOR_KEYS = ("use", "inputs", "params", "process", "machine", "live", "sync")
 NESTED_KEYS = ("use", "inputs", "params", "process", "machine")
+FOLDER = "graph:folder"
+"""The reference that stands for the folder of the file it is written in."""
+
 ReadFile = Callable[[str], str]
 """Text of a graph file by its path relative to the root file's folder; raises OSError or UnicodeDecodeError."""
 
@@ -118,17 +121,19 @@ class _Scope:
 
 
 class Expander:
-    """Unfolds a root file. `shown(path)` is how a file is called in messages."""
+    """Unfolds a root file. `shown(path)` is how a file is called in messages, `folder()` the root file's folder."""
 
     def __init__(
         self,
         read: ReadFile,
         shown: Callable[[str], str],
         variable: Callable[[str], str | None],
+        folder: Callable[[], str],
         settings: Sequence[str],
         problems: Problems,
     ) -> None:
         self.read, self.shown, self.variable, self.problems = read, shown, variable, problems
+        self.folder = folder
         self.fields = Fields(problems)
         self.budget = Budget(problems)
         self.members = 0
@@ -187,7 +192,7 @@ class Expander:
             return None
         declared, values = self.parameters(table, scope)
         rest = Table({k: e for k, e in table.entries.items() if k != "params"}, table.place)
-        done = document.substitute(rest, self.lookup(declared, values), self.problems, self.budget)
+        done = document.substitute(rest, self.lookup(scope, declared, values), self.problems, self.budget)
         assert isinstance(done, Table)
         return done
 
@@ -298,14 +303,16 @@ class Expander:
                 self.problems.add(entry.key.place, f"parameter name {fault}", NAME_RULE)
             value = given.get(name, entry.value)
             if name not in given:  # what comes from outside is complete already
-                value = document.substitute(value, self.lookup(seen, values, later), self.problems, self.budget)
+                value = document.substitute(value, self.lookup(scope, seen, values, later), self.problems, self.budget)
             seen.append(name)
             if not (isinstance(value, Leaf) and value.value is None):
                 values[name] = value
         return seen, values
 
-    def lookup(self, declared: Sequence[str], values: Mapping[str, Tree], later: Sequence[str] = ()) -> document.Lookup:
-        """How `${...}` is answered where `declared` names are in force."""
+    def lookup(
+        self, scope: _Scope, declared: Sequence[str], values: Mapping[str, Tree], later: Sequence[str] = ()
+    ) -> document.Lookup:
+        """Answers `${...}` where `declared` names are in force."""
 
         def find(reference: Reference) -> Tree | None:
             self.budget.charge(reference.place, REFERENCE_COST)
@@ -326,6 +333,10 @@ class Expander:
                     )
                 return default
             name = reference.name
+            if name == FOLDER:
+                inner = posixpath.dirname(scope.file)
+                folder = posixpath.join(self.folder(), inner) if inner else self.folder()
+                return Leaf(folder, reference.place, folder)
             if name in values:
                 return values[name]
             if name in declared:

@@ -192,13 +192,15 @@ class Bundle:
     """Everything that a graph was loaded from, so that it can be loaded again where the files are not.
 
     `files` maps a path relative to the root file's folder (the root file itself by its name) to its text; `settings`
-    are the `--set` words; `environment` holds the variables that `${env:NAME}` asked for (None: not set).
+    are the `--set` words; `environment` holds the variables that `${env:NAME}` asked for (None: not set); `folder` is
+    the root file's folder as the graph was named, where `${graph:folder}` asked for it.
     """
 
     file: str
     files: Mapping[str, str]
     settings: tuple[str, ...] = ()
     environment: Mapping[str, str | None] = field(default_factory=dict)
+    folder: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -116,7 +116,7 @@ CASES = {
     "unknown_module": (
         operator("c: {use: graph_operater:Camera}"),
         "4:12: no module 'graph_operater'",
-        "did you mean 'graph_operators'?",
+        "did you mean 'graph_operators'?\nlooked among the installed packages; --path DIR names another folder",
     ),
     "unknown_class": (
         operator('c: {use: "graph_operators:Camra"}'),
