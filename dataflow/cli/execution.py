@@ -269,7 +269,8 @@ def replay(
             whole = span(opened, plan_replay(opened, loaded).streams)
             begin, finish = window(whole, start, end, recording)
             if opened.torn:
-                say(f"[yellow]{recording} has no proper end:[/] what its writer had not stored when it died is missing")
+                name = escape(str(recording))
+                say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
             if begin is not None:
                 _say_what_begins_fresh(opened, loaded)
         outputs = _outputs(record, view, open_view, overwrite)
@@ -293,7 +294,7 @@ def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
 
     for node in graph.nodes.values():
         if not node.source and (reason := fresh_because(recording, graph, node)) is not None:
-            say(f"[yellow]{node.name} begins with fresh state:[/] {escape(reason)}")
+            say(f"[yellow]{escape(node.name)} begins with fresh state:[/] {escape(reason)}")
 
 
 def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:
@@ -414,4 +415,4 @@ def _say_what_is_left(before: dict[Path, tuple[int, int] | None]) -> None:
     """After a failure: which files hold what came before it, other than those that were there already."""
     for file, earlier in before.items():
         if file.exists() and _written(file) != earlier:
-            say(f"[dim]{file} ({size(file.stat().st_size)}) holds what came before the failure[/]")
+            say(f"[dim]{escape(str(file))} ({size(file.stat().st_size)}) holds what came before the failure[/]")

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, existing, find_modules_in
-from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say
+from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say, visible
 
 if TYPE_CHECKING:
     from dataflow.graph.catalogue import Catalogue
@@ -91,7 +92,7 @@ def show(
         if json:
             print_json(loaded.to_json())
         elif mermaid:
-            print(draw.mermaid(loaded))
+            print(visible(draw.mermaid(loaded)))
         elif svg is not None:
             svg.parent.mkdir(parents=True, exist_ok=True)
             svg.write_text(draw.svg(loaded), encoding="utf-8")
@@ -148,4 +149,4 @@ def _print_operators(found: Catalogue) -> None:
         out.print(Padding(Text(flow, style="dim"), (0, 0, 0, 4)))
         out.print(Padding(Text(spec.doc.partition("\n\n")[0].replace("\n", " ")), (0, 0, 0, 4)))
     for failure in found.failures:
-        say(f"[red]failed to import[/] {failure}")
+        say(f"[red]failed to import[/] {escape(str(failure))}")

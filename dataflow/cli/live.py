@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json as json_module
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -11,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, Json, chosen_streams
@@ -19,10 +19,10 @@ from dataflow.cli.output import (
     count,
     fail,
     friendly_errors,
-    jsonable,
     out,
     plural,
     print_json,
+    print_json_line,
     say,
     seconds,
     table,
@@ -61,7 +61,7 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
     except NotRunning:
         if not wait:
             raise
-    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else name} to run")
+    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else escape(name)} to run")
     return find_running(name, wait=wait)
 
 
@@ -136,7 +136,7 @@ def echo(
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Annotated[
-        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line; numbers unrounded.")
+        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line: all data, numbers unrounded.")
     ] = False,
 ) -> None:
     """Print the messages of a running graph, as they come.
@@ -178,9 +178,9 @@ def echo(
 
 def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> None:
     if json:
-        values = {name: _json_value(value, full) for name, value in message.items() if value is not None}
+        values = {name: value for name, value in message.items() if value is not None}
         line = {"stream": stream, "type": message.SCHEMA, **values}
-        print(json_module.dumps(line, ensure_ascii=False, allow_nan=False), flush=True)
+        print_json_line(line)
         return
     from dataflow.sync.stamps import format_stamp
 
@@ -189,14 +189,6 @@ def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> 
     width = max((len(name) for name, _ in fields), default=0)
     for name, value in fields:
         out.print(Text.assemble(f"  {name:<{width}}  ", _text(value, full)), soft_wrap=True)
-
-
-def _json_value(value: Any, full: bool) -> Any:
-    import numpy as np
-
-    if isinstance(value, np.ndarray) and not full and value.size > SHOWN_ELEMENTS:
-        return f"{value.dtype}{list(value.shape)}"
-    return jsonable(value)
 
 
 def _text(value: Any, full: bool) -> str:

@@ -16,6 +16,7 @@ from dataflow.cli import execution, inspection, live, param, recordings, top, ve
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup
+from dataflow.cli.start import OutputFailed
 
 app = typer.Typer(
     name="dataflow",
@@ -112,9 +113,11 @@ app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 
 def main() -> None:
-    """The console script."""
+    """Calls the command that the arguments name."""
     try:
         app()
+    except OutputFailed:
+        raise
     except Exception as error:  # a fault of ours, or of a plug-in
         if wants_traceback():
             err.print(escape(traceback.format_exc().rstrip()), soft_wrap=True)
@@ -125,6 +128,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    from dataflow.cli.start import main as start
+
     if not sys.flags.safe_path:
         del sys.path[0]  # the current folder: what lies there must not replace installed modules
-    main()
+    start()

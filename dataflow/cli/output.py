@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import typer
 from rich import box
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.segment import Segment
 from rich.table import Table
 
 DIFFERENT = 1
@@ -31,10 +33,31 @@ PIPE_WIDTH = 120
 """Columns of tables that go into a file or a pipe, unless COLUMNS says otherwise."""
 
 
+_INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that move the cursor, change the terminal or turn the direction of text; all but tab and line feed."""
+
+
+def visible(text: str) -> str:
+    """`text` with control characters written out: names in recordings and graphs may hold anything."""
+    return _INVISIBLE.sub(lambda match: f"\\x{ord(match[0]):02x}" if ord(match[0]) < 256 else _escaped(match), text)
+
+
+def _escaped(match: re.Match[str]) -> str:
+    return f"\\u{ord(match[0]):04x}"
+
+
+class _VisibleConsole(Console):
+    """Passes everything that is printed through `visible`; styles and cursor movements of its own stay."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=visible(segment.text))
+
+
 def _console(*, stderr: bool) -> Console:
     stream = sys.stderr if stderr else sys.stdout
     piped = not stream.isatty() and "COLUMNS" not in os.environ
-    return Console(stderr=stderr, highlight=False, width=PIPE_WIDTH if piped else None)
+    return _VisibleConsole(stderr=stderr, highlight=False, width=PIPE_WIDTH if piped else None)
 
 
 out = _console(stderr=False)
@@ -42,8 +65,18 @@ err = _console(stderr=True)
 
 
 def print_json(value: Any) -> None:
-    """One JSON document on standard output."""
-    print(json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False))
+    """Prints one JSON document on standard output."""
+    print(_json(value, indent=2))
+
+
+def print_json_line(value: Any) -> None:
+    """Prints one JSON value on a line of its own, at once."""
+    print(_json(value), flush=True)
+
+
+def _json(value: Any, indent: int | None = None) -> str:
+    text = json.dumps(jsonable(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    return _INVISIBLE.sub(_escaped, text)
 
 
 def jsonable(value: Any) -> Any:

@@ -164,7 +164,7 @@ def top(
     elif once or live is not None:
         out.print(_table(rows, _title(found.name, found.started)))
     if not once:
-        err.print(f"{found.name} has ended")
+        err.print(Text(f"{found.name} has ended"))
 
 
 def _title(name: str, started: float) -> Text:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
+from rich.text import Text
 
 from dataflow.cli.arguments import End, Overwrite, Start, chosen_streams, existing, output_file, span, window
 from dataflow.cli.live import GraphName, Wait, running_graph
@@ -162,7 +163,7 @@ class _Announcer:
         from dataflow.view import Serve
 
         if not self._done and isinstance(self._sink.target, Serve):
-            err.print(f"open {self._sink.target.url}", soft_wrap=True)  # whole, so that it can be clicked
+            err.print(Text(f"open {self._sink.target.url}"), soft_wrap=True)  # whole, so that it can be clicked
         self._done = True
 
     def before(self, progress: Callable[[int], None]) -> Callable[[int], None]:
@@ -187,7 +188,7 @@ def _view_running(
     with sink:
         sink.open({name: message_type(running.streams[name].types[0]) for name in chosen}, shown)
         _Announcer(sink).announce()
-        say(f"following {running.name} (process {found.pid})")
+        say(f"following {escape(running.name)} (process {found.pid})")
         with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
             while True:
                 taken = client.take(timeout=0.5)
