@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -38,6 +39,21 @@ ModuleFolders = Annotated[
     ),
 ]
 Overwrite = Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace output files that exist.")]
+
+
+def number(low: float, high: float, meaning: str) -> Callable[[str], float]:
+    """A parser of numbers from `low` to `high`, for `typer.Option(parser=...)`; `meaning` goes into its error."""
+
+    def parse(word: str) -> float:
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise typer.BadParameter(f"{word}: expected a number from {low:g} to {high:,.0f} ({meaning})")
+        return value
+
+    return parse
 
 
 def existing(path: Path, what: str) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -37,13 +38,19 @@ if TYPE_CHECKING:
 
 GraphName = Annotated[
     str | None,
-    typer.Option("--graph", metavar="NAME", help="Which running graph, by name or process, when several run."),
+    typer.Option(
+        "--graph",
+        metavar="NAME",
+        help="Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
+    ),
 ]
 Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", help="Wait so long for the graph to run.")]
 Streams = Annotated[
     list[str] | None, typer.Argument(metavar="STREAM...", help="Streams; wildcards work. Default: all.")
 ]
 
+GRAPH_VARIABLE = "DATAFLOW_GRAPH"
+"""Environment variable: the running graph that is meant where `--graph` is not given."""
 SHOWN_ELEMENTS = 16
 """Arrays and lists up to this length are printed whole."""
 HISTORY = 2000
@@ -54,6 +61,7 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
     """The running graph of that name, or the only one; says so when it has to wait. Raises `NotRunning`."""
     from dataflow.client.attach import NotRunning, find_running
 
+    name = name or os.environ.get(GRAPH_VARIABLE) or None
     if not 0 <= wait < 1e9:
         raise fail(f"--wait {wait:g}: expected seconds, 0 or more")
     try:
@@ -105,11 +113,11 @@ def list_running(json: Json = False) -> None:
                 f", running for {seconds(time.time() - found.started)}",
             )
         )
-        streams = table("stream", "type", "taken by")
+        streams = table("stream", "type", "subscribers")
         for stream in graph.streams.values():
             takers = ", ".join(f"{node.name}.{port}" for node, port in graph.consumers(stream.name))
             kind = " | ".join(stream.types) + (" (static)" if stream.static else "")
-            streams.add_row(Text(graph.relative(stream.name)), Text(kind), Text(takers or "nobody"))
+            streams.add_row(Text(graph.relative(stream.name)), Text(kind), Text(takers or "no subscribers"))
         out.print(streams)
 
 
@@ -235,7 +243,7 @@ class _Rate:
         mean = sum(entry[3] for entry in self.seen) / len(self.seen)
         return {
             "stream": stream,
-            "messages": n1 + 1,
+            "total": n1 + 1,
             "hz_clock": made / clock if made and clock > 0 else None,
             "hz_event": made / event if made and event > 0 else None,
             "bytes": mean,
@@ -252,8 +260,8 @@ def hz(
 ) -> None:
     """Show the rates of a running graph's streams.
 
-    By the clock, by event time (the stamps), and the bandwidth. Messages that are skipped here are counted all the
-    same. Ends with the graph, after --seconds, or at Ctrl-C.
+    By the clock, by event time (the timestamps), and the bandwidth; `total` counts since the graph began. Messages that
+    are skipped here are counted all the same. Ends with the graph, after --seconds, or at Ctrl-C.
 
     Examples:
 
@@ -308,11 +316,11 @@ def _take_rate(rates: dict[str, _Rate], taken: TapMessage) -> None:
 
 
 def _rate_table(rates: dict[str, _Rate], namespace: str) -> Table:
-    numbers = ("messages", "Hz", "Hz by stamp", "kB each", "MB/s")
+    numbers = ("total", "Hz", "Hz by stamp", "kB each", "MB/s")
     shown = table("stream", *numbers, right=numbers)
     for stream, rate in sorted(rates.items()):
         row = rate.row(stream)
         cells = (row["hz_clock"], row["hz_event"], row["bytes"] * 1e-3, row["mb_per_s"])
         texts = ("" if cell is None else f"{cell:,.2f}" for cell in cells)
-        shown.add_row(Text(stream.removeprefix(f"{namespace}/")), count(row["messages"]), *texts)
+        shown.add_row(Text(stream.removeprefix(f"{namespace}/")), count(row["total"]), *texts)
     return shown

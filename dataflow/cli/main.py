@@ -15,7 +15,7 @@ from rich.markup import escape
 from dataflow.cli import execution, inspection, live, param, recordings, top, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
-from dataflow.cli.plugins import CommandGroup
+from dataflow.cli.plugins import CommandGroup, renamed
 from dataflow.cli.start import OutputFailed
 
 app = typer.Typer(
@@ -25,7 +25,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["--help", "-h"]},
+    context_settings={"help_option_names": ["--help", "-h"], "token_normalize_func": renamed},
 )
 
 
@@ -52,7 +52,7 @@ def dataflow(
         ),
     ] = False,
 ) -> None:
-    """Robot perception as a dataflow graph: run it live, record it, replay it bit for bit, see it.
+    """Deterministic record and replay for robot perception: run a graph live, record it, replay it bit for bit, see it.
 
     Results go to standard output, progress and errors to standard error.
 

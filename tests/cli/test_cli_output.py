@@ -184,3 +184,23 @@ def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkey
         with pytest.raises(typer.Exit), friendly_errors():
             raise failure
         assert ("Traceback" in capsys.readouterr().err) == (asked == "1")
+
+
+def test_a_start_says_which_processes_it_waits_for() -> None:
+    status = Status(waiting=("camera", "cloud", "detector", "odometry", "@recorder"))
+    console = Console(file=io.StringIO(), width=100)
+    with shown(console, RunDisplay(console), quiet=False) as watch:
+        assert watch is not None
+        watch(status)
+
+    assert console.file.getvalue().split() == [
+        "starting",
+        "waiting",
+        "for",
+        "camera,",
+        "cloud,",
+        "detector",
+        "and",
+        "2",
+        "more",
+    ]
