@@ -1,10 +1,10 @@
 """Path latency: the time from a source's message to the end of the firing that it causes at a sink.
 
 Computed from firing records, so from any recording: every record holds when its call began and how long it took, and
-which messages it was given. A firing is caused by the messages of its triggers; that of an operator that fires on a timer
-by the messages of its batches, or, with none of those, by the ones that it sampled. Its *critical* cause is the one whose
-producer finished last. Walking back over critical causes splits a latency into the operators' own time and the time that
-messages waited in front of them (transport, queues, and other operators of the same process).
+which messages it was given. A firing is caused by the messages of its triggers; that of an operator that fires on a
+timer by the messages of its batches, or, with none of those, by the ones that it sampled. Its *critical* cause is the
+one whose producer finished last. Walking back over critical causes splits a latency into the operators' own time and
+the time that messages waited in front of them (transport, queues, and other operators of the same process).
 
 Clocks: wall time of one machine. Where a run spread over several, their offset is part of the result.
 """
