@@ -25,8 +25,8 @@ def check(
 ) -> None:
     """Check graph files wholly, without running them.
 
-    Names, streams, types, parameters, cycles, hosts. Exit code 0: all are sound; 1: one has faults; 2: one cannot be
-    read.
+    Names, streams, types, parameters, cycles, processes. Exit code 0: all are sound; 1: one has faults; 2: one cannot
+    be read.
 
     Examples:
 
@@ -69,34 +69,30 @@ def show(
     settings: Settings = None,
     path: ModuleFolders = None,
     mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
-    svg: Annotated[Path | None, typer.Option("--svg", metavar="FILE.svg", help="Write a picture.")] = None,
+    svg: Annotated[str | None, typer.Option("--svg", hidden=True)] = None,
     json: Json = False,
 ) -> None:
-    """Show a graph: hosts, operators, what each takes and makes.
+    """Show a graph: processes, operators, what each takes and makes.
 
     Examples:
 
       dataflow show graphs/synthetic_rgbd.yaml
-      dataflow show graphs/synthetic_rgbd.yaml --svg graph.svg
       dataflow show graphs/synthetic_rgbd.yaml --mermaid
+      dataflow show graphs/synthetic_rgbd.yaml --json
     """
     from dataflow.graph import draw, load_graph
 
     with friendly_errors():
-        if json + mermaid + (svg is not None) > 1:
-            raise fail("--json, --mermaid and --svg exclude each other")
-        if svg is not None and svg.suffix != ".svg":
-            raise fail(f"--svg {svg}: expected a file name that ends in .svg")
+        if svg is not None:
+            raise fail("--svg is gone: --mermaid prints a flowchart, which GitHub, editors and mermaid.live draw")
+        if json and mermaid:
+            raise fail("--json and --mermaid exclude each other")
         find_modules_in(path)
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
         if json:
             print_json(loaded.to_json())
         elif mermaid:
             print(visible(draw.mermaid(loaded)))
-        elif svg is not None:
-            svg.parent.mkdir(parents=True, exist_ok=True)
-            svg.write_text(draw.svg(loaded), encoding="utf-8")
-            out.print(Text(f"wrote {svg}"), soft_wrap=True)
         else:
             out.print(draw.tree(loaded))
 

@@ -105,6 +105,7 @@ def _view_recording(
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dataflow.recording import Recording
+    from dataflow.recording.layout import RECORDING
     from dataflow.reexecution.recorded_run import wiring
     from dataflow.view import Serve, from_recording
 
@@ -112,7 +113,7 @@ def _view_recording(
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         if not readable:
             raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
-        namespace = opened.metadata.get("recording", {}).get("namespace", "")
+        namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(streams, readable, namespace)
         if not any(opened.streams[name].count for name in chosen):
             raise fail(f"{path} holds no message of {', '.join(chosen)}")
