@@ -243,7 +243,7 @@ class _Rate:
         mean = sum(entry[3] for entry in self.seen) / len(self.seen)
         return {
             "stream": stream,
-            "total": n1 + 1,
+            "messages": n1 + 1,
             "hz_clock": made / clock if made and clock > 0 else None,
             "hz_event": made / event if made and event > 0 else None,
             "bytes": mean,
@@ -322,5 +322,5 @@ def _rate_table(rates: dict[str, _Rate], namespace: str) -> Table:
         row = rate.row(stream)
         cells = (row["hz_clock"], row["hz_event"], row["bytes"] * 1e-3, row["mb_per_s"])
         texts = ("" if cell is None else f"{cell:,.2f}" for cell in cells)
-        shown.add_row(Text(stream.removeprefix(f"{namespace}/")), count(row["total"]), *texts)
+        shown.add_row(Text(stream.removeprefix(f"{namespace}/")), count(row["messages"]), *texts)
     return shown

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json
+from dataflow.cli.arguments import FLAG, Json, find_modules_in
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, print_json_line, say, table
 
@@ -207,6 +207,7 @@ def _declared(graph: Graph, operator: str, name: str) -> dict[str, str]:
     from dataflow.graph.catalogue import parameters
     from dataflow.graph.model import OperatorImportError
 
+    find_modules_in(None)
     try:
         rows = parameters(graph.nodes[operator].operator)
     except OperatorImportError:

@@ -17,10 +17,10 @@ def tree(graph: Graph) -> Tree:
     hosts = graph.hosts()
     title = Text.assemble((graph.name, "bold"), f"  {graph.namespace}  ", (_counts(graph), "dim"))
     root = Tree(title)
-    for host, names in hosts.items():
+    for process, names in hosts.items():
         machines = {graph.nodes[name].machine for name in names} - {None}
         where = f" on {', '.join(sorted(m for m in machines if m))}" if machines else ""
-        branch = root.add(Text.assemble(("process ", "dim"), (host, "cyan"), (where, "dim")))
+        branch = root.add(Text.assemble(("process ", "dim"), (process, "cyan"), (where, "dim")))
         for name in names:
             node = graph.nodes[name]
             label = Text.assemble((name, "bold"), "  ", (node.use, "dim"))
@@ -69,12 +69,12 @@ def mermaid(graph: Graph) -> str:
     """A Mermaid flowchart: a subgraph per shared process; triggers solid, Sampled dotted, Batch thick."""
     ids = {name: f"n{i}" for i, name in enumerate(graph.nodes)}
     lines = ["flowchart LR"]
-    for number, (host, names) in enumerate(graph.hosts().items()):
+    for number, (label, names) in enumerate(graph.hosts().items()):
         boxes = [f'{ids[name]}["<b>{name}</b><br/>{graph.nodes[name].use.rpartition(":")[2]}"]' for name in names]
         if len(names) == 1:
             lines.append(f"    {boxes[0]}")
         else:
-            lines += [f'    subgraph h{number} ["process {host}"]', *(f"        {box}" for box in boxes), "    end"]
+            lines += [f'    subgraph h{number} ["process {label}"]', *(f"        {box}" for box in boxes), "    end"]
     for edge in graph.edges():
         arrow = _ARROW[graph.nodes[edge.consumer].input_port(edge.input).kind]
         label = f"{edge.port}: {' or '.join(graph.streams[edge.stream].types)}"

@@ -106,7 +106,11 @@ def test_looking_at_a_recording_imports_none_of_its_modules(made: tuple[Path, Pa
     (tmp_path / "own_operators.py").write_text("raise RuntimeError('imported')\n")
     saved = tmp_path / "own.rrd"
 
-    for words in (["info", recording], ["diff", recording, recording], ["view", recording, "--to", saved]):
+    for words in (
+        ["info", recording],
+        ["diff", recording, recording],
+        ["view", recording, "--to", saved],
+    ):
         told = run(tmp_path, *words)
         assert told.returncode == 0, told.stderr
         assert "imported" not in told.stderr
