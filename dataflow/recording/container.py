@@ -37,6 +37,7 @@ from mcap.records import (
 )
 
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.seals import sealed
 
 Compression = Literal["zstd", "lz4", "none"]
 Buffer = bytes | memoryview
@@ -46,6 +47,8 @@ ZSTD_LEVEL = 1
 CHUNK_BYTES = 4 * 1024 * 1024
 CHUNK_SECONDS = 1.0
 MAX_CHANNELS = 65535
+MAX_CHUNK_BYTES = 2**29
+"""Uncompressed. Readers refuse more, so that a file made to do harm takes no more memory."""
 
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIXED = _MESSAGE.size - 9
@@ -131,7 +134,7 @@ class ContainerWriter:
         self._position = 0
         self._fd = self._open(overwrite)
         try:
-            self._append(MAGIC, record_bytes(Header(profile="", library=library)))
+            self._append(MAGIC, sealed(record_bytes(Header(profile="", library=library))))
         except RecordingError:
             os.close(self._fd)
             raise
@@ -165,7 +168,7 @@ class ContainerWriter:
             if (known.name, known.encoding, known.data) == (name, encoding, data):
                 return known.id
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
-        self._append(record_bytes(schema))
+        self._append(sealed(record_bytes(schema)))
         self._schemas.append(schema)
         return schema.id
 
@@ -180,13 +183,13 @@ class ContainerWriter:
             schema_id=schema_id,
             metadata=dict(metadata),
         )
-        self._append(record_bytes(channel))
+        self._append(sealed(record_bytes(channel)))
         self._channels.append(channel)
         self._counts[channel.id] = 0
         return channel.id
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
-        record = record_bytes(Metadata(name=name, metadata=dict(metadata)))
+        record = sealed(record_bytes(Metadata(name=name, metadata=dict(metadata))))
         offset = self._position
         self._append(record)
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
@@ -226,7 +229,7 @@ class ContainerWriter:
         for channel, entries in chunk.entries.items():
             body = entries.tobytes()
             offsets[channel] = offset
-            indexes.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(body), channel, len(body)) + body)
+            indexes.append(sealed(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(body), channel, len(body)) + body))
             offset += len(indexes[-1])
         self._append(head, data, *indexes)
         self._chunks.append(

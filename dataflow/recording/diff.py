@@ -14,6 +14,7 @@ from rich.text import Text
 from dataflow.messages.base import Message
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.reader import Recorded, Recording
+from dataflow.recording.text import visible
 from dataflow.sync.stamps import format_stamp
 
 Outcome = Literal["same", "within tolerance", "different", "only in A", "only in B"]
@@ -99,13 +100,13 @@ class DiffReport:
             table.add_column(heading, justify="right" if heading in ("A", "B", "differ", "max |A-B|") else "left")
         for s in self.streams:
             table.add_row(
-                Text(s.stream),
+                Text(visible(s.stream)),
                 Text(s.outcome, style="green" if s.outcome in ("same", "within tolerance") else "red"),
                 str(s.count_a),
                 str(s.count_b),
                 str(s.differing + s.missing_in_a + s.missing_in_b),
                 f"{s.max_difference:.3g}" if s.max_difference else "0",
-                Text("" if s.first is None else f"{format_stamp(s.first.stamp)} {s.first.field}: {s.first.detail}"),
+                Text("" if s.first is None else visible(f"{format_stamp(s.first.stamp)} {s.first.field}: {s.first.detail}")),
             )
         return table
 

@@ -12,6 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dataflow.recording.reader import Recording
+from dataflow.recording.text import visible
 from dataflow.sync.stamps import format_duration, format_stamp
 
 LONG_VALUE = 60
@@ -40,7 +41,8 @@ class StreamSummary:
 class Description:
     """What `describe` finds. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
 
-    `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator.
+    `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator. `damage`: notes of
+    what is damaged. Text is as in the file: for a terminal `render`, or `visible` of `dataflow.recording.text`.
     """
 
     path: str
@@ -49,6 +51,7 @@ class Description:
     profile: str
     torn: bool
     lost_bytes: int
+    damage: tuple[str, ...]
     start: int | None
     end: int | None
     duration: int
@@ -76,9 +79,10 @@ class Description:
     def _facts(self) -> Table:
         grid = Table.grid(padding=(0, 2))
         size = f"{_size(self.bytes)}, {_size(sum(s.bytes for s in self.streams))} uncompressed"
-        grid.add_row("file", Text(self.path))
+        grid.add_row("file", Text(visible(self.path)))
         grid.add_row("size", size)
-        grid.add_row("written by", Text(self.library + (f" (profile {self.profile})" if self.profile else "")))
+        writer = self.library + (f" (profile {self.profile})" if self.profile else "")
+        grid.add_row("written by", Text(visible(writer)))
         if self.start is not None and self.end is not None:
             grid.add_row("from", f"{format_stamp(self.start)} ({self.start})")
             grid.add_row("to", f"{format_stamp(self.end)} ({self.end})")
@@ -87,6 +91,8 @@ class Description:
         if self.torn:
             lost = f"; {self.lost_bytes} bytes of an unfinished record are left out" if self.lost_bytes else ""
             grid.add_row("torn", Text(f"the file has no proper end: its writer died{lost}", style="yellow"))
+        for note in self.damage:
+            grid.add_row("damaged", Text(visible(note), style="yellow"))
         return grid
 
     def _stream_table(self) -> Table:
@@ -100,7 +106,7 @@ class Description:
             notes += ["declared otherwise now"] if s.declared_otherwise else []
             rate = "" if s.rate is None or s.static else f"{s.rate:.2f} Hz"
             row = (s.name, s.type, f"{s.schema} ({s.encoding})", str(s.count), rate, _size(s.bytes), ", ".join(notes))
-            table.add_row(*map(Text, row))
+            table.add_row(*(Text(visible(cell)) for cell in row))
         return table
 
     def _metadata_table(self) -> Table:
@@ -111,7 +117,7 @@ class Description:
             for key, value in mapping.items():
                 short = value.splitlines()[0][:LONG_VALUE] if value else ""
                 more = f" … ({len(value)} characters)" if short != value else ""
-                table.add_row(Text(name), Text(key), Text(short + more))
+                table.add_row(*(Text(visible(cell)) for cell in (name, key, short + more)))
         return table
 
 
@@ -131,6 +137,7 @@ def describe(recording: Recording) -> Description:
         profile=recording.profile,
         torn=recording.torn,
         lost_bytes=recording.lost_bytes,
+        damage=recording.damage,
         start=start,
         end=end,
         duration=0 if start is None or end is None else end - start,
@@ -167,7 +174,7 @@ def _counts(title: str, name: str, number: str, counts: Mapping[str, int]) -> Ta
     table.add_column(name)
     table.add_column(number, justify="right")
     for key, count in counts.items():
-        table.add_row(Text(key), str(count))
+        table.add_row(Text(visible(key)), str(count))
     return table
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -17,9 +17,10 @@ from dataflow.messages.base import Message, MessageError, message_types
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest, foreign_decoder
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.index import Entries, McapFile, RawMessage
+from dataflow.recording.contents import Entries
+from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
-from dataflow.recording.layout import DIGESTS, Kind
+from dataflow.recording.layout import Kind
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class _Channel:
     incarnation: int
     base: int
     entries: Entries
-    companion: Entries | None
+    companion: _Companion | None
     decode: Decode | None
     stamps: npt.NDArray[np.int64] | None = None
     """By entry; of foreign channels only known after a pass."""
@@ -103,13 +104,19 @@ class _Channel:
     """Foreign messages whose own times are not usable."""
 
 
-class _Entry(NamedTuple):
-    """One message in the merged sequence: what it is merged by, its entry in a channel, its rank in the stream."""
+@dataclass(slots=True)
+class _Companion:
+    """The companion of a channel. `at`: by entry of that channel the entry here, -1 for none; made when first read."""
 
-    key: int
-    channel: _Channel
-    position: int
-    rank: int
+    id: int
+    entries: Entries
+    at: npt.NDArray[np.int64] | None = None
+
+
+_Entry = tuple[int, _Channel, int, int]
+"""One message in the merged sequence: what it is merged by, its channel, its entry there, its rank in the stream."""
+_Place = tuple[int, int, int]
+"""Where a message lies: chunk, offset, log time."""
 
 
 @dataclass(slots=True)
@@ -151,6 +158,14 @@ class Recording:
         return self._file.lost_bytes
 
     @property
+    def damage(self) -> tuple[str, ...]:
+        """What in the file is damaged, for people: it was read by other means, or is left out as the note says.
+
+        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read.
+        """
+        return tuple(self._file.damage)
+
+    @property
     def library(self) -> str:
         """The program that wrote the file, as it calls itself."""
         return str(self._file.header.library)
@@ -185,14 +200,16 @@ class Recording:
     ) -> Iterator[RawRecord]:
         """Undecoded messages of any streams with start ≤ log time ≤ end, merged by (log time, stream)."""
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
-        for stream, entry in self._positions(chosen, start, end, log_time=True):
-            entries = entry.channel.entries
-            raw = self._file.read(int(entries.chunks[entry.position]), int(entries.offsets[entry.position]))
+        for stream, (_, channel, position, _) in self._positions(chosen, start, end, log_time=True):
+            raw = self._file.read(channel.record.id, *_place(channel.entries, position))
             info = stream.info
             yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
 
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """(operator, payload) of every batch of firing records, of one operator or of all, in file order."""
+        """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
+
+        One pass: they lie in chunks of their own, without the messages of streams (in older recordings among them).
+        """
         channels = {
             c.id: c.metadata.get("operator", "")
             for c in self._channels_of(Kind.FIRINGS)
@@ -235,10 +252,6 @@ class Recording:
                 digest.update(recorded.message.digest())
             found[stream.info.name] = digest.hexdigest()
         return found
-
-    def written_digests(self) -> Mapping[str, str]:
-        """The stream digests that the writer noted when it closed the file; empty for torn and foreign files."""
-        return self.metadata.get(DIGESTS, {})
 
     def close(self) -> None:
         self._file.close()
@@ -319,7 +332,7 @@ class Recording:
             incarnation=_number(record.metadata.get("incarnation", "0")),
             base=_number(record.metadata.get("sequence_base", "0")),
             entries=entries,
-            companion=None if companion is None else self._entries(companion.id),
+            companion=None if companion is None else _Companion(companion.id, self._entries(companion.id)),
             decode=None if codec is None else decode,
             stamps=entries.times,
         )
@@ -380,10 +393,10 @@ class Recording:
     # ------------------------------------------------------------------------------------------------- messages
 
     def _merge(self, streams: list[_Stream], start: int | None, end: int | None) -> Iterator[Recorded]:
-        for stream, entry in self._positions(streams, start, end, log_time=False):
-            message, sequence = self._decode(stream.info.name, entry.channel, entry.position)
-            seq = entry.channel.base + sequence if stream.own else entry.rank
-            yield Recorded(stream.info.name, message, seq, entry.channel.incarnation)
+        for stream, (_, channel, position, rank) in self._positions(streams, start, end, log_time=False):
+            message, sequence = self._decode(stream.info.name, channel, position)
+            seq = channel.base + sequence if stream.own else rank
+            yield Recorded(stream.info.name, message, seq, channel.incarnation)
 
     def _positions(
         self, streams: list[_Stream], start: int | None, end: int | None, *, log_time: bool
@@ -392,7 +405,7 @@ class Recording:
         ordered = sorted(streams, key=lambda s: s.info.name)
         cursors = [self._cursor(stream, start, end, log_time=log_time) for stream in ordered]
         heads = [next(cursor, None) for cursor in cursors]
-        heap = [(head.key, i) for i, head in enumerate(heads) if head is not None]
+        heap = [(head[0], i) for i, head in enumerate(heads) if head is not None]
         heapq.heapify(heap)
         while heap:
             _, i = heap[0]
@@ -403,7 +416,7 @@ class Recording:
             if following is None:
                 heapq.heappop(heap)
             else:
-                heapq.heapreplace(heap, (following.key, i))
+                heapq.heapreplace(heap, (following[0], i))
 
     def _cursor(self, stream: _Stream, start: int | None, end: int | None, *, log_time: bool) -> Iterator[_Entry]:
         """The entries of one stream in its own order: incarnation after incarnation, by stamp in each.
@@ -431,7 +444,7 @@ class Recording:
                 block = order[at : min(at + BLOCK, high)]
                 rows = zip(times[block].tolist(), owners[block].tolist(), positions[block].tolist(), strict=True)
                 for i, (time, owner, position) in enumerate(rows, at):
-                    yield _Entry(time + shift, group[owner], position, rank + i)
+                    yield time + shift, group[owner], position, rank + i
             rank += len(order)
 
     def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:
@@ -449,11 +462,11 @@ class Recording:
 
     def _decode(self, stream: str, channel: _Channel, position: int) -> tuple[Message, int]:
         """The message of an entry and its number in the file."""
-        raw = self._file.read(int(channel.entries.chunks[position]), int(channel.entries.offsets[position]))
+        raw = self._file.read(channel.record.id, *_place(channel.entries, position))
         try:
             if channel.decode is None:
                 raise RecordingError(f"no decoder for {channel.record.message_encoding} of this schema")
-            message = channel.decode(raw, self._companion(channel, raw))
+            message = channel.decode(raw, self._companion(channel, position, raw.sequence))
             if channel.by_log_time:
                 message = message.replace(stamp=raw.log_time)
             return message, raw.sequence
@@ -462,25 +475,53 @@ class Recording:
                 f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {error}"
             ) from error
 
-    def _companion(self, channel: _Channel, raw: RawMessage) -> memoryview | None:
-        """The companion's data of a message: the entry of the same time and number."""
-        entries = channel.companion
-        if entries is None:
+    def _companion(self, channel: _Channel, position: int, sequence: int) -> memoryview | None:
+        """The companion's data of a message: that of the same time and number."""
+        companion = channel.companion
+        if companion is None:
             return None
-        at = int(np.searchsorted(entries.times, raw.log_time))
-        if at == len(entries) or entries.times[at] != raw.log_time:
+        if companion.at is None:
+            companion.at = _matches(channel.entries.times, companion.entries.times)
+        at = int(companion.at[position])
+        if at < 0:
             return None
-        found = self._file.read(int(entries.chunks[at]), int(entries.offsets[at]))
-        return found.data if found.sequence == raw.sequence else None
+        found = self._file.read(companion.id, *_place(companion.entries, at))
+        if found.sequence != sequence:
+            raise RecordingError(f"its companion is numbered {found.sequence}")
+        return found.data
 
     def _in_file_order(self, channels: list[int]) -> Iterator[RawMessage]:
-        known = [self._entries(c) for c in channels]
+        known = [(c, self._entries(c)) for c in channels]
         if not known:
             return
-        chunks = np.concatenate([e.chunks for e in known])
-        offsets = np.concatenate([e.offsets for e in known])
-        for i in np.lexsort((offsets, chunks)):
-            yield self._file.read(int(chunks[i]), int(offsets[i]))
+        owners = np.concatenate([np.full(len(e), c, np.int64) for c, e in known])
+        chunks = np.concatenate([e.chunks for _, e in known])
+        offsets = np.concatenate([e.offsets for _, e in known])
+        times = np.concatenate([e.times for _, e in known])
+        order = np.lexsort((offsets, chunks))
+        for at in range(0, len(order), BLOCK):
+            block = order[at : at + BLOCK]
+            columns = (column[block].tolist() for column in (owners, chunks, offsets, times))
+            for owner, chunk, offset, time in zip(*columns, strict=True):
+                yield self._file.read(owner, chunk, offset, time)
+
+
+def _place(entries: Entries, position: int) -> _Place:
+    return int(entries.chunks[position]), int(entries.offsets[position]), int(entries.times[position])
+
+
+def _matches(times: npt.NDArray[np.int64], of: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """By message, which of its channel's companion messages has its time; -1 for none.
+
+    Raises `RecordingError` where a companion message has the time of no message: it would be passed over.
+    """
+    order = np.argsort(of, kind="stable")
+    ranks = np.minimum(np.searchsorted(of, times, sorter=order), max(len(of) - 1, 0))
+    found = np.where(of[order[ranks]] == times, order[ranks], -1) if len(of) else np.full(len(times), -1)
+    alone = np.setdiff1d(of, times)
+    if len(alone):
+        raise RecordingError(f"{len(alone)} companion messages belong to no message, the first at {alone[0]}")
+    return found
 
 
 def _key(channel: Channel, stream: str) -> tuple[str, str, str]:
