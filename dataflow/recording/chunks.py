@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import lz4.frame  # type: ignore[import-untyped]
 import zstandard
 
-from dataflow.recording.container import MAX_CHUNK_BYTES
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.packing import MAX_CHUNK_BYTES
 from dataflow.recording.rawfile import RawFile
 
 CACHE_BYTES = 256 * 2**20

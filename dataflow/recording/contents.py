@@ -18,8 +18,8 @@ from dataflow.recording.rawfile import RECORD, RawFile
 UNCHUNKED = -1
 MAX_PARSED = 2**18
 """Schemas, channels, chunks and metadata records that one file may hold: each costs some 20 µs to read."""
-MAX_WALKED = 2**24
-"""Messages that are looked for without an index: each costs a microsecond and 24 bytes."""
+MAX_WALKED = 2**23
+"""Records that are looked for without an index: each costs a microsecond or two, and a message 24 bytes."""
 
 MESSAGE_BODY = struct.Struct("<HIQQ")
 _ID = struct.Struct("<H")
@@ -137,7 +137,10 @@ class Contents:
             channel, length = _INDEX.unpack_from(body)
             if length % _ENTRY.itemsize or _INDEX.size + length > len(body) or channel in found:
                 return False
-            found[channel] = np.frombuffer(body, _ENTRY, length // _ENTRY.itemsize, _INDEX.size)
+            entries = np.frombuffer(body, _ENTRY, length // _ENTRY.itemsize, _INDEX.size)
+            if len(entries) and int(entries["offset"].max()) >= self.chunks.refs[chunk].uncompressed_size:
+                return False
+            found[channel] = entries
         for channel, entries in found.items():
             self._entries_of(channel).extend(entries, chunk)
         return True
@@ -147,19 +150,20 @@ class Contents:
         self.chunks.check_ratio(number)
         data = self.chunks.data(number)
         where = self.chunks.where(number)
+        size, unpack, message = len(data), RECORD.unpack_from, MESSAGE_BODY
         position = 0
-        while position < len(data):
-            if position + RECORD.size > len(data):
+        while position < size:
+            if position + RECORD.size > size:
                 raise self.file.damaged(f"{where} ends within a record")
-            opcode, length = RECORD.unpack_from(data, position)
+            opcode, length = unpack(data, position)
             start = position + RECORD.size
-            if opcode == 0 or start + length > len(data):
+            if opcode == 0 or start + length > size:
                 raise self.file.damaged(f"{where} has no whole record at its byte {position}")
             self._count_walked(self.chunks.refs[number].offset)
             if opcode == Opcode.MESSAGE:
-                if length < MESSAGE_BODY.size:
+                if length < message.size:
                     raise self.file.damaged(f"{where} has a message of {length} bytes at its byte {position}")
-                channel, _, log_time, _ = MESSAGE_BODY.unpack_from(data, start)
+                channel, _, log_time, _ = message.unpack_from(data, start)
                 self._entries_of(channel).add(signed(log_time), number, position)
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 self.declare(opcode, data[start : start + length], self.chunks.refs[number].offset)

@@ -106,7 +106,11 @@ class DiffReport:
                 str(s.count_b),
                 str(s.differing + s.missing_in_a + s.missing_in_b),
                 f"{s.max_difference:.3g}" if s.max_difference else "0",
-                Text("" if s.first is None else visible(f"{format_stamp(s.first.stamp)} {s.first.field}: {s.first.detail}")),
+                Text(
+                    ""
+                    if s.first is None
+                    else visible(f"{format_stamp(s.first.stamp)} {s.first.field}: {s.first.detail}")
+                ),
             )
         return table
 

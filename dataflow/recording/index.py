@@ -13,9 +13,10 @@ import numpy as np
 from mcap.opcode import Opcode
 from mcap.records import Header
 
-from dataflow.recording.container import MAGIC, MAX_CHUNK_BYTES
+from dataflow.recording.container import MAGIC
 from dataflow.recording.contents import UNCHUNKED, Contents, Entries, signed
 from dataflow.recording.errors import DamagedError, RecordingError
+from dataflow.recording.packing import MAX_CHUNK_BYTES
 from dataflow.recording.rawfile import RECORD, RawFile
 from dataflow.recording.scan import scan
 from dataflow.recording.seals import Seal, seal_of

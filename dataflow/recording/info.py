@@ -41,7 +41,7 @@ class StreamSummary:
 class Description:
     """What `describe` finds. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
 
-    `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator. `damage`: notes of
+    `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator. `damage` notes
     what is damaged. Text is as in the file: for a terminal `render`, or `visible` of `dataflow.recording.text`.
     """
 

@@ -16,8 +16,8 @@ from mcap.records import Channel
 from dataflow.messages.base import Message, MessageError, message_types
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest, foreign_decoder
-from dataflow.recording.errors import RecordingError
 from dataflow.recording.contents import Entries
+from dataflow.recording.errors import RecordingError
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
 from dataflow.recording.layout import Kind
