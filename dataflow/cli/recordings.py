@@ -87,7 +87,10 @@ def _facts(described: Description) -> Table:
     row("size", f"{size(described.bytes)}, {size(uncompressed)} uncompressed")
     row("written by", described.library + (f", profile {described.profile}" if described.profile else ""))
     if "dataflow:graph" in made:
-        row("graph", f"{made['dataflow:graph'].get('name', '')}, namespace {made['recording'].get('namespace', '')}")
+        row(
+            "graph",
+            f"{made['dataflow:graph'].get('name', '')}, namespace {made.get('recording', {}).get('namespace', '')}",
+        )
     if "dataflow:run" in made:
         row("made by", _made_by(made["dataflow:run"]))
     if "machine" in made:
@@ -99,6 +102,8 @@ def _facts(described: Description) -> Table:
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
         row("torn", "no proper end: its writer died" + (lost if described.lost_bytes else ""), "yellow")
+    for note in described.damage:
+        row("damaged", note, "yellow")
     if described.start is not None and described.end is not None:
         row("from", format_stamp(described.start))
         row("to", format_stamp(described.end))
