@@ -6,8 +6,8 @@ The index takes 24 bytes of memory a message, whatever the messages hold.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -26,8 +26,7 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_FIXED = _MESSAGE.size - RECORD.size
 
 
-@dataclass(frozen=True, slots=True)
-class RawMessage:
+class RawMessage(NamedTuple):
     """A message record as it stands in the file. `data` is a view of its chunk."""
 
     channel: int

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,12 +14,14 @@ from mcap.records import Channel
 
 from dataflow.messages.base import Message, MessageError, message_types
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest, foreign_decoder
+from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest
 from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.foreign import foreign_decoder
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
 from dataflow.recording.layout import Kind
+from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +86,6 @@ class StreamInfo:
 
 
 Decode = Callable[[RawMessage, memoryview | None], Message]
-BLOCK = 4096
 
 
 @dataclass(slots=True)
@@ -96,27 +96,13 @@ class _Channel:
     incarnation: int
     base: int
     entries: Entries
-    companion: _Companion | None
+    companion: tuple[int, Entries] | None
+    """Id and entries of the companion."""
     decode: Decode | None
     stamps: npt.NDArray[np.int64] | None = None
     """By entry; of foreign channels only known after a pass."""
     by_log_time: bool = False
     """Foreign messages whose own times are not usable."""
-
-
-@dataclass(slots=True)
-class _Companion:
-    """The companion of a channel. `at`: by entry of that channel the entry here, -1 for none; made when first read."""
-
-    id: int
-    entries: Entries
-    at: npt.NDArray[np.int64] | None = None
-
-
-_Entry = tuple[int, _Channel, int, int]
-"""One message in the merged sequence: what it is merged by, its channel, its entry there, its rank in the stream."""
-_Place = tuple[int, int, int]
-"""Where a message lies: chunk, offset, log time."""
 
 
 @dataclass(slots=True)
@@ -200,8 +186,8 @@ class Recording:
     ) -> Iterator[RawRecord]:
         """Undecoded messages of any streams with start ≤ log time ≤ end, merged by (log time, stream)."""
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
-        for stream, (_, channel, position, _) in self._positions(chosen, start, end, log_time=True):
-            raw = self._file.read(channel.record.id, *_place(channel.entries, position))
+        for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
+            raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
             info = stream.info
             yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
 
@@ -332,7 +318,7 @@ class Recording:
             incarnation=_number(record.metadata.get("incarnation", "0")),
             base=_number(record.metadata.get("sequence_base", "0")),
             entries=entries,
-            companion=None if companion is None else _Companion(companion.id, self._entries(companion.id)),
+            companion=None if companion is None else (companion.id, self._entries(companion.id)),
             decode=None if codec is None else decode,
             stamps=entries.times,
         )
@@ -352,7 +338,7 @@ class Recording:
             if channel.decode is None or not len(channel.entries):
                 continue
             try:
-                return type(self._decode(name, channel, 0)[0])
+                return type(next(self._unordered(name, channel)))
             except RecordingError:
                 channel.decode = None
         return None
@@ -393,59 +379,49 @@ class Recording:
     # ------------------------------------------------------------------------------------------------- messages
 
     def _merge(self, streams: list[_Stream], start: int | None, end: int | None) -> Iterator[Recorded]:
-        for stream, (_, channel, position, rank) in self._positions(streams, start, end, log_time=False):
-            message, sequence = self._decode(stream.info.name, channel, position)
-            seq = channel.base + sequence if stream.own else rank
-            yield Recorded(stream.info.name, message, seq, channel.incarnation)
+        for stream, row in self._rows(streams, start, end, by_log_time=False):
+            _, owner, chunk, offset, time, companion_chunk, companion_offset, rank = row
+            channel = stream.channels[owner]
+            name = stream.info.name
+            raw = self._file.read(channel.record.id, chunk, offset, time)
+            extra = None
+            if companion_chunk != NOWHERE and channel.companion is not None:
+                companion = self._file.read(channel.companion[0], companion_chunk, companion_offset, time)
+                if companion.sequence != raw.sequence:
+                    raise self._unreadable(name, raw, f"its companion is numbered {companion.sequence}")
+                extra = companion.data
+            message = self._decode(name, channel, raw, extra)
+            seq = channel.base + raw.sequence if stream.own else rank
+            yield Recorded(name, message, seq, channel.incarnation)
 
-    def _positions(
-        self, streams: list[_Stream], start: int | None, end: int | None, *, log_time: bool
-    ) -> Iterator[tuple[_Stream, _Entry]]:
+    def _rows(
+        self, streams: list[_Stream], start: int | None, end: int | None, *, by_log_time: bool
+    ) -> Iterator[tuple[_Stream, Row]]:
         """The merged sequence: always the stream whose next message has the smallest (stamp, stream)."""
         ordered = sorted(streams, key=lambda s: s.info.name)
-        cursors = [self._cursor(stream, start, end, log_time=log_time) for stream in ordered]
-        heads = [next(cursor, None) for cursor in cursors]
-        heap = [(head[0], i) for i, head in enumerate(heads) if head is not None]
-        heapq.heapify(heap)
-        while heap:
-            _, i = heap[0]
-            head = heads[i]
-            assert head is not None
-            yield ordered[i], head
-            following = heads[i] = next(cursors[i], None)
-            if following is None:
-                heapq.heappop(heap)
-            else:
-                heapq.heapreplace(heap, (following[0], i))
+        cursors = [rows(self._tracks(stream, by_log_time), start, end) for stream in ordered]
+        return ((ordered[i], row) for i, row in merged(cursors))
 
-    def _cursor(self, stream: _Stream, start: int | None, end: int | None, *, log_time: bool) -> Iterator[_Entry]:
-        """The entries of one stream in its own order: incarnation after incarnation, by stamp in each.
+    def _tracks(self, stream: _Stream, by_log_time: bool) -> Iterator[Track]:
+        """The incarnations of a stream, one after the other, or all channels of a foreign one."""
+        for group in [[c] for c in stream.channels] if stream.own else [stream.channels]:
+            yield Track(
+                entries=[c.entries for c in group],
+                times=[c.entries.times if by_log_time else self._stamps(stream, c) for c in group],
+                companions=[None if by_log_time else self._companions(stream, c) for c in group],
+            )
 
-        An incarnation whose clock has jumped back is merged as if it followed directly on the one before.
-        """
-        groups = [[c] for c in stream.channels] if stream.own else [stream.channels]
-        rank = 0
-        newest: int | None = None
-        for group in groups:
-            times = np.concatenate([c.entries.times if log_time else self._stamps(stream, c) for c in group])
-            chunks = np.concatenate([c.entries.chunks for c in group])
-            offsets = np.concatenate([c.entries.offsets for c in group])
-            owners = np.concatenate([np.full(len(c.entries), i) for i, c in enumerate(group)])
-            positions = np.concatenate([np.arange(len(c.entries)) for c in group])
-            order = np.lexsort((offsets, chunks, times))
-            if not len(order):
-                continue
-            first, last = int(times[order[0]]), int(times[order[-1]])
-            shift = 0 if newest is None or first > newest else newest + 1 - first
-            newest = last + shift
-            low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
-            high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
-            for at in range(low, high, BLOCK):
-                block = order[at : min(at + BLOCK, high)]
-                rows = zip(times[block].tolist(), owners[block].tolist(), positions[block].tolist(), strict=True)
-                for i, (time, owner, position) in enumerate(rows, at):
-                    yield time + shift, group[owner], position, rank + i
-            rank += len(order)
+    def _companions(
+        self, stream: _Stream, channel: _Channel
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+        if channel.companion is None:
+            return None
+        found = companions_of(channel.entries.times, channel.companion[1])
+        if found is None:
+            raise RecordingError(
+                f"{self.path}: stream {stream.info.name!r} has companion messages of messages it lacks"
+            )
+        return found
 
     def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:
         """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
@@ -454,74 +430,34 @@ class Recording:
         """
         if channel.stamps is None:
             count = len(channel.entries)
-            decoded = (self._decode(stream.info.name, channel, i)[0].stamp for i in range(count))
+            decoded = (message.stamp for message in self._unordered(stream.info.name, channel))
             channel.stamps = np.fromiter(decoded, np.int64, count)
             if len(np.unique(channel.stamps)) < count:
                 channel.stamps, channel.by_log_time = channel.entries.times, True
         return channel.stamps
 
-    def _decode(self, stream: str, channel: _Channel, position: int) -> tuple[Message, int]:
-        """The message of an entry and its number in the file."""
-        raw = self._file.read(channel.record.id, *_place(channel.entries, position))
+    def _unordered(self, stream: str, channel: _Channel) -> Iterator[Message]:
+        """The messages of a foreign channel in the order of its entries."""
+        entries = channel.entries
+        for i in range(len(entries)):
+            place = int(entries.chunks[i]), int(entries.offsets[i]), int(entries.times[i])
+            yield self._decode(stream, channel, self._file.read(channel.record.id, *place), None)
+
+    def _decode(self, stream: str, channel: _Channel, raw: RawMessage, extra: memoryview | None) -> Message:
         try:
             if channel.decode is None:
                 raise RecordingError(f"no decoder for {channel.record.message_encoding} of this schema")
-            message = channel.decode(raw, self._companion(channel, position, raw.sequence))
-            if channel.by_log_time:
-                message = message.replace(stamp=raw.log_time)
-            return message, raw.sequence
+            message = channel.decode(raw, extra)
+            return message.replace(stamp=raw.log_time) if channel.by_log_time else message
         except (RecordingError, MessageError) as error:
-            raise RecordingError(
-                f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {error}"
-            ) from error
+            raise self._unreadable(stream, raw, str(error)) from error
 
-    def _companion(self, channel: _Channel, position: int, sequence: int) -> memoryview | None:
-        """The companion's data of a message: that of the same time and number."""
-        companion = channel.companion
-        if companion is None:
-            return None
-        if companion.at is None:
-            companion.at = _matches(channel.entries.times, companion.entries.times)
-        at = int(companion.at[position])
-        if at < 0:
-            return None
-        found = self._file.read(companion.id, *_place(companion.entries, at))
-        if found.sequence != sequence:
-            raise RecordingError(f"its companion is numbered {found.sequence}")
-        return found.data
+    def _unreadable(self, stream: str, raw: RawMessage, why: str) -> RecordingError:
+        return RecordingError(f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {why}")
 
     def _in_file_order(self, channels: list[int]) -> Iterator[RawMessage]:
-        known = [(c, self._entries(c)) for c in channels]
-        if not known:
-            return
-        owners = np.concatenate([np.full(len(e), c, np.int64) for c, e in known])
-        chunks = np.concatenate([e.chunks for _, e in known])
-        offsets = np.concatenate([e.offsets for _, e in known])
-        times = np.concatenate([e.times for _, e in known])
-        order = np.lexsort((offsets, chunks))
-        for at in range(0, len(order), BLOCK):
-            block = order[at : at + BLOCK]
-            columns = (column[block].tolist() for column in (owners, chunks, offsets, times))
-            for owner, chunk, offset, time in zip(*columns, strict=True):
-                yield self._file.read(owner, chunk, offset, time)
-
-
-def _place(entries: Entries, position: int) -> _Place:
-    return int(entries.chunks[position]), int(entries.offsets[position]), int(entries.times[position])
-
-
-def _matches(times: npt.NDArray[np.int64], of: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """By message, which of its channel's companion messages has its time; -1 for none.
-
-    Raises `RecordingError` where a companion message has the time of no message: it would be passed over.
-    """
-    order = np.argsort(of, kind="stable")
-    ranks = np.minimum(np.searchsorted(of, times, sorter=order), max(len(of) - 1, 0))
-    found = np.where(of[order[ranks]] == times, order[ranks], -1) if len(of) else np.full(len(times), -1)
-    alone = np.setdiff1d(of, times)
-    if len(alone):
-        raise RecordingError(f"{len(alone)} companion messages belong to no message, the first at {alone[0]}")
-    return found
+        for place in in_file_order([(c, self._entries(c)) for c in channels]):
+            yield self._file.read(*place)
 
 
 def _key(channel: Channel, stream: str) -> tuple[str, str, str]:
