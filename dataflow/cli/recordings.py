@@ -101,6 +101,8 @@ def _facts(described: Description) -> Table:
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
         row("torn", "no proper end: its writer died" + (lost if described.lost_bytes else ""), "yellow")
+    for note in described.damage:
+        row("damaged", note, "yellow")
     if described.start is not None and described.end is not None:
         row("from", format_stamp(described.start))
         row("to", format_stamp(described.end))

@@ -1,9 +1,9 @@
-"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON; foreign decoders."""
+"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -147,33 +147,3 @@ def declaration_digest(message: type[Message]) -> str:
         kind = f"{field.dtype_text()} {field.shape_text()}" if isinstance(field, ArrayField) else field.kind
         words.append(f"{field.name}: {kind}{' | None' if field.optional else ''}")
     return xxhash.xxh3_64_hexdigest("\n".join(words).encode())
-
-
-@dataclass(frozen=True, slots=True)
-class ForeignDecoder:
-    """Reads the messages that other programs wrote with one schema.
-
-    `bind(schema)` is called once per channel with the schema as it stands in the file, and returns the function that
-    turns (data, log time) into a message. Its stamp is the one that the data carries, or else the log time.
-    """
-
-    bind: Callable[[SchemaText], Callable[[bytes, int], Message]]
-
-
-_foreign: dict[tuple[str, str], ForeignDecoder] = {}
-
-
-def register_decoder(message_encoding: str, schema: str, decoder: ForeignDecoder) -> None:
-    """Makes streams of (message encoding, schema name), written by other programs, readable as messages."""
-    key = (message_encoding, schema)
-    if key in _foreign:
-        raise RecordingError(f"there is a decoder for {message_encoding} messages of schema {schema!r} already")
-    _foreign[key] = decoder
-
-
-def foreign_decoder(message_encoding: str, schema: SchemaText) -> Callable[[bytes, int], Message] | None:
-    """The decoder of a foreign channel, or None where the schema is not known."""
-    from dataflow.recording import foreign  # noqa: F401  (registers the decoders that come with this package)
-
-    found = _foreign.get((message_encoding, schema.name))
-    return None if found is None else found.bind(schema)

@@ -8,13 +8,10 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from rich.table import Table
-from rich.text import Text
 
 from dataflow.messages.base import Message
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.reader import Recorded, Recording
-from dataflow.sync.stamps import format_stamp
 
 Outcome = Literal["same", "within tolerance", "different", "only in A", "only in B"]
 
@@ -91,23 +88,6 @@ class DiffReport:
             for s in self.streams
         ]
         return {"same": self.same, "a": self.a, "b": self.b, "tolerance": self.tolerance, "streams": streams}
-
-    def table(self) -> Table:
-        """One line a stream."""
-        table = Table(title="the same" if self.same else "different", title_justify="left")
-        for heading in ("stream", "result", "A", "B", "differ", "max |A-B|", "first difference"):
-            table.add_column(heading, justify="right" if heading in ("A", "B", "differ", "max |A-B|") else "left")
-        for s in self.streams:
-            table.add_row(
-                Text(s.stream),
-                Text(s.outcome, style="green" if s.outcome in ("same", "within tolerance") else "red"),
-                str(s.count_a),
-                str(s.count_b),
-                str(s.differing + s.missing_in_a + s.missing_in_b),
-                f"{s.max_difference:.3g}" if s.max_difference else "0",
-                Text("" if s.first is None else f"{format_stamp(s.first.stamp)} {s.first.field}: {s.first.detail}"),
-            )
-        return table
 
 
 def diff(

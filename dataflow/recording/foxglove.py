@@ -86,7 +86,7 @@ class FoxgloveSchema:
         """The protobuf object; raises `RecordingError`."""
         parsed = self.proto()
         try:
-            parsed.ParseFromString(bytes(data))
+            parsed.ParseFromString(data)
         except DecodeError as error:
             raise RecordingError(f"not a {self.name}: {error}") from error
         return parsed

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +14,14 @@ from mcap.records import Channel
 
 from dataflow.messages.base import Message, MessageError, message_types
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest, foreign_decoder
+from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest
+from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.index import Entries, McapFile, RawMessage
+from dataflow.recording.foreign import foreign_decoder
+from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
-from dataflow.recording.layout import DIGESTS, Kind
+from dataflow.recording.layout import Kind
+from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,6 @@ class StreamInfo:
 
 
 Decode = Callable[[RawMessage, memoryview | None], Message]
-BLOCK = 4096
 
 
 @dataclass(slots=True)
@@ -95,21 +96,13 @@ class _Channel:
     incarnation: int
     base: int
     entries: Entries
-    companion: Entries | None
+    companion: tuple[int, Entries] | None
+    """Id and entries of the companion."""
     decode: Decode | None
     stamps: npt.NDArray[np.int64] | None = None
     """By entry; of foreign channels only known after a pass."""
     by_log_time: bool = False
     """Foreign messages whose own times are not usable."""
-
-
-class _Entry(NamedTuple):
-    """One message in the merged sequence: what it is merged by, its entry in a channel, its rank in the stream."""
-
-    key: int
-    channel: _Channel
-    position: int
-    rank: int
 
 
 @dataclass(slots=True)
@@ -151,6 +144,14 @@ class Recording:
         return self._file.lost_bytes
 
     @property
+    def damage(self) -> tuple[str, ...]:
+        """What in the file is damaged, for people: it was read by other means, or is left out as the note says.
+
+        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read.
+        """
+        return tuple(self._file.damage)
+
+    @property
     def library(self) -> str:
         """The program that wrote the file, as it calls itself."""
         return str(self._file.header.library)
@@ -185,14 +186,16 @@ class Recording:
     ) -> Iterator[RawRecord]:
         """Undecoded messages of any streams with start ≤ log time ≤ end, merged by (log time, stream)."""
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
-        for stream, entry in self._positions(chosen, start, end, log_time=True):
-            entries = entry.channel.entries
-            raw = self._file.read(int(entries.chunks[entry.position]), int(entries.offsets[entry.position]))
+        for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
+            raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
             info = stream.info
             yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
 
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """(operator, payload) of every batch of firing records, of one operator or of all, in file order."""
+        """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
+
+        One pass: they lie in chunks of their own, without the messages of streams (in older recordings among them).
+        """
         channels = {
             c.id: c.metadata.get("operator", "")
             for c in self._channels_of(Kind.FIRINGS)
@@ -235,10 +238,6 @@ class Recording:
                 digest.update(recorded.message.digest())
             found[stream.info.name] = digest.hexdigest()
         return found
-
-    def written_digests(self) -> Mapping[str, str]:
-        """The stream digests that the writer noted when it closed the file; empty for torn and foreign files."""
-        return self.metadata.get(DIGESTS, {})
 
     def close(self) -> None:
         self._file.close()
@@ -319,7 +318,7 @@ class Recording:
             incarnation=_number(record.metadata.get("incarnation", "0")),
             base=_number(record.metadata.get("sequence_base", "0")),
             entries=entries,
-            companion=None if companion is None else self._entries(companion.id),
+            companion=None if companion is None else (companion.id, self._entries(companion.id)),
             decode=None if codec is None else decode,
             stamps=entries.times,
         )
@@ -339,7 +338,7 @@ class Recording:
             if channel.decode is None or not len(channel.entries):
                 continue
             try:
-                return type(self._decode(name, channel, 0)[0])
+                return type(next(self._unordered(name, channel)))
             except RecordingError:
                 channel.decode = None
         return None
@@ -380,59 +379,49 @@ class Recording:
     # ------------------------------------------------------------------------------------------------- messages
 
     def _merge(self, streams: list[_Stream], start: int | None, end: int | None) -> Iterator[Recorded]:
-        for stream, entry in self._positions(streams, start, end, log_time=False):
-            message, sequence = self._decode(stream.info.name, entry.channel, entry.position)
-            seq = entry.channel.base + sequence if stream.own else entry.rank
-            yield Recorded(stream.info.name, message, seq, entry.channel.incarnation)
+        for stream, row in self._rows(streams, start, end, by_log_time=False):
+            _, owner, chunk, offset, time, companion_chunk, companion_offset, rank = row
+            channel = stream.channels[owner]
+            name = stream.info.name
+            raw = self._file.read(channel.record.id, chunk, offset, time)
+            extra = None
+            if companion_chunk != NOWHERE and channel.companion is not None:
+                companion = self._file.read(channel.companion[0], companion_chunk, companion_offset, time)
+                if companion.sequence != raw.sequence:
+                    raise self._unreadable(name, raw, f"its companion is numbered {companion.sequence}")
+                extra = companion.data
+            message = self._decode(name, channel, raw, extra)
+            seq = channel.base + raw.sequence if stream.own else rank
+            yield Recorded(name, message, seq, channel.incarnation)
 
-    def _positions(
-        self, streams: list[_Stream], start: int | None, end: int | None, *, log_time: bool
-    ) -> Iterator[tuple[_Stream, _Entry]]:
+    def _rows(
+        self, streams: list[_Stream], start: int | None, end: int | None, *, by_log_time: bool
+    ) -> Iterator[tuple[_Stream, Row]]:
         """The merged sequence: always the stream whose next message has the smallest (stamp, stream)."""
         ordered = sorted(streams, key=lambda s: s.info.name)
-        cursors = [self._cursor(stream, start, end, log_time=log_time) for stream in ordered]
-        heads = [next(cursor, None) for cursor in cursors]
-        heap = [(head.key, i) for i, head in enumerate(heads) if head is not None]
-        heapq.heapify(heap)
-        while heap:
-            _, i = heap[0]
-            head = heads[i]
-            assert head is not None
-            yield ordered[i], head
-            following = heads[i] = next(cursors[i], None)
-            if following is None:
-                heapq.heappop(heap)
-            else:
-                heapq.heapreplace(heap, (following.key, i))
+        cursors = [rows(self._tracks(stream, by_log_time), start, end) for stream in ordered]
+        return ((ordered[i], row) for i, row in merged(cursors))
 
-    def _cursor(self, stream: _Stream, start: int | None, end: int | None, *, log_time: bool) -> Iterator[_Entry]:
-        """The entries of one stream in its own order: incarnation after incarnation, by stamp in each.
+    def _tracks(self, stream: _Stream, by_log_time: bool) -> Iterator[Track]:
+        """The incarnations of a stream, one after the other, or all channels of a foreign one."""
+        for group in [[c] for c in stream.channels] if stream.own else [stream.channels]:
+            yield Track(
+                entries=[c.entries for c in group],
+                times=[c.entries.times if by_log_time else self._stamps(stream, c) for c in group],
+                companions=[None if by_log_time else self._companions(stream, c) for c in group],
+            )
 
-        An incarnation whose clock has jumped back is merged as if it followed directly on the one before.
-        """
-        groups = [[c] for c in stream.channels] if stream.own else [stream.channels]
-        rank = 0
-        newest: int | None = None
-        for group in groups:
-            times = np.concatenate([c.entries.times if log_time else self._stamps(stream, c) for c in group])
-            chunks = np.concatenate([c.entries.chunks for c in group])
-            offsets = np.concatenate([c.entries.offsets for c in group])
-            owners = np.concatenate([np.full(len(c.entries), i) for i, c in enumerate(group)])
-            positions = np.concatenate([np.arange(len(c.entries)) for c in group])
-            order = np.lexsort((offsets, chunks, times))
-            if not len(order):
-                continue
-            first, last = int(times[order[0]]), int(times[order[-1]])
-            shift = 0 if newest is None or first > newest else newest + 1 - first
-            newest = last + shift
-            low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
-            high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
-            for at in range(low, high, BLOCK):
-                block = order[at : min(at + BLOCK, high)]
-                rows = zip(times[block].tolist(), owners[block].tolist(), positions[block].tolist(), strict=True)
-                for i, (time, owner, position) in enumerate(rows, at):
-                    yield _Entry(time + shift, group[owner], position, rank + i)
-            rank += len(order)
+    def _companions(
+        self, stream: _Stream, channel: _Channel
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+        if channel.companion is None:
+            return None
+        found = companions_of(channel.entries.times, channel.companion[1])
+        if found is None:
+            raise RecordingError(
+                f"{self.path}: stream {stream.info.name!r} has companion messages of messages it lacks"
+            )
+        return found
 
     def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:
         """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
@@ -441,46 +430,34 @@ class Recording:
         """
         if channel.stamps is None:
             count = len(channel.entries)
-            decoded = (self._decode(stream.info.name, channel, i)[0].stamp for i in range(count))
+            decoded = (message.stamp for message in self._unordered(stream.info.name, channel))
             channel.stamps = np.fromiter(decoded, np.int64, count)
             if len(np.unique(channel.stamps)) < count:
                 channel.stamps, channel.by_log_time = channel.entries.times, True
         return channel.stamps
 
-    def _decode(self, stream: str, channel: _Channel, position: int) -> tuple[Message, int]:
-        """The message of an entry and its number in the file."""
-        raw = self._file.read(int(channel.entries.chunks[position]), int(channel.entries.offsets[position]))
+    def _unordered(self, stream: str, channel: _Channel) -> Iterator[Message]:
+        """The messages of a foreign channel in the order of its entries."""
+        entries = channel.entries
+        for i in range(len(entries)):
+            place = int(entries.chunks[i]), int(entries.offsets[i]), int(entries.times[i])
+            yield self._decode(stream, channel, self._file.read(channel.record.id, *place), None)
+
+    def _decode(self, stream: str, channel: _Channel, raw: RawMessage, extra: memoryview | None) -> Message:
         try:
             if channel.decode is None:
                 raise RecordingError(f"no decoder for {channel.record.message_encoding} of this schema")
-            message = channel.decode(raw, self._companion(channel, raw))
-            if channel.by_log_time:
-                message = message.replace(stamp=raw.log_time)
-            return message, raw.sequence
+            message = channel.decode(raw, extra)
+            return message.replace(stamp=raw.log_time) if channel.by_log_time else message
         except (RecordingError, MessageError) as error:
-            raise RecordingError(
-                f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {error}"
-            ) from error
+            raise self._unreadable(stream, raw, str(error)) from error
 
-    def _companion(self, channel: _Channel, raw: RawMessage) -> memoryview | None:
-        """The companion's data of a message: the entry of the same time and number."""
-        entries = channel.companion
-        if entries is None:
-            return None
-        at = int(np.searchsorted(entries.times, raw.log_time))
-        if at == len(entries) or entries.times[at] != raw.log_time:
-            return None
-        found = self._file.read(int(entries.chunks[at]), int(entries.offsets[at]))
-        return found.data if found.sequence == raw.sequence else None
+    def _unreadable(self, stream: str, raw: RawMessage, why: str) -> RecordingError:
+        return RecordingError(f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {why}")
 
     def _in_file_order(self, channels: list[int]) -> Iterator[RawMessage]:
-        known = [self._entries(c) for c in channels]
-        if not known:
-            return
-        chunks = np.concatenate([e.chunks for e in known])
-        offsets = np.concatenate([e.offsets for e in known])
-        for i in np.lexsort((offsets, chunks)):
-            yield self._file.read(int(chunks[i]), int(offsets[i]))
+        for place in in_file_order([(c, self._entries(c)) for c in channels]):
+            yield self._file.read(*place)
 
 
 def _key(channel: Channel, stream: str) -> tuple[str, str, str]:
