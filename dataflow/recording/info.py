@@ -33,6 +33,7 @@ class StreamSummary:
     bytes: int
     incarnations: int
     readable: bool
+    generic: bool
     declared_otherwise: bool
 
 
@@ -98,6 +99,7 @@ class Description:
             notes += [f"{s.incarnations} incarnations"] if s.incarnations > 1 else []
             notes += [] if s.readable else ["not readable here"]
             notes += ["declared otherwise now"] if s.declared_otherwise else []
+            notes += ["type read from the recording"] if s.generic else []
             rate = "" if s.rate is None or s.static else f"{s.rate:.2f} Hz"
             row = (s.name, s.type, f"{s.schema} ({s.encoding})", str(s.count), rate, _size(s.bytes), ", ".join(notes))
             table.add_row(*map(Text, row))
@@ -158,6 +160,7 @@ def _summary(recording: Recording, name: str) -> StreamSummary:
         bytes=info.bytes,
         incarnations=info.incarnations,
         readable=info.message_type is not None,
+        generic=info.generic,
         declared_otherwise=info.declared_otherwise,
     )
 

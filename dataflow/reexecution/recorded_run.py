@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from dataflow.graph import load_bundle
 from dataflow.graph.model import Graph
+from dataflow.messages.base import message_type
+from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording
 from dataflow.recording.layout import ENDS, GRAPH
 
@@ -23,9 +26,33 @@ def recorded_graph(recording: Recording) -> Graph:
     return load_bundle(bundle)
 
 
+def resolved_graph(recording: Recording) -> Graph | None:
+    """The graph that made a recording as it was resolved then, for tools that look: imports no operator.
+
+    None where the recording does not hold it, or holds that of another version of this program.
+    """
+    held = recording.metadata.get(GRAPH, {})
+    try:
+        return Graph.from_json(json.loads(held["resolved"]) | {"bundle": _bundle(json.loads(held["bundle"]))})
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _bundle(packed: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in packed.items() if name != "format"}
+
+
 def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
-    """What a recording must hold so that its graph can be loaded again."""
-    return {GRAPH: {"name": graph.name, "bundle": graph.bundle(), "text": graph.text}}
+    """What a recording must hold so that its graph can be loaded again, or looked at without its operators."""
+    resolved = {name: value for name, value in graph.to_json().items() if name != "bundle"}
+    return {
+        GRAPH: {
+            "name": graph.name,
+            "bundle": graph.bundle(),
+            "text": graph.text,
+            "resolved": json.dumps(resolved, ensure_ascii=False),
+        }
+    }
 
 
 def check_type(recording: Recording, graph: Graph, stream: str) -> None:
@@ -36,6 +63,16 @@ def check_type(recording: Recording, graph: Graph, stream: str) -> None:
         raise ReplayError(
             f"{recording.path}: stream {stream!r} holds {info.schema}, "
             f"the graph's {graph.streams[stream].node!r} emits {' | '.join(wanted)}"
+        )
+    if info.declaration is None:
+        return
+    schema = info.declaration.schema
+    expected = graph.types.get(schema) or Declaration.of(message_type(schema))
+    if faults := info.declaration.differences(expected, "the recording", expected.path):
+        raise ReplayError(
+            f"{recording.path}: stream {stream!r} holds {schema} as it was declared when it was recorded, and "
+            f"{expected.path} declares it differently: {'; '.join(faults)}. Restore the fields, or give the new type "
+            "another schema name: class ...(Message, schema=...)"
         )
 
 
