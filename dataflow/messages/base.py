@@ -22,6 +22,7 @@ from dataflow.messages.fields import (
     INT64_MIN,
     MISSING,
     SYMBOL,
+    TAKEN,
     ArrayField,
     Field,
     MessageError,
@@ -133,8 +134,10 @@ class Message(_Declared):
         own = []
         for name, value in list(vars(cls).items()):
             if isinstance(value, (ScalarField, ArrayField)):
-                if name == "stamp" or hasattr(Message, name):
+                if name in TAKEN or hasattr(Message, name):
                     raise MessageError(f"{cls.__name__}.{name}: every message has {name!r} already; use another name")
+                if name.startswith("_"):
+                    raise MessageError(f"{cls.__name__}.{name}: the name of a field begins with a letter")
                 own.append(type(value)(name, *(getattr(value, s) for s in value.__slots__[1:])))
                 delattr(cls, name)
         cls.FIELDS = (*cls.FIELDS, *own)

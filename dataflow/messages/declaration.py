@@ -17,6 +17,7 @@ from dataflow.messages.base import Message, registered_type, type_path
 from dataflow.messages.fields import (
     MISSING,
     SYMBOL,
+    TAKEN,
     ArrayField,
     Field,
     MessageError,
@@ -174,7 +175,8 @@ def _field_to_json(field: Field) -> dict[str, Any]:
 
 def _field_from_json(values: Any) -> Field:
     name, doc, optional = _text(values["name"]), _text(values["doc"]), values["optional"]
-    if not name.isidentifier() or keyword.iskeyword(name) or name == "stamp" or hasattr(GenericMessage, name):
+    usable = name.isidentifier() and not name.startswith("_") and not keyword.iskeyword(name)
+    if not usable or name in (*TAKEN, "DECLARATION") or hasattr(GenericMessage, name):
         raise ValueError(f"{name!r} cannot name a field")
     if not isinstance(optional, bool):
         raise TypeError(f"field {name!r}: optional is {optional!r}")

@@ -16,6 +16,8 @@ Scalar = bool | int | float | str | tuple[str, ...]
 MISSING: Any = object()
 INT64_MIN, INT64_MAX = -(2**63), 2**63 - 1
 _PYTHON_NAME = {"bool": "bool", "int": "int", "float": "float", "str": "str", "strs": "sequence of str"}
+TAKEN = ("stamp", "timestamp")
+"""No names for fields: every message has the first, and recordings write it as the second."""
 SYMBOL = re.compile(r"[A-Z][A-Za-z]*")
 
 

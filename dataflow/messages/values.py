@@ -12,7 +12,7 @@ ALARM_LEVELS: Final = ("debug", "info", "warning", "error", "fatal")
 class Number(Message):
     """One number: a temperature, a distance, a score. NaN where it could not be had."""
 
-    value: float = scalar("float", "the number")
+    value: float = scalar("float", "the number, in `unit`")
     unit: str = scalar("str", "its unit, such as `°C` or `m/s`; empty for a pure number", default="")
 
 
