@@ -13,7 +13,7 @@ from mcap.reader import make_reader
 
 from dataflow.messages import Message, array, scalar
 from dataflow.messages import base as registry
-from dataflow.messages.declaration import GenericMessage
+from dataflow.messages.declaration import Declaration, GenericMessage, generic_type
 from dataflow.messages.example import example
 from dataflow.recording import Recording, RecordingWriter, describe, diff
 
@@ -102,6 +102,17 @@ def test_a_class_whose_fields_have_changed_is_not_used(path: Path, monkeypatch: 
             assert [m.message for m in recording.messages()] == messages()
         del registry._registry["tests.own.Beacon"]
         patched.setitem(registry._registry, Beacon.SCHEMA, Beacon)
+
+
+def test_two_declarations_of_one_type_differ_by_name_of_field(path: Path, tmp_path: Path) -> None:
+    values = Declaration.of(Beacon).to_json()
+    values["fields"][2]["dtypes"] = ["float64"]
+    made = generic_type(Declaration.from_json(values))
+    other = write(tmp_path / "other.mcap", [made(**dict(m.items())) for m in messages()])
+    with Recording(path) as a, Recording(other) as b:
+        (stream,) = diff(a, b).streams
+    assert stream.first is not None
+    assert "field 'positions' is float32 (N, 3) in A and float64 (N, 3) in B" in stream.first.detail
 
 
 def test_a_declaration_that_cannot_be_read_leaves_the_rest_readable(tmp_path: Path) -> None:
