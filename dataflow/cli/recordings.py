@@ -130,6 +130,7 @@ def _streams(described: Description, namespace: str) -> Table:
         notes += [f"{s.incarnations} incarnations"] if s.incarnations > 1 else []
         notes += [f"unsupported encoding ({s.encoding})"] if not s.readable else []
         notes += ["declared differently now"] if s.declared_otherwise else []
+        notes += ["type read from the recording"] if s.generic else []
         kind = s.type if s.readable else f"{s.schema} ({s.encoding})" if foreign else s.schema
         rate = "" if s.rate is None or s.static else f"{s.rate:.2f}"
         row = (_relative(s.name, namespace), kind, count(s.count), rate, size(s.bytes), ", ".join(notes))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,7 +10,8 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import xxhash
 
-from dataflow.messages.base import ArrayField, Field, Message, MessageError
+from dataflow.messages.base import ArrayField, Field, Message, MessageError, is_built_in
+from dataflow.messages.declaration import Declaration
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, Parts, file_descriptor_set
 from dataflow.recording.json_codec import (
@@ -22,6 +24,7 @@ from dataflow.recording.json_codec import (
     json_schema,
     timestamp_object,
 )
+from dataflow.recording.layout import FIELDS
 
 M = TypeVar("M", bound=Message)
 
@@ -138,6 +141,22 @@ def codec_for(message: type[Message]) -> Codec:
             codec = JsonCodec(message) if well_known is None else FoxgloveCodec(message, well_known)
             _codecs[message] = codec
         return codec
+
+
+def declaration_metadata(message: type[Message]) -> dict[str, str]:
+    """What a stream's channel says of its type: a digest of the declaration, and the whole of it for an own type."""
+    declared = {"declaration": declaration_digest(message)}
+    if not is_built_in(message):
+        declared[FIELDS] = json.dumps(Declaration.of(message).to_json(), ensure_ascii=False)
+    return declared
+
+
+def recorded_declaration(metadata: Mapping[str, str]) -> Declaration | None:
+    """The declaration that a stream's channel holds; None where it holds none that can be read."""
+    try:
+        return Declaration.from_json(json.loads(metadata[FIELDS]))
+    except (KeyError, ValueError, RecursionError):
+        return None
 
 
 def declaration_digest(message: type[Message]) -> str:

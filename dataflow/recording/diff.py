@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.base import Message
+from dataflow.messages.declaration import Declaration
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.reader import Recorded, Recording
 
@@ -178,9 +179,11 @@ def differences(a: Message, b: Message, tolerance: float | None = None) -> tuple
     much, absolutely, and NaN equals NaN; everything else must be equal.
     """
     if type(a) is not type(b):
-        return [
-            FieldDifference(a.stamp, "(message)", f"{a.SCHEMA} against {b.SCHEMA}", None, a=a.SCHEMA, b=b.SCHEMA)
-        ], 0
+        kinds = Declaration.of(type(a)), Declaration.of(type(b))
+        forms = kinds[0].differences(kinds[1], "A", "B") if a.SCHEMA == b.SCHEMA else ()
+        text = f"two declarations of {a.SCHEMA}: {'; '.join(forms)}" if forms else f"{a.SCHEMA} against {b.SCHEMA}"
+        if forms or a.SCHEMA != b.SCHEMA:
+            return [FieldDifference(a.stamp, "(message)", text, None, a=a.SCHEMA, b=b.SCHEMA)], 0
     found: list[FieldDifference] = []
     largest = 0.0
     for (name, left), (_, right) in zip(a.items(), b.items(), strict=True):

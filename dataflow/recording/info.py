@@ -26,6 +26,7 @@ class StreamSummary:
     bytes: int
     incarnations: int
     readable: bool
+    generic: bool
     declared_otherwise: bool
 
 
@@ -102,5 +103,6 @@ def _summary(recording: Recording, name: str) -> StreamSummary:
         bytes=info.bytes,
         incarnations=info.incarnations,
         readable=info.message_type is not None,
+        generic=info.generic,
         declared_otherwise=info.declared_otherwise,
     )

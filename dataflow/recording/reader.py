@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -12,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from mcap.records import Channel
 
-from dataflow.messages.base import Message, MessageError, message_types
+from dataflow.messages.base import Message, MessageError, message_types, registered_type
+from dataflow.messages.declaration import Declaration, GenericMessage, known_type
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest
+from dataflow.recording.codecs import SchemaText, codec_for, declaration_digest, recorded_declaration
 from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foreign import foreign_decoder
@@ -64,28 +66,54 @@ class StreamInfo:
     """What a recording knows of one stream without decoding it.
 
     - `schema`, `encoding`: of the file, such as foxglove.RawImage and protobuf.
-    - `message_type`: the class that its messages are read as; None where this program has none.
+    - `declaration`: of a type that the recording itself declares, since it is not of `dataflow.messages`.
+    - `known`: the class of any other type; None where this program has none.
     - `first`, `last`: smallest and largest log time (our own recordings: stamp), ns; None for an empty stream.
     - `bytes`: message data before compression, companions included.
-    - `declared_otherwise`: the type's declaration has changed since the recording was made.
     - `metadata`: of the stream's channel.
     """
 
     name: str
     schema: str
     encoding: str
-    message_type: type[Message] | None
+    declaration: Declaration | None
+    known: type[Message] | None
     count: int
     first: int | None
     last: int | None
     static: bool
     bytes: int
     incarnations: int
-    declared_otherwise: bool
     metadata: Mapping[str, str]
+
+    @property
+    def message_type(self) -> type[Message] | None:
+        """The class that its messages are read as; None where there is none.
+
+        Of a type that the recording declares, that is the class of this program with the same fields, from when the
+        module that has it is imported; else a class made from the declaration.
+        """
+        return self.known if self.declaration is None else known_type(self.declaration)
+
+    @property
+    def generic(self) -> bool:
+        """Whether its messages are read by the recording's declaration, without the class that made them."""
+        found = self.message_type
+        return found is not None and issubclass(found, GenericMessage)
+
+    @property
+    def declared_otherwise(self) -> bool:
+        """Whether the type's declaration in this program differs from the one that the messages were written with."""
+        if self.declaration is not None:
+            return self.generic and registered_type(self.declaration.schema) is not None
+        written = self.metadata.get("declaration", "")
+        return self.metadata.get("kind") == Kind.STREAM and (
+            self.known is not None and written != declaration_digest(self.known)
+        )
 
 
 Decode = Callable[[RawMessage, memoryview | None], Message]
+TypeOf = Callable[[], type[Message] | None]
 
 
 @dataclass(slots=True)
@@ -274,8 +302,9 @@ class Recording:
     ) -> _Stream:
         first = records[0]
         own = first.metadata.get("kind") == Kind.STREAM
-        message_type = message_types().get(first.metadata.get("message_type", "")) if own else None
-        codec = codec_for(message_type) if message_type is not None else None
+        declaration = recorded_declaration(first.metadata) if own else None
+        known = message_types().get(first.metadata.get("message_type", "")) if own else None
+        read_as: TypeOf = (lambda: known) if declaration is None else partial(known_type, declaration)
         channels: list[_Channel] = []
         size = 0
         for record in records:
@@ -283,34 +312,33 @@ class Recording:
             companion = companions.get(_key(record, name)) if own else None
             if companion is not None:
                 size += sizes.get(companion.id, 0)
-            channels.append(self._own_channel(record, companion, codec) if own else self._foreign_channel(record))
+            channels.append(self._own_channel(record, companion, read_as) if own else self._foreign_channel(record))
         channels.sort(key=lambda c: (c.incarnation, c.base))
         if not own:
-            message_type = self._peek(name, channels)
+            known = self._peek(name, channels)
         times = [c.entries.times for c in channels if len(c.entries)]
         schema = self._schema(first)
         info = StreamInfo(
             name=name,
             schema=schema.name,
             encoding=first.message_encoding,
-            message_type=message_type,
+            declaration=declaration,
+            known=known,
             count=sum(len(c.entries) for c in channels),
             first=min((int(t.min()) for t in times), default=None),
             last=max((int(t.max()) for t in times), default=None),
             static=first.metadata.get("static") == "true" and own,
             bytes=size,
             incarnations=len({c.incarnation for c in channels if len(c.entries)}),
-            declared_otherwise=own
-            and message_type is not None
-            and first.metadata.get("declaration", "") != declaration_digest(message_type),
             metadata=first.metadata,
         )
         return _Stream(info, own, channels)
 
-    def _own_channel(self, record: Channel, companion: Channel | None, codec: Codec | None) -> _Channel:
+    def _own_channel(self, record: Channel, companion: Channel | None, read_as: TypeOf) -> _Channel:
         def decode(raw: RawMessage, extra: memoryview | None) -> Message:
-            assert codec is not None
-            return codec.decode(raw.log_time, raw.data, extra)
+            message_type = read_as()
+            assert message_type is not None
+            return codec_for(message_type).decode(raw.log_time, raw.data, extra)
 
         entries = self._entries(record.id)
         return _Channel(
@@ -319,7 +347,7 @@ class Recording:
             base=_number(record.metadata.get("sequence_base", "0")),
             entries=entries,
             companion=None if companion is None else (companion.id, self._entries(companion.id)),
-            decode=None if codec is None else decode,
+            decode=None if read_as() is None else decode,
             stamps=entries.times,
         )
 

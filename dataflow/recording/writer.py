@@ -12,7 +12,7 @@ from typing import Any, Self
 from dataflow.messages import Transforms
 from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest
+from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_metadata
 from dataflow.recording.container import CHUNK_BYTES, CHUNK_SECONDS, ContainerWriter
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.frames import FrameTree
@@ -127,9 +127,8 @@ class RecordingWriter:
         metadata = {
             "kind": Kind.STREAM,
             "message_type": message_type.SCHEMA,
-            "declaration": declaration_digest(message_type),
             "static": "true" if static else "false",
-        }
+        } | declaration_metadata(message_type)
         clash = metadata.keys() & (extra or {}).keys()
         if clash:
             raise RecordingError(f"{self.path}: stream {stream!r}: extra must not set {', '.join(sorted(clash))}")
