@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from dataflow.cli.arguments import FLAG, Json, Settings, check_offset, existing, output_file
-from dataflow.cli.execution import HostEach, OneHost, Quiet
+from dataflow.cli.arguments import FLAG, Json, Network, Settings, check_offset, existing, output_file
+from dataflow.cli.execution import HostEach, OneHost, Quiet, say_network_ignored
 from dataflow.cli.output import (
     COULD_NOT_RUN,
     DIFFERENT,
@@ -82,6 +82,7 @@ def verify(
             "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
         ),
     ] = None,
+    network: Network = False,
     quiet: Quiet = False,
     one_host: OneHost = False,
     host_each: HostEach = False,
@@ -148,6 +149,7 @@ def verify(
             "only": only,
             "tolerance": tolerance,
             "start": start,
+            "network": network,
             "placement": "one_host" if one_host else "host_each" if host_each else "graph",
         }
         single = len(recordings) == 1 and not recordings[0].is_dir()
@@ -182,7 +184,10 @@ def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], Verif
 
     def verifier(path: Path) -> VerifyReport:
         with shown(err, RunDisplay(err), quiet=quiet) as watch:
-            return verify_recording(path, watch=watch, **options)
+            report = verify_recording(path, watch=watch, **options)
+        if report.network_ignored:
+            say_network_ignored(path)
+        return report
 
     return verifier
 

@@ -1,6 +1,6 @@
 """Envelope codec and the Zenoh bus between hosts."""
 
-from dataflow.transport.bus import Bus, BusError, StreamPublisher, Token
+from dataflow.transport.bus import Bus, Token
 from dataflow.transport.codec import (
     DecodeError,
     Envelope,
@@ -10,12 +10,13 @@ from dataflow.transport.codec import (
     decode,
     decode_head,
     encode,
-    encode_into,
     encode_parts,
-    encoded_size,
 )
-from dataflow.transport.network import NetworkConfig, NetworkError, reserve_endpoints
+from dataflow.transport.network import NetworkConfig, NetworkError
+from dataflow.transport.publisher import BusError, StreamPublisher
 from dataflow.transport.registry import RegistryError, RunningGraph, register, running
+from dataflow.transport.seal import new_secret
+from dataflow.transport.sockets import Reservation, reserve_endpoints
 from dataflow.transport.taps import TapClient, TapMessage, TapServer, TapWindow
 
 __all__ = [
@@ -29,6 +30,7 @@ __all__ = [
     "NetworkConfig",
     "NetworkError",
     "RegistryError",
+    "Reservation",
     "RunningGraph",
     "StreamPublisher",
     "TapClient",
@@ -39,9 +41,8 @@ __all__ = [
     "decode",
     "decode_head",
     "encode",
-    "encode_into",
     "encode_parts",
-    "encoded_size",
+    "new_secret",
     "register",
     "reserve_endpoints",
     "running",

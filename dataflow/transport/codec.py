@@ -43,15 +43,16 @@ class Kind(IntEnum):
     MESSAGE = 1
     """A message; `stamp` is the message's. It implies the frontier `stamp`."""
     FRONTIER = 2
-    """No later message has a stamp ≤ `stamp`. `seq` is the next message's."""
+    """No later message has a stamp ≤ `stamp`. `incarnation` and `seq` mean nothing."""
     END = 3
-    """Nothing follows in this incarnation: `stamp` is the final stamp, `reason` says why, `seq` counts the messages."""
-    RESET = 4
-    """A new incarnation begins (`incarnation` is the new number) because of `reason`; `seq` starts at 0 again."""
+    """Nothing follows: `stamp` is the final one, `reason` says why. `incarnation` and `seq` mean nothing."""
     PROBE = 5
     """Start barrier: carries no data. `seq` is the probe's number."""
     REFERENCE = 6
     """A message that lies in shared memory: resolved by the bus, never seen by its users."""
+
+
+_KINDS: Final = frozenset(Kind)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +100,6 @@ class Envelope:
     message: Message | None = None
     reason: str = ""
     wall: int = 0
-
-    @staticmethod
-    def of(message: Message, stream: str, seq: int, incarnation: int = 0, wall: int = 0) -> Envelope:
-        """The envelope that carries `message`."""
-        return Envelope(Kind.MESSAGE, stream, incarnation, seq, message.stamp, message, "", wall)
 
 
 def encode_head(envelope: Envelope) -> bytes:
@@ -155,28 +151,6 @@ def parts_size(parts: Sequence[Buffer]) -> int:
     return sum(len(p) for p in parts)
 
 
-def encoded_size(envelope: Envelope) -> int:
-    """Bytes of the wire form of `envelope`."""
-    return parts_size(encode_parts(envelope))
-
-
-def encode_into(envelope: Envelope | Sequence[Buffer], buffer: bytearray | memoryview) -> int:
-    """Writes the wire form (of an envelope, or of its parts) to the start of `buffer`; returns the bytes written.
-
-    Raises `ValueError` when the buffer is too small, before anything is written.
-    """
-    parts = encode_parts(envelope) if isinstance(envelope, Envelope) else envelope
-    size = parts_size(parts)
-    if size > len(buffer):
-        raise ValueError(f"envelope of {size} bytes does not fit a buffer of {len(buffer)}")
-    target = memoryview(buffer).cast("B")
-    offset = 0
-    for part in parts:
-        target[offset : offset + len(part)] = part
-        offset += len(part)
-    return size
-
-
 def decode_head(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Head:
     """The head alone: which stream, kind, stamp and number, without looking at the message. Raises `DecodeError`."""
     return _head(_bytes_view(buffer), limits)[0]
@@ -217,7 +191,7 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
         raise DecodeError(f"prelude: magic {magic.hex()}, expected {MAGIC.hex()}")
     if version != VERSION:
         raise DecodeError(f"prelude: version {version}, this decoder knows {VERSION}")
-    if not Kind.MESSAGE <= kind <= Kind.REFERENCE:
+    if kind not in _KINDS:
         raise DecodeError(f"prelude: kind {kind}, known are {', '.join(f'{k.value} ({k.name})' for k in Kind)}")
     for name, size, most in (("head", head_bytes, limits.head_bytes), ("body", body_bytes, limits.body_bytes)):
         if size > most:

@@ -37,13 +37,3 @@ def tap_key(namespace: str, tap: str, stream: str) -> str:
 def stream_of_tap(namespace: str, tap: str, key: str) -> str:
     """The stream that a `tap_key` is about."""
     return f"{namespace}/{key.removeprefix(runtime_key(namespace, 'tap', tap) + '/')}"
-
-
-def alive_key(namespace: str, operator: str) -> str:
-    """The liveliness token of an operator; `**` for all of them."""
-    return runtime_key(namespace, "alive", operator)
-
-
-def alive_name(namespace: str, key: str) -> str:
-    """The operator that an `alive_key` is about."""
-    return key.removeprefix(alive_key(namespace, ""))

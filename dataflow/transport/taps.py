@@ -21,9 +21,10 @@ from typing import Any, Final, Self
 import msgpack
 import zenoh
 
-from dataflow.transport.bus import Bus, undeclare
+from dataflow.transport.bus import Bus
 from dataflow.transport.codec import DEFAULT_LIMITS, Envelope, Head, Limits, decode, decode_head, encode
 from dataflow.transport.keys import runtime_key, stream_of_tap, tap_key
+from dataflow.transport.publisher import undeclare
 
 SYNC_EVERY = 0.5
 SPEC_WITHIN = 10.0
