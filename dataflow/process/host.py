@@ -103,7 +103,10 @@ class Host:
 
     def open(self) -> None:
         """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
-        self.bus = Bus(network_config(self.graph.network, self.config.secret, self.config.listen, self.config.connect))
+        config = self.config
+        self.bus = Bus(
+            network_config(self.graph.network, config.secret, config.listen, config.connect, live=config.live)
+        )
         self.taps = TapServer(self.bus, self.graph.namespace)
         for stream, consumers in self.config.publish.items():
             self.remote[stream] = self.bus.publisher(stream, consumers=consumers)

@@ -108,7 +108,8 @@ class SinkHost:
         self._outcome = "the supervisor is gone"
 
     def open(self) -> None:
-        self.bus = Bus(network_config(self.graph.network, self.config.secret, [], self.config.connect))
+        config = self.config
+        self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
         for key in (*self.frontiers, *self.firings_open):
             self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")

@@ -96,7 +96,8 @@ class Bus:
         sharing = None
         if consumers and self._can_share(stream):
             sharing = Sharing(self.session, stream, consumers, self.counted, self._share)
-        return StreamPublisher(stream, publisher, Seal(self.config.secret, stream), self.counted, sharing)
+        seal = Seal(self.config.secret, stream)
+        return StreamPublisher(stream, publisher, seal, self.counted, sharing, self.config.blocked)
 
     def subscribe(self, stream: str, receive: Receive) -> Token:
         """Calls `receive(payload)` for all that processes of this run publish on a key, in each publisher's order.

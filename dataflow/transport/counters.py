@@ -15,6 +15,7 @@ NAMES: Final = (
     "shared_full",  # large messages that travelled whole because the pool had no room
     "shared_unready",  # large messages that travelled whole because not all consumers could share memory (yet)
     "unresolved",  # references received whose memory could not be opened
+    "stalled",  # publications that waited until the link of a subscriber that took nothing was closed
     "foreign",  # publications dropped because they do not come from a process of this run
 )
 

@@ -28,8 +28,9 @@ class NetworkConfig:
     is refused in `listen` unless `exposed` is set: it stands for "the graph's `network:` section says so".
     `shared_memory` lets large messages between processes of one machine go through shared memory, in a pool of
     `pool_bytes` for each publishing process. `secret` is the run's (`seal.new_secret`): buses with another one neither
-    take our publications nor we theirs. `zenoh` holds further settings of Zenoh's own configuration by path:
-    `{"transport/link/tls": {...}, "access_control": {}}`.
+    take our publications nor we theirs. `blocked`: seconds that a publication waits for a subscriber that takes
+    nothing; then its link is closed, and it misses messages until it has connected again. `zenoh` holds further
+    settings of Zenoh's own configuration by path: `{"transport/link/tls": {...}, "access_control": {}}`.
     """
 
     listen: tuple[str, ...] = ()
@@ -38,6 +39,7 @@ class NetworkConfig:
     exposed: bool = False
     pool_bytes: int = 256 << 20
     secret: str = field(default="", repr=False)
+    blocked: float = 30.0
     zenoh: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -57,13 +59,15 @@ class NetworkConfig:
     def zenoh_config(self) -> Config:
         """The Zenoh configuration; raises `NetworkError` for a setting that Zenoh does not take."""
         config = Config()
-        for path, value in (_BASE | dict(self.zenoh)).items():
+        closing = {f"{_BLOCK}/wait_before_close": round(self.blocked * 1e6)}
+        for path, value in (_BASE | closing | dict(self.zenoh)).items():
             _insert(config, path, value)
         _insert(config, "listen/endpoints", list(self.listen))
         _insert(config, "connect/endpoints", list(self.connect))
         return config
 
 
+_BLOCK = "transport/link/tx/queue/congestion_control/block"
 _BASE: dict[str, Any] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
@@ -78,7 +82,6 @@ _BASE: dict[str, Any] = {
     # because its sockets close.
     "transport/link/tx/lease": 30_000,
     "transport/link/tx/keep_alive": 12,
-    "transport/link/tx/queue/congestion_control/block/wait_before_close": 30_000_000,
     # Large messages are cut into pieces of 64 KB; Zenoh's default queue is two pieces (benchmarks/transport.md).
     "transport/link/tx/queue/size/data": 16,
     "transport/link/rx/buffer_size": 1 << 20,

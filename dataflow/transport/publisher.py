@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import threading
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -36,13 +38,20 @@ class StreamPublisher:
     """Publishes one stream: in order, reliably; waits when a consumer's link is full."""
 
     def __init__(
-        self, stream: str, publisher: zenoh.Publisher, seal: Seal, counted: Counters, sharing: Sharing | None
+        self,
+        stream: str,
+        publisher: zenoh.Publisher,
+        seal: Seal,
+        counted: Counters,
+        sharing: Sharing | None,
+        blocked: float,
     ) -> None:
         self.stream = stream
         self._publisher = publisher
         self._seal = seal
         self._counted = counted
         self._sharing = sharing
+        self._blocked = blocked
         self._probes = 0
 
     def put(self, envelope: Envelope) -> int:
@@ -80,10 +89,18 @@ class StreamPublisher:
             self._sharing.close()
 
     def _put(self, payload: bytes, size: int) -> None:
+        begun = time.monotonic()
         try:
             self._publisher.put(payload, attachment=self._seal.of(payload))
         except zenoh.ZError as error:
             raise BusError(f"publishing {size} bytes on {self.stream!r}: {error}") from error
+        if (waited := time.monotonic() - begun) >= self._blocked:
+            self._counted.add("stalled")
+            print(
+                f"publishing on {self.stream!r} waited {waited:.1f} s for a subscriber that takes nothing: its link "
+                "was closed, and what it misses is a gap in the numbers that it gets next",
+                file=sys.stderr,
+            )
         self._counted.moved("sent", size)
 
 

@@ -52,6 +52,10 @@ class Peer:
             lines.append(json.loads(self._lines.get()))
         return lines
 
+    def waiting(self) -> bool:
+        """Whether it has said something that nobody has read."""
+        return not self._lines.empty()
+
     def tell(self) -> None:
         """Lets it go on."""
         assert self.process.stdin is not None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -63,6 +65,35 @@ def probe_until(publisher: Any, consumer: Any) -> None:
             continue
         return
     raise AssertionError("no probe arrived")
+
+
+def test_a_stopped_subscriber_blocks_its_publisher_for_a_bounded_time_and_sees_what_it_missed(
+    peer: Callable[..., Any], open_bus: Callable[..., Bus], endpoint: str, eventually: Callable[..., None]
+) -> None:
+    bus = open_bus(listen=(endpoint,), blocked=0.2, shared_memory=False)
+    consumer = peer("consume", endpoint)
+    publisher = bus.publisher(DEPTH)
+    probe_until(publisher, consumer)
+    os.kill(consumer.pid, signal.SIGSTOP)
+    seq = 0
+    while not bus.counters()["stalled"]:
+        publisher.put(carrying(depth_image(seq, 128), DEPTH, seq))
+        seq += 1
+    eventually(lambda: not bus.peers())
+    for _ in range(100):  # nobody is waited for any more
+        publisher.put(carrying(depth_image(seq, 128), DEPTH, seq))
+        seq += 1
+    assert bus.counters()["stalled"] == 1
+    os.kill(consumer.pid, signal.SIGCONT)
+
+    def ended() -> bool:
+        publisher.put(Envelope(Kind.END, DEPTH, 0, 0, seq))
+        return bool(consumer.waiting())
+
+    eventually(ended)
+    numbers = [number for kind, number, _ in consumer.expect("ended")["seen"] if kind == "MESSAGE"]
+    assert numbers == sorted(set(numbers))
+    assert len(numbers) < seq
 
 
 def test_a_late_joiner_gets_the_static_streams_it_asks_for(
