@@ -6,12 +6,14 @@ process.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import signal
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from types import TracebackType
+from types import FrameType, TracebackType
 from typing import Any, Self
 
 import zenoh
@@ -52,6 +54,23 @@ class Token:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def _interrupts_deferred() -> Iterator[None]:
+    """Handles a SIGINT that comes while the block runs after it (in the main thread; elsewhere none is handled)."""
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield
+        return
+    came: list[FrameType | None] = []
+    signal.signal(signal.SIGINT, lambda number, frame: came.append(frame))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+    if came:
+        before(signal.SIGINT, came[-1])
 
 
 class Bus:
@@ -271,8 +290,13 @@ class Bus:
     def close(self) -> None:
         """Leaves the network: every declaration ends with it. Takes at most a few seconds; further calls do nothing.
 
-        Raises `BusError` when Zenoh does not come to an end in `CLOSE_WITHIN` seconds.
+        Ctrl-C takes effect afterwards: a thread of Zenoh's that outlives the interpreter aborts the process. Raises
+        `BusError` when Zenoh does not come to an end in `CLOSE_WITHIN` seconds.
         """
+        with _interrupts_deferred():
+            self._close()
+
+    def _close(self) -> None:
         with self._lock:
             if self._closed:
                 return

@@ -24,6 +24,11 @@ def stream_of_static(key: str) -> str:
     return key.removesuffix(f"/{RUNTIME}/static")
 
 
+def statics_key(namespace: str, bus: str) -> str:
+    """Where a process answers which static streams it holds; `*` for all processes."""
+    return runtime_key(namespace, "statics", bus)
+
+
 def shared_key(stream: str, machine: str, pid: str, descriptor: str, bus: str) -> str:
     """The liveliness token of a consumer of `stream` that can read shared memory."""
     return "/".join((stream, RUNTIME, "shm", machine, pid, descriptor, bus))

@@ -23,7 +23,7 @@ import zenoh
 
 from dataflow.transport.bus import Bus
 from dataflow.transport.codec import DEFAULT_LIMITS, Envelope, Head, Limits, decode, decode_head, encode
-from dataflow.transport.keys import runtime_key, stream_of_tap, tap_key
+from dataflow.transport.keys import runtime_key, statics_key, stream_of_tap, tap_key
 from dataflow.transport.publisher import undeclare
 
 SYNC_EVERY = 0.5
@@ -153,6 +153,7 @@ class TapServer:
         self._worker: threading.Thread | None = None
         self._sent = self._skipped_before = self.malformed = 0
         session = bus.session
+        self._statics = bus.serve(statics_key(namespace, bus.id), self._answer_statics)
         self._acks = session.declare_subscriber(
             runtime_key(namespace, "ack", bus.id, "*"), zenoh.handlers.Callback(self._on_ack, indirect=False)
         )
@@ -189,6 +190,7 @@ class TapServer:
             self._wake.notify_all()
         undeclare(self._tokens)
         undeclare(self._acks)
+        self._statics.close()
         if self._worker is not None:
             self._worker.join(CLOSE_WITHIN)
 
@@ -201,6 +203,10 @@ class TapServer:
         self.close()
 
     # Zenoh's threads
+
+    def _answer_statics(self, query: zenoh.Query) -> None:
+        with query:
+            query.reply(statics_key(self._namespace, self._bus.id), msgpack.packb(self._bus.statics()))
 
     def _on_token(self, sample: zenoh.Sample) -> None:
         tap_id = str(sample.key_expr).rpartition("/")[2]
@@ -479,6 +485,12 @@ class TapClient:
                 key = runtime_key(self._namespace, "ack", _host_text(other), self.id)
                 due.append((key, ACKNOWLEDGEMENT.pack(state.epoch, *state.taken)))
         return due
+
+
+def held_statics(bus: Bus, namespace: str, timeout: float) -> list[set[str]]:
+    """Returns the static streams that each process of a graph holds now, of those that answer within `timeout` s."""
+    answers = bus.ask(statics_key(namespace, "*"), timeout=timeout)
+    return [set(msgpack.unpackb(answer, raw=False)) for answer in answers]
 
 
 def _read_spec(data: bytes) -> tuple[tuple[zenoh.KeyExpr, ...], TapWindow]:

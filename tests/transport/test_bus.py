@@ -196,6 +196,27 @@ def test_a_subscription_that_was_closed_receives_nothing_more(
     assert len(ended) == count
 
 
+def test_an_interrupt_while_closing_takes_effect_when_it_is_closed(
+    endpoint: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = Bus(NetworkConfig(listen=(endpoint,)))
+    session = bus.session
+    closed: list[bool] = []
+
+    class Interrupting:
+        def close(self) -> None:
+            for _ in range(3):
+                signal.raise_signal(signal.SIGINT)
+            session.close()
+            closed.append(True)
+
+    monkeypatch.setattr(bus, "session", Interrupting())
+    with pytest.raises(KeyboardInterrupt):
+        bus.close()
+    assert closed == [True]
+    assert session.is_closed()
+
+
 def test_an_endpoint_in_use_is_an_error_that_names_it(open_bus: Callable[..., Bus], endpoint: str) -> None:
     open_bus(listen=(endpoint,))
     with pytest.raises(BusError, match=endpoint):
