@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataflow.graph.model import Graph
 from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
 from dataflow.transport.registry import RunningGraph, running
-from dataflow.transport.taps import held_statics
+from dataflow.transport.tap_client import held_statics
 
 POLL = 0.1
 AGAIN_AFTER = 0.005

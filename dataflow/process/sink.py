@@ -25,7 +25,7 @@ from dataflow.process.network import network_config
 from dataflow.records.firing import consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Bus, DecodeError, Kind, decode
-from dataflow.transport.codec import MAGIC
+from dataflow.transport.envelope import MAGIC
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01

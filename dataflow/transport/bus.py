@@ -18,8 +18,9 @@ from typing import Any, Self
 
 import zenoh
 
-from dataflow.transport.codec import Buffer, DecodeError, Envelope, encode_head
+from dataflow.transport.codec import encode_head
 from dataflow.transport.counters import Counters
+from dataflow.transport.envelope import Buffer, DecodeError, Envelope
 from dataflow.transport.keys import RUNTIME, shared_key, static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
 from dataflow.transport.pool import BoardReader, SharedPool

@@ -1,4 +1,4 @@
-"""The wire form of everything that travels on a stream: encode, decode, and nothing else (pure, no I/O).
+"""The wire form of envelopes: encode, decode, and nothing else (pure, no I/O).
 
 An envelope is one byte string: a fixed prelude, a msgpack head (which stream, which number, which stamp), for messages
 a msgpack body (schema, header fields, array descriptors), and the arrays' raw bytes, each aligned to 64 bytes. The
@@ -8,10 +8,7 @@ format is specified byte by byte in `docs/wire-format.md`.
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any, Final
 
 import msgpack
@@ -19,91 +16,29 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.base import ArrayField, Message, MessageError, ScalarField, message_type
-
-MAGIC: Final = b"\x9cDFE"
-VERSION: Final = 1
-ALIGNMENT: Final = 64
-PRELUDE: Final = struct.Struct("<4sBBHI")  # magic, version, kind, head bytes, body bytes
-
-Buffer = bytes | bytearray | memoryview
+from dataflow.transport.envelope import (
+    ALIGNMENT,
+    DEFAULT_LIMITS,
+    MAGIC,
+    PRELUDE,
+    VERSION,
+    Buffer,
+    DecodeError,
+    Envelope,
+    Head,
+    Kind,
+    Limits,
+)
 
 _INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
 _PADDING = bytes(ALIGNMENT)
 _NIL = 0xC0
 _HEAD_FIELDS: Final = 6
-
-
-class DecodeError(ValueError):
-    """Bytes that are no envelope: says what is wrong and where."""
-
-
-class Kind(IntEnum):
-    """What an envelope says about its stream."""
-
-    MESSAGE = 1
-    """A message; `stamp` is the message's. It implies the frontier `stamp`."""
-    FRONTIER = 2
-    """No later message has a stamp ≤ `stamp`. `incarnation` and `seq` mean nothing."""
-    END = 3
-    """Nothing follows: `stamp` is the final one, `reason` says why. `incarnation` and `seq` mean nothing."""
-    PROBE = 5
-    """Start barrier: carries no data. `seq` is the probe's number."""
-    REFERENCE = 6
-    """A message that lies in shared memory: resolved by the bus, never seen by its users."""
-
-
 _KINDS: Final = frozenset(Kind)
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What a decoder accepts at most. Anything larger is a `DecodeError` before memory is taken for it."""
-
-    head_bytes: int = 4096
-    body_bytes: int = 1 << 20
-    payload_bytes: int = 1 << 30
-    dimensions: int = 8
-    string_bytes: int = 1 << 16
-    strings: int = 1 << 16
-
-
-DEFAULT_LIMITS: Final = Limits()
-
-
-@dataclass(frozen=True, slots=True)
-class Head:
-    """What every envelope says before its content: enough for rates, lag and routing."""
-
-    kind: Kind
-    stream: str
-    incarnation: int
-    seq: int
-    stamp: int
-    wall: int
-    """Wall time of the publication, ns since the epoch. For showing lag only, never compared."""
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Envelope:
-    """One thing that happens on a stream.
-
-    `stamp` is the message's stamp, the frontier, or the final stamp (ns since the epoch), by `kind`. `wall` is the wall
-    time of the publication (ns), for showing lag only.
-    """
-
-    kind: Kind
-    stream: str
-    incarnation: int
-    seq: int
-    stamp: int
-    message: Message | None = None
-    reason: str = ""
-    wall: int = 0
-
-
 def encode_head(envelope: Envelope) -> bytes:
-    """The msgpack head alone; raises `ValueError` when it is longer than the prelude can say."""
+    """Returns the msgpack head alone; raises `ValueError` when it is longer than the prelude can say."""
     head: bytes = msgpack.packb(
         (envelope.stream, envelope.incarnation, envelope.seq, envelope.stamp, envelope.wall, envelope.reason)
     )
@@ -113,7 +48,7 @@ def encode_head(envelope: Envelope) -> bytes:
 
 
 def encode_parts(envelope: Envelope) -> list[Buffer]:
-    """The envelope as consecutive buffers, arrays by reference: joined, they are the wire form.
+    """Returns the envelope as consecutive buffers, arrays by reference: joined, they are the wire form.
 
     Raises `ValueError` when a head or body exceeds what the prelude can say, or `message` does not fit `kind`.
     """
@@ -142,22 +77,22 @@ def encode_parts(envelope: Envelope) -> list[Buffer]:
 
 
 def encode(envelope: Envelope) -> bytes:
-    """The wire form of `envelope`; copies its arrays once."""
+    """Returns the wire form of `envelope`; copies its arrays once."""
     return b"".join(encode_parts(envelope))
 
 
 def parts_size(parts: Sequence[Buffer]) -> int:
-    """Bytes of the wire form that `parts` make up."""
+    """Returns the bytes of the wire form that `parts` make up."""
     return sum(len(p) for p in parts)
 
 
 def decode_head(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Head:
-    """The head alone: which stream, kind, stamp and number, without looking at the message. Raises `DecodeError`."""
+    """Returns the head alone: stream, kind, stamp and number, without looking at the message. Raises `DecodeError`."""
     return _head(_bytes_view(buffer), limits)[0]
 
 
 def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Envelope:
-    """The envelope in `buffer`, which must hold exactly one.
+    """Returns the envelope in `buffer`, which must hold exactly one.
 
     The message's arrays are read-only views of `buffer`: nobody may write to it afterwards. Raises only `DecodeError`.
     """

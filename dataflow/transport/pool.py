@@ -17,7 +17,7 @@ from typing import Final, Protocol
 import msgpack
 import psutil  # type: ignore[import-untyped]
 
-from dataflow.transport.codec import MAGIC, PRELUDE, VERSION, Buffer, Kind
+from dataflow.transport.envelope import MAGIC, PRELUDE, VERSION, Buffer, Kind
 from dataflow.transport.shared import (
     BOARD_BYTES,
     BOARD_NAME,

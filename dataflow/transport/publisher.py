@@ -10,8 +10,9 @@ from typing import Any
 
 import zenoh
 
-from dataflow.transport.codec import Buffer, Envelope, Kind, encode_parts, parts_size
+from dataflow.transport.codec import encode_parts, parts_size
 from dataflow.transport.counters import Counters
+from dataflow.transport.envelope import Buffer, Envelope, Kind
 from dataflow.transport.keys import shared_key
 from dataflow.transport.pool import BoardReader
 from dataflow.transport.seal import Seal

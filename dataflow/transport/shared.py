@@ -22,7 +22,7 @@ from typing import Any, Final
 import msgpack
 import numpy as np
 
-from dataflow.transport.codec import MAGIC, PRELUDE, DecodeError, Kind
+from dataflow.transport.envelope import MAGIC, PRELUDE, DecodeError, Kind
 
 SUPPORTED: Final = sys.platform == "linux" and hasattr(os, "memfd_create")
 THRESHOLD: Final = 32 << 10

@@ -14,20 +14,8 @@ from hypothesis import strategies as st
 from transport_envelopes import carrying
 
 from dataflow.messages import Message, array, scalar
-from dataflow.transport.codec import (
-    ALIGNMENT,
-    MAGIC,
-    PRELUDE,
-    VERSION,
-    DecodeError,
-    Envelope,
-    Kind,
-    Limits,
-    decode,
-    decode_head,
-    encode,
-    encode_parts,
-)
+from dataflow.transport.codec import decode, decode_head, encode, encode_parts
+from dataflow.transport.envelope import ALIGNMENT, MAGIC, PRELUDE, VERSION, DecodeError, Envelope, Kind, Limits
 
 
 class CodecSample(Message):

@@ -16,7 +16,7 @@ from transport_envelopes import carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, decode
-from dataflow.transport.codec import MAGIC, PRELUDE, VERSION
+from dataflow.transport.envelope import MAGIC, PRELUDE, VERSION
 from dataflow.transport.shared import SUPPORTED
 
 pytestmark = pytest.mark.skipif(not SUPPORTED, reason=f"no memfd on {sys.platform}")
