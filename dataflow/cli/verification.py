@@ -12,13 +12,14 @@ from dataflow.cli.arguments import (
     FLAG,
     Json,
     ModuleFolders,
+    Network,
     Settings,
     check_offset,
     existing,
     find_modules_in,
     output_file,
 )
-from dataflow.cli.execution import OneProcess, ProcessEach, Quiet
+from dataflow.cli.execution import OneProcess, ProcessEach, Quiet, say_network_ignored
 from dataflow.cli.output import (
     COULD_NOT_RUN,
     DIFFERENT,
@@ -92,6 +93,7 @@ def verify(
             "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
         ),
     ] = None,
+    network: Network = False,
     quiet: Quiet = False,
     one_process: OneProcess = False,
     process_each: ProcessEach = False,
@@ -159,6 +161,7 @@ def verify(
             "only": only,
             "tolerance": tolerance,
             "start": start,
+            "network": network,
             "placement": "one_host" if one_process else "host_each" if process_each else "graph",
         }
         single = len(recordings) == 1 and not recordings[0].is_dir()
@@ -193,7 +196,10 @@ def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], Verif
 
     def verifier(path: Path) -> VerifyReport:
         with shown(err, RunDisplay(err), quiet=quiet) as watch:
-            return verify_recording(path, watch=watch, **options)
+            report = verify_recording(path, watch=watch, **options)
+        if report.network_ignored:
+            say_network_ignored(path)
+        return report
 
     return verifier
 

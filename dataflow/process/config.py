@@ -15,8 +15,9 @@ class HostConfig:
     """What the supervisor tells a host to be. Travels as plain values.
 
     `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
-    are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is
-    (messages, bytes). `firings`: whether a recorder takes the firing records. `verify` names a recording by whose
+    are the remote ones taken here. `secret` is the run's: only messages that were sealed with it count. `replay` names
+    a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`: whether a recorder
+    takes the firing records. `verify` names a recording by whose
     firing records the operators are driven. `live`: sources do not wait for the graph, and operators not for their
     inputs. `resume` is given to a host that takes the place of one that died: for each operator, where it had got to
     (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the operators'
@@ -30,6 +31,7 @@ class HostConfig:
     subscribe: list[str]
     listen: list[str]
     connect: list[str]
+    secret: str
     replay: dict[str, Any] | None = None
     window: tuple[int, int] = (256, 64 << 20)
     rate: float | None = None

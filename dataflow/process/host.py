@@ -37,8 +37,8 @@ from dataflow.recording import Recording
 from dataflow.reexecution.recorded import RecordedRunner, recorded_digests, recorded_firings
 from dataflow.sync import FOREVER, NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode
-from dataflow.transport.bus import BusError
 from dataflow.transport.keys import runtime_key
+from dataflow.transport.publisher import BusError
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.004
@@ -103,7 +103,10 @@ class Host:
 
     def open(self) -> None:
         """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
-        self.bus = Bus(network_config(self.graph.network, self.config.listen, self.config.connect))
+        config = self.config
+        self.bus = Bus(
+            network_config(self.graph.network, config.secret, config.listen, config.connect, live=config.live)
+        )
         self.taps = TapServer(self.bus, self.graph.namespace)
         for stream, consumers in self.config.publish.items():
             self.remote[stream] = self.bus.publisher(stream, consumers=consumers)
@@ -120,7 +123,6 @@ class Host:
             self._make_log(self.config.replay)
         limit_threads(self.graph.threads)
         for maker in self.makers:
-            self.bus.alive(self.graph.namespace, maker.node.name)
             maker.setup()
         if self.config.resume is not None:
             self._fetch_statics()
@@ -145,7 +147,7 @@ class Host:
         wanted = {s for s in self.config.subscribe if s in self.static}
         deadline = time.monotonic() + STATICS_WITHIN
         while missing := wanted - self._static_seen:
-            for stream, payload in self.bus.query_static(self.graph.namespace, timeout=1.0).items():
+            for stream, payload in self.bus.fetch_statics(self.graph.namespace, timeout=1.0).items():
                 if stream in missing:
                     self._receive(stream, payload)
             if time.monotonic() > deadline:

@@ -25,7 +25,7 @@ from dataflow.process.network import network_config
 from dataflow.records.firing import consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Bus, DecodeError, Kind, decode
-from dataflow.transport.codec import MAGIC
+from dataflow.transport.envelope import MAGIC
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01
@@ -44,6 +44,7 @@ class SinkConfig:
     streams: list[str]
     firings: list[str]
     connect: list[str]
+    secret: str
     options: dict[str, Any]
     live: bool = False
 
@@ -107,7 +108,8 @@ class SinkHost:
         self._outcome = "the supervisor is gone"
 
     def open(self) -> None:
-        self.bus = Bus(network_config(self.graph.network, [], self.config.connect))
+        config = self.config
+        self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
         for key in (*self.frontiers, *self.firings_open):
             self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")
@@ -229,7 +231,7 @@ class SinkHost:
             self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
             self._ended = True
-            self.channel.send("ended", report={"counts": self._counts()})
+            self.channel.send("ended", report={"counts": self._counts(), "transport": self.bus.counters()})
 
     def _counts(self) -> dict[str, list[int]]:
         return {self.config.label: [0, self.written, 0, self._busy_ns, self._done]}

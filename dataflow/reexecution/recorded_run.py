@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 from dataflow.graph import load_bundle
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, Network
 from dataflow.messages.base import message_type
 from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording
@@ -19,7 +20,20 @@ class ReplayError(ValueError):
 
 
 def recorded_graph(recording: Recording) -> Graph:
-    """The graph that made a recording. Raises `ReplayError` when it does not hold one."""
+    """Returns the graph that made a recording, without its network: a recording opens no port and calls nobody.
+
+    Raises `ReplayError` when the recording does not hold a graph.
+    """
+    return isolated(graph_as_recorded(recording))
+
+
+def isolated(graph: Graph) -> Graph:
+    """Returns a graph whose processes can only be reached from this machine, whatever its `network:` section says."""
+    return replace(graph, network=Network(shared_memory=graph.network.shared_memory))
+
+
+def graph_as_recorded(recording: Recording) -> Graph:
+    """Returns the graph that made a recording, as it is. Raises `ReplayError` when it does not hold one."""
     bundle = recording.metadata.get(GRAPH, {}).get("bundle")
     if bundle is None:
         raise ReplayError(f"{recording.path} does not hold the graph that made it: name one with --graph")

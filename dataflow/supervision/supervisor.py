@@ -23,8 +23,7 @@ from dataflow.supervision.nursery import Child, Nursery, NurseryFailed
 from dataflow.supervision.plan import RunPlan, expected_probes, host_plans
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
 from dataflow.sync import FOREVER, NEVER
-from dataflow.transport import registry, reserve_endpoints
-from dataflow.transport.network import Reservation
+from dataflow.transport import Reservation, new_secret, registry, reserve_endpoints
 
 TICK = 0.05
 QUIET = 0.3
@@ -141,9 +140,15 @@ class Supervisor:
         self._nursery = Nursery(environment(graph.threads))
         self._reserved = reserve_endpoints(len(self._plans))
         endpoints = dict(zip(self._plans, self._reserved.endpoints, strict=True))
+        secret = new_secret()
         for label, host in self._plans.items():
             connect = [endpoints[up] for up in host.upstream]
-            common: dict[str, Any] = {"label": label, "graph": graph.to_json(), "connect": connect}
+            common: dict[str, Any] = {
+                "label": label,
+                "graph": graph.to_json(),
+                "connect": connect,
+                "secret": secret,
+            }
             if host.sink is not None:
                 config = common | {
                     "kind": host.sink,
@@ -216,7 +221,6 @@ class Supervisor:
         """Every host ready, and every edge proven by a probe that arrived."""
         deadline = time.monotonic() + self.plan.start_timeout
         probing = False
-        assert self._reserved is not None
         while True:
             self._receive(TICK)
             if self._stop_asked:
@@ -226,7 +230,6 @@ class Supervisor:
             if all(p.ready for p in processes):
                 if not probing:
                     probing = True
-                    self._reserved.close()
                     self._send_all("probe")
                 if not any(p.unseen for p in processes):
                     return

@@ -13,7 +13,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.reexecution.recorded import Verification, recorded_firings
-from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+from dataflow.reexecution.recorded_run import ReplayError, graph_as_recorded, isolated
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import OperatorCounts, RunFailed
@@ -52,6 +52,8 @@ class VerifyReport:
     producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
     start: float | None = None
     torn: bool = False
+    network_ignored: bool = False
+    """The graph inside the recording has a `network:` section, which was not obeyed."""
     work: Mapping[str, OperatorCounts] = field(default_factory=dict)
 
     @property
@@ -124,6 +126,7 @@ def verify(
     only: str | None = None,
     tolerance: float | None = None,
     start: float | None = None,
+    network: bool = False,
     watch: Watch | None = None,
     **options: Any,
 ) -> VerifyReport:
@@ -135,13 +138,15 @@ def verify(
     field: the culprits as far as the first difference, with a `tolerance` (absolute, in the unit of each floating-point
     field) all of them to the end.
     `start` (seconds from the first message) begins in the middle, from recorded states where there are any; see
-    `midway.verify_from`. Further options are the fields of `RunPlan`.
+    `later_start.verify_from`. `network`: obey the `network:` section of the graph inside the recording, which is left
+    alone otherwise. Further options are the fields of `RunPlan`.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
     if tolerance is not None and not 0 <= tolerance < math.inf:
         raise ReplayError(f"tolerance {tolerance}: expected a finite number, 0 or more")
     with Recording(path) as recording:
-        played = graph or recorded_graph(recording)
+        recorded = graph or graph_as_recorded(recording)
+        played = recorded if graph or network else isolated(recorded)
         chosen = _with_makers(recording, played, _chosen(played, first, only))
         require_records(recording, sorted(chosen))
         require_ports(recording, played, sorted(chosen))
@@ -167,6 +172,7 @@ def verify(
             span=(last - begin) * 1e-9,
             start=start,
             torn=torn,
+            network_ignored=played.network != recorded.network,
         )
     report = execute(RunPlan(played, log=log, verify=frozenset(chosen), **options), mode="verify", watch=watch)
     found = {v["operator"]: Verification.from_wire(v) for v in report.verifications}
@@ -186,6 +192,7 @@ def verify(
         tolerance=tolerance,
         comparisons=_compare(path, played, differing, tolerance),
         digests=report.streams,
+        network_ignored=played.network != recorded.network,
         work={v.operator: report.operators[v.operator] for v in compared},
         torn=torn,
         outputs={v.operator: tuple(played.nodes[v.operator].outputs.values()) for v in compared},

@@ -8,7 +8,6 @@ import select
 import shutil
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -145,13 +144,14 @@ def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
 
 
 class Link:
-    """A wire between two hosts, for a test to cut: a TCP proxy on loopback in front of `endpoint`."""
+    """A wire between two hosts, for a test to cut: a proxy in front of `endpoint`, a Unix socket."""
 
     def __init__(self, endpoint: str) -> None:
-        address, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-        self._to = (address, int(port))
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self._to = endpoint.removeprefix("unixsock-stream/")
+        self._server = socket.socket(socket.AF_UNIX)
+        self._server.bind(f"{self._to}.wire")
+        self._server.listen()
+        self.endpoint = f"{endpoint}.wire"
         self.whole = True
         self.carried = 0
         self.cuts = 0
@@ -176,7 +176,8 @@ class Link:
         try:
             if not self.whole:
                 raise ConnectionError("the wire is cut")
-            far = socket.create_connection(self._to, timeout=5)
+            far = socket.socket(socket.AF_UNIX)
+            far.connect(self._to)
         except OSError:  # nobody is there (any more)
             near.close()
         else:
@@ -196,7 +197,6 @@ class Link:
     def _close(self, end: socket.socket) -> None:
         for each in (end, self._pairs.pop(end)):
             self._pairs.pop(each, None)
-            each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset, as a lost peer is
             each.close()
 
     def _drop(self) -> None:
