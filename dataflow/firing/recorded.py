@@ -1,47 +1,32 @@
-"""Drives an operator by its recorded firings and compares what it makes, digest by digest.
+"""Drives an operator by its recorded firings.
 
-The recorded firings say which messages each call was given, so nothing is decided again: drops, timeouts, lateness and
-restarts of a live run are repeated exactly. A difference is the operator's own when everything it had been given
-until then was as recorded (*culprit*); otherwise it follows from another's (*downstream*).
+They say which messages each call was given, so nothing is decided again: drops, timeouts, lateness and restarts of a
+live run are repeated exactly. A `Judge` compares what comes out, digest by digest.
 """
 
 from __future__ import annotations
 
-import re
 import time
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import PurePath
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from dataflow.firing.align import align_spec
-from dataflow.firing.judge import Difference, Digests, Verification
-from dataflow.firing.runner import (
-    Emitter,
-    OperatorFailure,
-    OutputPorts,
-    call_operator,
-    changed_input,
-    entries_of,
-    readable,
-    summary_of,
-)
-from dataflow.firing.seeding import firing_seed, seed_generators
-from dataflow.firing.snapshots import pack_state, unpack_state
+from dataflow.firing.calls import Calls, changed_input
+from dataflow.firing.failure import RAISED, OperatorFailure
+from dataflow.firing.judge import Digests, Judge, Verification
+from dataflow.firing.ports import Emitter
+from dataflow.firing.protocol import Runner
+from dataflow.firing.seeding import VERSION
 from dataflow.graph.model import Node
-from dataflow.messages.base import Message
-from dataflow.operator import Operator, OperatorSpec, outputs_of
-from dataflow.records.firing import WITHHELD, Emission, FiringRecord
+from dataflow.operator import ParameterError
+from dataflow.records.firing import FiringRecord
 from dataflow.records.reading import CALLS, beginning, needed_from, whole
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
 
-RAISED = (Exception, SystemExit, KeyboardInterrupt)
-"""What an operator may raise; a live run records all of it as the operator's error."""
 
-_ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
-
-
-class RecordedRunner:
-    """One operator, re-executed. The same shape as `OperatorRunner`, so a host drives either."""
+class RecordedRunner(Runner):
+    """One operator, re-executed by its `records`. `inputs` are the digests of what it was given; `seeding` is the
+    version by which the recorded run seeded its generators; `begin` the stamp from which it is to be repeated."""
 
     def __init__(
         self,
@@ -52,56 +37,44 @@ class RecordedRunner:
         records: Iterable[FiringRecord],
         inputs: Digests,
         seed: int = 0,
+        seeding: int = VERSION,
         paranoid: bool = False,
         begin: int | None = None,
     ) -> None:
-        self.node, self.seed, self.paranoid = node, seed, paranoid
-        self.operator: Operator = node.make()
-        self.spec: OperatorSpec = self.operator.spec
-        self.ports = OutputPorts(node, self.spec, emitter)
-        self.emitter = emitter
-        self.result = Verification(node.name)
-        self._inputs = inputs
+        super().__init__(node, node.make(), emitter)
+        self.paranoid = paranoid
+        self.calls = Calls(node, self.operator, seed, version=seeding)
+        self.judge = Judge(node.name, tuple(self.ports.states), inputs)
         kept, lost = whole(records)
         self._setup_record = kept.pop(0) if kept and kept[0].kind == "setup" else None
         self._before, self._records, self.result.began = beginning(kept, begin, stateless=self.operator.stateless)
         calls = [r for r in self._records if r.kind in CALLS]
         self.result.firings = len(calls) + lost
         self.result.lost_records = lost
-        self.aligner_spec = align_spec(node, self.spec, static)
-        self.aligner = RecordedAligner(self.aligner_spec, (r.firing() for r in calls))
+        self._align_spec = align_spec(node, self.spec, static)
+        self.aligner = RecordedAligner(self._align_spec, (r.firing() for r in calls))
         self._position = 0
         self._changed: dict[str, Any] = {}
         self._latest: dict[str, tuple[int, int]] = {}
         self._open = {s for streams in node.inputs.values() for s in streams}
-        self.firings = 0
-        self.done = NEVER
-        self.ended = False
-        self.busy_ns = 0
+
+    @property
+    def result(self) -> Verification:
+        """What re-execution has come to so far."""
+        return self.judge.result
+
+    def report(self) -> Mapping[str, Any]:
+        return {"verification": self.result.to_wire()}
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
-        statics = self._set_up()
-        first = self._setup_record
-        if first is not None:
-            self.result.files_changed = _changed_files(first.detail.get("files", {}), self.operator.files)
-            self._compare(first, statics)
+        statics = self.calls.setup()
+        if self._setup_record is not None:
+            self.judge.files(self._setup_record, self.operator.files)
+            for name, message, seq in self.judge.outputs(self._setup_record, statics):
+                self.ports.emit_as(name, message, seq, self._setup_record.incarnation)
         self._take_up()
-        for state in self.ports.states.values():
-            if state.port.static:
-                state.promised = FOREVER
-                self.emitter.end(state.stream, None, "static")
-
-    def _change(self, values: Mapping[str, Any]) -> None:
-        """Sets parameters to values that they had when the recording was made."""
-        for name, value in values.items():
-            self._changed[name] = value
-            try:
-                self.operator.set_parameter(name, value)
-            except Exception as error:
-                raise OperatorFailure(
-                    self.node.name, f"taking the recorded value of parameter {name!r}", error
-                ) from error
+        self.ports.end_statics()
 
     def _take_up(self) -> None:
         """Where re-execution begins in the middle: the last restart, the parameters and the state of that moment."""
@@ -115,23 +88,20 @@ class RecordedRunner:
         again = [record for record in self._before if record.kind == "setup"]
         if again:
             self._start_again(again[-1])
-        self._change(changes)
+        self._change(changes, again[-1].incarnation if again else 0)
         if self._before and self._before[-1].kind == "snapshot":
-            self._restore_from(self._before[-1].detail["state"])
+            last = self._before[-1]
+            self.calls.restore(last.detail["state"], (last.incarnation, last.stamp))
 
-    def _restore_from(self, state: bytes) -> None:
-        try:
-            self.operator.restore(unpack_state(state))
-        except Exception as error:
-            raise OperatorFailure(self.node.name, "restore()", error) from error
-
-    def _set_up(self) -> dict[str, Message]:
-        try:
-            self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, NEVER))
-            self.operator.setup()
-            return dict(self.operator.static_outputs())
-        except RAISED as error:
-            raise OperatorFailure(self.node.name, "setup()", error) from error
+    def _change(self, values: Mapping[str, Any], incarnation: int) -> None:
+        """Sets parameters to values that they had when the recording was made."""
+        for name, value in values.items():
+            self._changed[name] = value
+            try:
+                self.calls.parameter(name, value, (incarnation, NEVER))
+            except RAISED as error:
+                when = f"taking the recorded value of parameter {name!r}"
+                raise OperatorFailure(self.node.name, when, error) from error
 
     def push(self, stream: str, entry: Entry) -> None:
         self._latest[stream] = (entry.incarnation, entry.seq)
@@ -159,6 +129,7 @@ class RecordedRunner:
         record = self._records[self._position]
         self._fire(firing, record)
         self._position += 1
+        self.done = max(self.done, record.stamp)
         return True
 
     def _repeat_changes(self) -> None:
@@ -166,62 +137,48 @@ class RecordedRunner:
         while self._position < len(self._records) and self._records[self._position].kind not in CALLS:
             record = self._records[self._position]
             self._position += 1
-            self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, NEVER))
+            place = (record.incarnation, record.stamp)
             match record.kind:
                 case "setup":
                     self._start_again(record)
-                case "param":
-                    self._changed[record.detail["name"]] = record.detail["value"]
-                    self._attempt(record, lambda d: self.operator.set_parameter(d["name"], d["value"]))
-                case "reset":
-                    self._attempt(record, lambda d: self.operator.on_reset(d["input"]))
+                case "param" | "reset":
+                    self._attempt(record)
                 case "snapshot":
-                    self._compare_state(record)
+                    self.judge.state(record, self.calls.snapshot(place))
                 case "restore":
                     self._restore(record)
 
     def _start_again(self, record: FiringRecord) -> None:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
         self.operator.close()
-        self.operator = self.node.make()
-        self._change(self._changed)
-        statics = self._set_up()
-        for (name, _), expected in zip(self.ports.states.items(), record.outputs, strict=True):
-            if expected is not None and (name not in statics or statics[name].digest() != expected.digest):
-                self._differ(record, name, expected.digest.hex(), "another static message")
+        self.operator = self.calls.operator = self.node.make()
+        self._change(self._changed, record.incarnation)
+        self.judge.statics(record, self.calls.setup())
 
-    def _attempt(self, record: FiringRecord, change: Callable[[Mapping[str, Any]], object]) -> None:
+    def _attempt(self, record: FiringRecord) -> None:
+        """Changes a parameter, or resets; compares what that raises."""
+        place, detail = (record.incarnation, record.stamp), record.detail
         try:
-            change(record.detail)
+            if record.kind == "param":
+                self._changed[detail["name"]] = detail["value"]
+                self.calls.parameter(detail["name"], detail["value"], place)
+            else:
+                self.calls.reset(detail["input"], place)
         except RAISED as error:
-            self._compare_error(record, error)
+            self.judge.error(record, error)
         else:
-            self._compare_error(record, None)
-
-    def _compare_error(self, record: FiringRecord, error: BaseException | None) -> None:
-        """Compares what a call raised, if anything; addresses in memory, which texts may hold, are left out."""
-        expected = f"error: {record.detail.get('error', '')}" if record.outcome == "error" else "no error"
-        got = "no error" if error is None else f"error: {readable(error)}"
-        if _ADDRESS.sub("", expected) != _ADDRESS.sub("", got):
-            self._differ(record, "", expected, got)
+            self.judge.error(record, None)
 
     def _restore(self, record: FiringRecord) -> None:
-        """A replay that began in the middle: with this state, or with one that cannot be had again."""
+        """A replay that began in the middle: with this state, or with one that is unavailable."""
         state = record.detail["state"]
         if state is None:
             rest = self._records[self._position :]
             self.result.lost_records += sum(r.kind in CALLS for r in rest)
             del self._records[self._position :]
-            self.aligner = RecordedAligner(self.aligner_spec, ())
+            self.aligner = RecordedAligner(self._align_spec, ())
             return
-        self._restore_from(state)
-
-    def _compare_state(self, record: FiringRecord) -> None:
-        state = self.operator.snapshot()
-        packed = b"" if state is None else pack_state(state)
-        if packed != record.detail["state"]:
-            self.result.states += 1
-            self._differ(record, "", "the recorded state", "another state")
+        self.calls.restore(state, (record.incarnation, record.stamp))
 
     def _is_lost(self, missing: MessageRef | None) -> bool:
         """Whether a message that the next firing needs can no longer come."""
@@ -240,78 +197,33 @@ class RecordedRunner:
         """By stream, the first message (incarnation, number) that is needed to repeat what is to be repeated."""
         return needed_from(self._records)
 
-    @property
-    def drops(self) -> Mapping[tuple[str, str], int]:
-        """Nothing is dropped again."""
-        return {}
+    def set_parameter(self, name: str, value: Any) -> Any:
+        raise ParameterError("the parameters of a re-execution are the recorded ones")
 
     def _fire(self, firing: Firing, record: FiringRecord) -> None:
         started = time.time_ns()
-        if self.result.tainted is None and not self._as_recorded(firing):
-            self.result.tainted = record.index
+        self.judge.given(record, firing)
         if record.detail.get("injected"):  # a fault that was tried out: the operator was not called
             self.result.verified += 1
             return
-        self.operator.rng = seed_generators(firing_seed(self.seed, self.node.name, firing.stamp))
         try:
-            messages = outputs_of(self.operator, call_operator(self.operator, firing))
+            messages = self.calls.process(firing)
             if record.outcome == "error":
                 self.ports.check(messages, firing.stamp)
         except RAISED as error:
-            self._compare_error(record, error)
+            self.judge.error(record, error)
             messages = {}
         else:
-            self._compare_error(record, None)
+            self.judge.error(record, None)
             if self.paranoid and (problem := changed_input(self.node, firing)) is not None:
                 raise OperatorFailure(self.node.name, f"{record.kind} at stamp {record.stamp}", problem)
-        self._compare(record, messages)
+        for name, message, seq in self.judge.outputs(record, messages):
+            self.ports.emit_as(name, message, seq, record.incarnation)
         if "summary" in record.detail:
-            self._compare_summary(record)
+            self.judge.summary(record, self.calls.summary((record.incarnation, record.stamp)))
         self.firings += record.kind != "finish"
         self.result.verified += 1
         self.busy_ns += time.time_ns() - started
-
-    def _as_recorded(self, firing: Firing) -> bool:
-        return all(
-            self._inputs.get(entry.stream, {}).get((entry.incarnation, entry.seq), entry.digest) == entry.digest
-            for given in firing.inputs.values()
-            for entry in entries_of(given)
-        )
-
-    def _compare(self, record: FiringRecord, messages: Mapping[str, Message]) -> None:
-        """Compares with the record, and emits under the recorded numbers what the record says was emitted."""
-        recorded = record.outputs or (None,) * len(self.ports.states)
-        for (name, state), expected in zip(self.ports.states.items(), recorded, strict=True):
-            got = messages.get(name)
-            if expected is None and got is None:
-                continue
-            self.result.outputs += 1
-            if expected is None or got is None:
-                self._differ(record, name, *(_word(expected), _word(got)))
-            elif got.digest() != expected.digest:
-                self._differ(record, name, expected.digest.hex(), got.digest().hex())
-            if expected is not None and got is not None and expected.seq != WITHHELD:
-                assert state.digest is not None
-                state.digest.update(got.digest())
-                self.ports.emitted += 1
-                entry = Entry(got.stamp, got, expected.seq, record.incarnation, got.digest(), state.stream)
-                state.last = state.promised = max(state.promised, got.stamp)
-                self.emitter.message(state.stream, entry)
-
-    def _compare_summary(self, record: FiringRecord) -> None:
-        """What the operator sums up at its end: all that a sink makes."""
-        expected, got = record.detail["summary"], summary_of(self.operator, self.node.name)
-        name = next((n for n in (*expected, *got) if repr(expected.get(n)) != repr(got.get(n))), None)
-        if name is not None:
-            self._differ(record, "", *(f"summary {name}: {values.get(name, 'nothing')}" for values in (expected, got)))
-
-    def _differ(self, record: FiringRecord, port: str, expected: str, got: str) -> None:
-        self.result.differing += 1
-        if self.result.first is None:
-            self.result.own_fault = self.result.tainted is None
-            self.result.first = Difference(
-                record.index, record.kind, record.stamp, port, expected, got, record.incarnation
-            )
 
     def _end(self) -> None:
         self.ended, self.done = True, FOREVER
@@ -321,13 +233,3 @@ class RecordedRunner:
             if (lost.incarnation, lost.seq) > self._latest.get(lost.stream, (-1, -1)):
                 self.result.beyond = self.result.unverifiable
         self.ports.end(None, "end of records")
-
-
-def _changed_files(before: Mapping[str, str], now: Mapping[str, str]) -> list[str]:
-    """Files whose content is that of no file of the same name that was read then, wherever that lay."""
-    known = {(PurePath(file).name, digest) for file, digest in before.items()}
-    return sorted(file for file, digest in now.items() if (PurePath(file).name, digest) not in known)
-
-
-def _word(emission: Emission | Message | None) -> str:
-    return "nothing" if emission is None else f"a message at stamp {emission.stamp}"

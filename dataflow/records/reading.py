@@ -36,20 +36,6 @@ def needed_from(records: Iterable[FiringRecord]) -> dict[str, tuple[int, int]]:
     return needed
 
 
-def messages_of(ref: InputRef) -> Iterator[MessageRef]:
-    """Every message that a reference names."""
-    match ref:
-        case None:
-            return
-        case MessageRef():
-            yield ref
-        case tuple():
-            for run in ref:
-                yield from run
-        case _:
-            yield from ref.values()
-
-
 def whole(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
     """The records by (incarnation, index), each once, and how many calls had to be left out.
 

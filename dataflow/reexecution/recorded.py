@@ -4,28 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from dataflow.firing.judge import Difference, Digests, Verdict, Verification
-from dataflow.firing.recorded import RecordedRunner
+from dataflow.firing.judge import Digests
+from dataflow.firing.seeding import version_of
 from dataflow.graph.model import Node
 from dataflow.recording import Recording
+from dataflow.recording.layout import RUN
 from dataflow.records.firing import FiringRecord, decode_batch
-from dataflow.records.reading import CALLS, beginning, first_places, messages_of, needed_from, whole
-
-__all__ = [
-    "CALLS",
-    "Difference",
-    "Digests",
-    "RecordedRunner",
-    "Verdict",
-    "Verification",
-    "beginning",
-    "first_places",
-    "messages_of",
-    "needed_from",
-    "recorded_digests",
-    "recorded_firings",
-    "whole",
-]
 
 
 def recorded_firings(recording: Recording, operator: str) -> Iterator[FiringRecord]:
@@ -45,3 +29,8 @@ def recorded_digests(recording: Recording, nodes: Iterable[Node], streams: froze
                     if emission is not None and stream in found:
                         found[stream][record.incarnation, emission.seq] = emission.digest
     return found
+
+
+def seeding_of(recording: Recording) -> int:
+    """The version of the scheme by which the recorded run seeded its generators."""
+    return version_of(recording.metadata.get(RUN, {}))

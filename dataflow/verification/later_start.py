@@ -6,10 +6,10 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
+from dataflow.firing.judge import Verification
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded import Verification
 from dataflow.sync import Entry
 from dataflow.verification.worker import Tell, apart
 
