@@ -8,8 +8,8 @@ from rich.console import Console
 from rich.text import Text
 
 from dataflow.cli.output import count, plural, seconds, size, table
-from dataflow.firing.judge import Difference, Verification
 from dataflow.recording.diff import FieldDifference
+from dataflow.records.comparison import Difference, Verification
 from dataflow.sync.stamps import format_stamp
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.complete import Completion

@@ -13,14 +13,15 @@ from typing import Any
 from dataflow.firing.align import align_spec
 from dataflow.firing.calls import Calls, changed_input
 from dataflow.firing.failure import RAISED, OperatorFailure
-from dataflow.firing.judge import Digests, Judge, Verification
+from dataflow.firing.judge import Judge
 from dataflow.firing.ports import Emitter
 from dataflow.firing.protocol import Runner
 from dataflow.firing.seeding import VERSION
 from dataflow.graph.model import Node
 from dataflow.operator import ParameterError
-from dataflow.records.firing import FiringRecord
-from dataflow.records.reading import CALLS, beginning, needed_from, whole
+from dataflow.records.comparison import Verification
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import Digests, beginning, needed_from, whole
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
 
 

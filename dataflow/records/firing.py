@@ -20,7 +20,8 @@ Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "
 Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
 OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
-
+CALLS: tuple[Kind, ...] = ("fire", "tick", "finish")
+"""The kinds that stand for a call with messages."""
 
 WITHHELD = -1
 """The place in its stream of a message that was not sent, since its stamp did not increase (live runs only)."""

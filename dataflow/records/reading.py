@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
-from dataflow.records.firing import FiringRecord
+from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.sync import InputRef, MessageRef
 
-CALLS = ("fire", "tick", "finish")
-"""The kinds of records that stand for a call with messages."""
+Place = tuple[int, int]
+"""(incarnation, number) of a message in its stream."""
+Digests = Mapping[str, Mapping[Place, bytes]]
+"""Stream → place → the recorded digest."""
 
 
 def first_places(ref: InputRef) -> Iterator[tuple[str, tuple[int, int]]]:

@@ -10,13 +10,13 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 
 from dataflow.feeds.log import LogFeed
-from dataflow.firing.judge import Verification
 from dataflow.firing.recorded import RecordedRunner
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
-from dataflow.records.reading import CALLS, beginning, needed_from, whole
+from dataflow.records.comparison import Verification
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import beginning, needed_from, whole
 from dataflow.reexecution.recorded import recorded_digests, recorded_firings, seeding_of
 from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
 from dataflow.sync import Entry

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
-from dataflow.firing.judge import Digests
 from dataflow.firing.seeding import version_of
 from dataflow.graph.model import Node
 from dataflow.recording import Recording
 from dataflow.recording.layout import RUN
 from dataflow.records.firing import FiringRecord, decode_batch
+from dataflow.records.reading import Digests
 
 
 def recorded_firings(recording: Recording, operator: str) -> Iterator[FiringRecord]:

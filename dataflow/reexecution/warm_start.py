@@ -9,8 +9,7 @@ from pathlib import Path
 from dataflow.graph.model import Graph, Node
 from dataflow.operator import Operator
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
-from dataflow.records.reading import CALLS
+from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.reexecution.recorded import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph

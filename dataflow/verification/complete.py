@@ -15,11 +15,11 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from dataflow.firing.judge import Verification
 from dataflow.graph.model import Graph
 from dataflow.process.recorder import RecorderSink
 from dataflow.recording import Recording
 from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
 from dataflow.reexecution.engine import Feeding, Recomputation
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph

@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from dataflow.firing.judge import Verification
 from dataflow.graph.model import Graph
 from dataflow.messages import MessageError
 from dataflow.operator import ParameterError
 from dataflow.recording import Recording, RecordingError
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecordError
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed

@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
-from dataflow.firing.judge import Verification
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
+from dataflow.records.comparison import Verification
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.sync import Entry
 from dataflow.verification.worker import Tell, apart

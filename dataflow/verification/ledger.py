@@ -10,10 +10,10 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
-from dataflow.firing.judge import Verification
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import OUTCOME
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import WITHHELD
 from dataflow.reexecution.recorded import recorded_firings
 from dataflow.sync import messages_of

@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from dataflow.firing.judge import Verification
 from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
+from dataflow.records.comparison import Verification
 from dataflow.reexecution.recorded import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.plan import RunPlan

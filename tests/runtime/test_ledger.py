@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.firing.judge import Verification
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.layout import OUTCOME, RESERVED_METADATA
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.reexecution.recorded import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError
