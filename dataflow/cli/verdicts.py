@@ -9,7 +9,7 @@ from rich.text import Text
 
 from dataflow.cli.output import count, plural, seconds, size, table
 from dataflow.recording.diff import FieldDifference
-from dataflow.reexecution.recorded import Difference, Verification
+from dataflow.records.comparison import Difference, Verification
 from dataflow.sync.stamps import format_stamp
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.complete import Completion

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataflow.firing.admission import LiveRunner
+from dataflow.firing.live import LiveRunner
 from dataflow.firing.source import SourceRunner
 
 

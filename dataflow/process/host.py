@@ -17,12 +17,15 @@ from typing import Any
 
 import msgpack
 
-from dataflow.chaos.faults import SourceFaults
+from dataflow.chaos.faults import OperatorFaults, SourceFaults
 from dataflow.chaos.plan import TO_SOURCES
 from dataflow.feeds.log import LogFeed
 from dataflow.feeds.window import Feed, Handover, Window
-from dataflow.firing.admission import LiveRunner
-from dataflow.firing.runner import OperatorFailure, OperatorRunner, summary_of
+from dataflow.firing.calls import summary_of
+from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.live import LiveRunner
+from dataflow.firing.recorded import RecordedRunner
+from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner, step_size, step_stamp
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph, Node
@@ -34,7 +37,7 @@ from dataflow.process.network import network_config
 from dataflow.process.outlet import Outlet
 from dataflow.process.watchdog import Watchdog
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import RecordedRunner, recorded_digests, recorded_firings
+from dataflow.reexecution.recorded import recorded_digests, recorded_firings, seeding_of
 from dataflow.sync import FOREVER, NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode
 from dataflow.transport.keys import runtime_key
@@ -72,6 +75,7 @@ class Host:
         self.feeds: list[Feed] = []
         self.live: list[SourceRunner] = []
         self.faults: dict[str, SourceFaults] = {}
+        self.operator_faults: dict[str, OperatorFaults] = {}
         self._static_seen: set[str] = set()
         self.window = Window(*config.window)
         self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
@@ -84,6 +88,7 @@ class Host:
         self._start: tuple[int, float] | None = None
         self._counted: dict[str, list[int]] = {}
         self._dropped: dict[str, list[list[Any]]] = {}
+        self._waited: dict[str, list[list[Any]]] = {}
         self._reported: dict[str, int] = {}
         self._report_due = 0.0
         self._watch: Watchdog | None = None
@@ -184,8 +189,14 @@ class Host:
             "snapshots": self.config.snapshots,
         }
         if self.config.live:
+            faults = self.operator_faults[node.name] = OperatorFaults()
             return LiveRunner(
-                node, self.outlet, **common, event_clock=self._event_clock, on_failure=self._on_outlived_failure
+                node,
+                self.outlet,
+                **common,
+                event_clock=self._event_clock,
+                on_failure=self._on_outlived_failure,
+                fault=faults.before,
             )
         runner = OperatorRunner(node, self.outlet, **common)
         if self.config.warm is not None:
@@ -228,6 +239,7 @@ class Host:
                 records=recorded_firings(recording, node.name),
                 inputs=recorded_digests(recording, producers, inputs),
                 seed=self.graph.seed,
+                seeding=seeding_of(recording),
                 paranoid=self.config.paranoid,
             )
 
@@ -531,7 +543,9 @@ class Host:
         self._counted = self._counts()
         drops = {name: found for name, found in self._drops().items() if found != self._dropped.get(name)}
         self._dropped |= drops
-        self.channel.send("progress", done=done, counts=self._counted, drops=drops)
+        waits = {name: found for name, found in self._waits().items() if found != self._waited.get(name)}
+        self._waited |= waits
+        self.channel.send("progress", done=done, counts=self._counted, drops=drops, waits=waits)
 
     def _counts(self) -> dict[str, list[int]]:
         """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
@@ -558,6 +572,16 @@ class Host:
             s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self.live
         }
 
+    def _waits(self) -> dict[str, list[list[Any]]]:
+        """For each operator: input, "timeout" or "late", and number: waits given up, and messages that came late."""
+        return {
+            r.node.name: [
+                *([i, "timeout", n] for i, n in sorted(r.timeouts.items())),
+                *([i, "late", n] for i, n in sorted(r.late.items())),
+            ]
+            for r in self.runners
+        }
+
     def _end_if_done(self) -> None:
         if all(f.ended for f in self.feeds) and all(s.ended for s in self.live) and all(r.ended for r in self.runners):
             self._ended = True
@@ -578,6 +602,7 @@ class Host:
             "streams": streams,
             "counts": self._counts(),
             "drops": self._drops(),
+            "waits": self._waits(),
             "summaries": {r.node.name: s for r in self.runners if (s := summary_of(r.operator, r.node.name))},
             "transport": {**self.bus.counters(), "malformed": self.malformed},
             "verifications": [r.result.to_wire() for r in self.runners if isinstance(r, RecordedRunner)],
@@ -644,8 +669,8 @@ class Host:
                 for stream in maker.node.outputs.values():
                     self.bus.session.put(stream, b"\x00malformed\xff" * 8)
             case "raise" | "hang" | "slow" | "leak":
-                if isinstance(maker, LiveRunner):
-                    maker.begin_fault(kind, fields)
+                if operator in self.operator_faults:
+                    self.operator_faults[operator].begin(kind, fields, time.monotonic())
 
     def _parameter_asked(self, name: str) -> Callable[[Any], None]:
         put = self.inbox.put

@@ -13,14 +13,15 @@ from typing import Any, Literal
 
 import msgpack
 
-from dataflow.sync import FiringInputs, InputRef, MessageRef, RunRef
+from dataflow.sync import Drop, FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
 Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot"]
 Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
 OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
-
+CALLS: tuple[Kind, ...] = ("fire", "tick", "finish")
+"""The kinds that stand for a call with messages."""
 
 WITHHELD = -1
 """The place in its stream of a message that was not sent, since its stamp did not increase (live runs only)."""
@@ -37,19 +38,6 @@ class Emission:
     seq: int
     stamp: int
     digest: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class DropRecord:
-    """A message that an operator did not use, and why; `because` names the input that was missing, if any."""
-
-    input: str
-    stream: str
-    incarnation: int
-    seq: int
-    stamp: int
-    reason: str
-    because: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +64,7 @@ class FiringRecord:
     late: frozenset[str] = frozenset()
     outputs: tuple[Emission | None, ...] = ()
     outcome: Outcome = "ok"
-    drops: tuple[DropRecord, ...] = ()
+    drops: tuple[Drop, ...] = ()
     detail: Mapping[str, Any] = field(default_factory=dict)
     wall_start: int = 0
     duration: int = 0
@@ -191,7 +179,7 @@ def _record(
         late=frozenset(late),
         outputs=tuple(None if e is None else Emission(e[0], stamp + e[1], e[2]) for e in outputs),
         outcome=OUTCOMES[outcome],
-        drops=tuple(DropRecord(i, streams[s], *rest) for i, s, *rest in drops),
+        drops=tuple(Drop(i, streams[s], at, n, inc, why, of) for i, s, inc, n, at, why, of in drops),
         detail=detail,
         wall_start=wall_start,
         duration=duration,

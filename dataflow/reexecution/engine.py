@@ -10,20 +10,14 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import dataclass
 
 from dataflow.feeds.log import LogFeed
+from dataflow.firing.recorded import RecordedRunner
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.recorded import (
-    CALLS,
-    RecordedRunner,
-    Verification,
-    beginning,
-    needed_from,
-    recorded_digests,
-    recorded_firings,
-    whole,
-)
+from dataflow.records.comparison import Verification
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import beginning, needed_from, whole
+from dataflow.reexecution.recorded import recorded_digests, recorded_firings, seeding_of
 from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
 from dataflow.sync import Entry
 
@@ -167,6 +161,7 @@ def _runner(
         records=records,
         inputs=recorded_digests(recording, producers, inputs),
         seed=graph.seed,
+        seeding=seeding_of(recording),
         begin=begin,
     )
 

@@ -9,11 +9,11 @@ from pathlib import Path
 from dataflow.graph.model import Graph, Node
 from dataflow.operator import Operator
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
+from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded import CALLS, messages_of, recorded_firings
+from dataflow.reexecution.recorded import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
-from dataflow.sync import Entry
+from dataflow.sync import Entry, messages_of
 
 
 @dataclass(frozen=True, slots=True)

@@ -42,6 +42,7 @@ class LiveSupervisor(Supervisor):
         self._frontiers: dict[str, tuple[int, int]] = {}
         self._base: dict[str, OperatorCounts] = {}
         self._base_drops: dict[str, Counter[tuple[str, str]]] = {}
+        self._base_waits: dict[str, Counter[tuple[str, str]]] = {}
         self._away: dict[str, str] = {}
         self._ended_streams: dict[str, str] = {}
         self._restarted = False
@@ -82,7 +83,13 @@ class LiveSupervisor(Supervisor):
         }
         ended = frozenset(n for p in self._processes.values() if p.report is not None for n in p.nodes)
         self.status.health = self._monitor.update(
-            counts, now, away=self._away, ended=ended, restarts=self.status.restarts, drops=self.status.drops
+            counts,
+            now,
+            away=self._away,
+            ended=ended,
+            restarts=self.status.restarts,
+            drops=self.status.drops,
+            waits=self.status.waits,
         )
         self._tell_recorder("diagnostics", **diagnostics_fields(self.status.health, self._event_time()))
 
@@ -169,6 +176,7 @@ class LiveSupervisor(Supervisor):
             if name in self.status.operators:
                 self._base[name] = self.status.operators[name]
             self._base_drops[name] = Counter(self.status.drops.get(name, {}))
+            self._base_waits[name] = Counter(self.status.waits.get(name, {}))
         self._hand_over_records(process.nodes)
         self._tell_consumers(process, absent=True)
         self._cover()
@@ -290,6 +298,11 @@ class LiveSupervisor(Supervisor):
         super()._count_drops(drops)
         for name in drops:
             self.status.drops[name] += self._base_drops.get(name, Counter())
+
+    def _count_waits(self, waits: Mapping[str, list[tuple[str, str, int]]]) -> None:
+        super()._count_waits(waits)
+        for name in waits:
+            self.status.waits[name] += self._base_waits.get(name, Counter())
 
     def _on_message(self, process: Supervised, kind: str, fields: dict[str, Any]) -> None:
         if kind == "progress" and process.kind == "host":  # one that was started again has not decided anything yet

@@ -43,6 +43,8 @@ class Status:
     operators: dict[str, OperatorCounts] = field(default_factory=dict)
     drops: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
     """By operator, how many messages were dropped by (input, reason); a source's input is ""."""
+    waits: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
+    """By operator and (input, "timeout" or "late"): waits that were given up, and messages that came late."""
     host_of: dict[str, str] = field(default_factory=dict)
     first: int | None = None
     steps: int | None = None
@@ -78,6 +80,9 @@ class RunReport:
     interrupted: bool
     notes: tuple[str, ...]
     restarts: Mapping[str, int] = field(default_factory=dict)
+    waits: Mapping[str, tuple[tuple[str, str, int], ...]] = field(default_factory=dict)
+    """Each operator's (input, "timeout" or "late", count): waits that were given up, which drops nothing, and messages
+    that came after what needed them was decided, of which those for a trigger are among the drops too."""
 
     def digests(self) -> dict[str, str]:
         return {stream: digest for stream, (_, digest) in sorted(self.streams.items())}

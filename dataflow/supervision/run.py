@@ -12,6 +12,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from dataflow.firing import seeding
 from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
@@ -70,6 +71,7 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         "started": str(time.time_ns()),
         "rate": "as fast as it goes" if plan.rate is None else str(plan.rate),
         "seed": str(plan.graph.seed),
+        seeding.FACT: str(seeding.VERSION),
         "threads": str(plan.graph.threads),
         **{f"host of {node}": label for node, label in placed.items()},
     }

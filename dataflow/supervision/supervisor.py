@@ -366,6 +366,7 @@ class Supervisor:
                 process.done |= fields["done"]
                 self._count(fields["counts"])
                 self._count_drops(fields.get("drops", {}))
+                self._count_waits(fields.get("waits", {}))
                 self._cover()
             case "beat":
                 process.beat = time.monotonic()
@@ -377,6 +378,7 @@ class Supervisor:
                 process.report = fields["report"]
                 self._count(fields["report"]["counts"])
                 self._count_drops(fields["report"].get("drops", {}))
+                self._count_waits(fields["report"].get("waits", {}))
                 process.done = dict.fromkeys(process.done, FOREVER)
                 self._cover()
             case "closed":
@@ -398,6 +400,10 @@ class Supervisor:
     def _count_drops(self, drops: Mapping[str, list[tuple[str, str, int]]]) -> None:
         for name, found in drops.items():
             self.status.drops[name] = Counter({(input_name, reason): n for input_name, reason, n in found})
+
+    def _count_waits(self, waits: Mapping[str, list[tuple[str, str, int]]]) -> None:
+        for name, found in waits.items():
+            self.status.waits[name] = Counter({(input_name, what): n for input_name, what, n in found})
 
     def _cover(self) -> None:
         """Tells the feeds how far everything is done."""
@@ -472,6 +478,11 @@ class Supervisor:
             interrupted=self._stop_sent,
             notes=tuple(self.status.notes),
             restarts=dict(self.status.restarts),
+            waits={
+                node: tuple((i, what, n) for (i, what), n in sorted(found.items()))
+                for node, found in self.status.waits.items()
+                if found
+            },
         )
 
     def _await_closed(self) -> None:

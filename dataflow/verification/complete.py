@@ -19,9 +19,9 @@ from dataflow.graph.model import Graph
 from dataflow.process.recorder import RecorderSink
 from dataflow.recording import Recording
 from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
 from dataflow.reexecution.engine import Feeding, Recomputation
-from dataflow.reexecution.recorded import Verification
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import OperatorCounts, Status

@@ -15,8 +15,8 @@ from dataflow.graph.model import Graph
 from dataflow.messages import MessageError
 from dataflow.operator import ParameterError
 from dataflow.recording import Recording, RecordingError
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecordError
-from dataflow.reexecution.recorded import Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
 from dataflow.verification.verify import VerifyReport

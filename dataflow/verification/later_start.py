@@ -8,8 +8,8 @@ from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
+from dataflow.records.comparison import Verification
 from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded import Verification
 from dataflow.sync import Entry
 from dataflow.verification.worker import Tell, apart
 

@@ -13,8 +13,10 @@ from dataclasses import dataclass
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import OUTCOME
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import WITHHELD
-from dataflow.reexecution.recorded import Verification, messages_of, recorded_firings
+from dataflow.reexecution.recorded import recorded_firings
+from dataflow.sync import messages_of
 
 COMPLETE = "complete"
 

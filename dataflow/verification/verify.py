@@ -12,7 +12,8 @@ from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
-from dataflow.reexecution.recorded import Verification, recorded_firings
+from dataflow.records.comparison import Verification
+from dataflow.reexecution.recorded import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError, graph_as_recorded, isolated
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay

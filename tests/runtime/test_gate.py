@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.reexecution.recorded import Difference, Verification
+from dataflow.records.comparison import Difference, Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
 from dataflow.verification.compare import OutputComparison

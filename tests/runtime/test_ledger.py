@@ -11,8 +11,9 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.layout import OUTCOME, RESERVED_METADATA
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
-from dataflow.reexecution.recorded import Verification, recorded_firings
+from dataflow.reexecution.recorded import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.run import run
 from dataflow.verification.complete import complete
