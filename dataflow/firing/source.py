@@ -49,6 +49,7 @@ class SourceRunner:
         self.ended = False
         self.busy_ns = 0
         self.last = NEVER
+        self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
 
@@ -96,9 +97,10 @@ class SourceRunner:
                             f"{self.node.name} yielded stamps {sorted(stamps)} together; "
                             "one step of stream() has one stamp"
                         )
+                    (self._read,) = stamps
                     return messages
         except BaseException as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
         return None
 
     def admit(self) -> tuple[int, int]:

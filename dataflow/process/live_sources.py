@@ -54,28 +54,33 @@ class Reader:
         return not self._thread.is_alive()
 
     def _run(self) -> None:
+        ended = False
         try:
-            self._read()
+            ended = self._read()
         except OperatorFailure as failure:
             self.failure = failure
         except BaseException as error:  # whatever it is, it ends this source, and under its name
-            self.failure = OperatorFailure(self.runner.node.name, f"stream() after stamp {self.runner.last}", error)
-        self.failure = self.failure or self.condemned
+            self.failure = OperatorFailure(self.runner.node.name, "the thread that reads stream()", error)
+        if self.failure is None and not ended:
+            self.failure = self.condemned
         if self.failure is not None:
             self._owner.inbox.put(("source_failed", self, self.failure))
+        elif ended:
+            self._owner.inbox.put(("source", self, None, self._lost))
 
-    def _read(self) -> None:
+    def _read(self) -> bool:
+        """Reads until the source has ended (True) or is to stop."""
         owner, runner = self._owner, self.runner
         while not owner.stopping.is_set() and self.condemned is None:
             step = runner.take()
             if step is None:
-                owner.inbox.put(("source", self, None, self._lost))
-                return
+                return True
             if not runner.source.live and not self._paced(step_stamp(step)):
                 continue
             for given in self._faults.apply(step, time.monotonic()):
                 self._hand_over(given)
         runner.close_stream()
+        return False
 
     def _paced(self, stamp: int) -> bool:
         """Holds a source that could wait to the clock, as a device would be; False for what a device would have seen
@@ -158,6 +163,8 @@ class LiveSources:
         runner = reader.runner
         if step is not None:
             reader.unread.take(*step_size(step))
+        if reader.condemned is not None and step is None:
+            self.failed(reader, reader.condemned)
         if runner.ended or reader.condemned is not None:
             return
         if lost:
@@ -177,7 +184,7 @@ class LiveSources:
         try:
             admitted = runner.emit_live(step)
         except OperatorFailure as failure:
-            if runner.node.live.restart.max == 0:
+            if runner.node.live.restart.max == 0 or self.stopping.is_set():
                 raise
             reader.condemned = failure  # it comes back as this source's failure when the thread has ended
             return
