@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from dataflow.firing.calls import Calls
-from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.failure import OperatorFailure, readable
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter, OutputPorts
 from dataflow.firing.seeding import change_seed, seed_generators
@@ -39,11 +40,13 @@ class SourceRunner:
         self._recorded: Counter[str] = Counter()
         self._backwards: list[int] = []
         self._resumed = False
+        self._changed: dict[str, Any] = {}
         self.records = FiringLog(node.name, emitter)
         self.firings = 0
         self.ended = False
         self.busy_ns = 0
         self.last = NEVER
+        self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
 
@@ -53,9 +56,12 @@ class SourceRunner:
         self.records.add_setup(self.operator, started, self.ports.prepare(statics, NEVER))
         self.ports.publish()
         self.ports.end_statics()
+        self._begin_stream()
+
+    def _begin_stream(self) -> None:
         try:
             self._steps = iter(self.source.stream())
-        except Exception as error:
+        except BaseException as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
 
     def look_ahead(self) -> int | None:
@@ -104,9 +110,10 @@ class SourceRunner:
                             f"{self.node.name} yielded stamps {sorted(stamps)} together; "
                             "one step of stream() has one stamp"
                         )
+                    (self._read,) = stamps
                     return messages
-        except (Exception, SystemExit, KeyboardInterrupt) as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+        except BaseException as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
         return None
 
     def admit(self) -> tuple[int, int]:
@@ -178,6 +185,36 @@ class SourceRunner:
         self.ports.resume(incarnation, last)
         self.last = max(last.values(), default=NEVER)
         self._resumed = not self.source.live
+        self._change(changed)
+
+    def start_again(self) -> None:
+        """Puts a fresh source in the place of one that failed, with the parameters as they were last set; its streams
+        begin a new incarnation. Raises `OperatorFailure` when that fails too."""
+        old = self.operator
+        self._steps, self._next = iter(()), None
+        self._backwards.clear()
+        incarnation = self.records.incarnation + 1
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation)
+        self._resumed = not self.source.live
+        try:
+            old.close()
+        except Exception as error:  # the first failure is known
+            print(f"{self.node.name}: close() after a failure: {readable(error)}", file=sys.stderr)
+        try:
+            self.operator = self.node.make()
+            assert isinstance(self.operator, Source)
+            self.source = self.operator
+            self._change(self._changed)
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "construction", error) from error
+        started = time.time_ns()
+        Calls(self.node, self.operator, self.seed).setup()  # its static streams go on as they are
+        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states))
+        self._begin_stream()
+
+    def _change(self, changed: Mapping[str, Any]) -> None:
+        self._changed = dict(changed)
         for name, value in changed.items():
             self.operator.set_parameter(name, value)
 
@@ -188,6 +225,7 @@ class SourceRunner:
         """
         started = time.time_ns()
         self.operator.set_parameter(name, value)
+        self._changed[name] = value
         plain = self.operator.params.model_dump(mode="json")[name]
         self.records.add("param", max(self.last, NEVER + 1), started, detail={"name": name, "value": plain})
         return plain
@@ -207,7 +245,7 @@ class SourceRunner:
         if close is not None:
             try:
                 close()
-            except Exception as error:
+            except BaseException as error:
                 raise OperatorFailure(self.node.name, "the end of stream()", error) from error
 
 

@@ -1,4 +1,4 @@
-"""The control channel between the supervisor and one host: small msgpack messages over a socket pair.
+"""The control channel between the supervisor and one process: small msgpack messages over a socket pair.
 
 It is a pipe rather than a Zenoh key because its end is the news: when either process dies, however it dies, the other
 one reads end-of-file at once.

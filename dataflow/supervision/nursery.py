@@ -26,7 +26,7 @@ from dataflow.process.channel import Channel
 START_WITHIN = 60.0
 WORDS_PERIOD = 0.1
 LEAVE_WITHIN = 15.0
-PRELOAD = ("dataflow.process.host", "dataflow.process.sink", "dataflow.process.recorder", "dataflow.process.main")
+PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
 
 
 class NurseryFailed(RuntimeError):

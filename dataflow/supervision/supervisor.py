@@ -22,6 +22,7 @@ from dataflow.process.channel import Channel, ChannelClosed, ready
 from dataflow.supervision.nursery import Child, Nursery, NurseryFailed
 from dataflow.supervision.plan import RunPlan, expected_probes, host_plans
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
+from dataflow.supervision.words import Words
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Reservation, new_secret, registry, reserve_endpoints
 
@@ -88,7 +89,7 @@ class Supervisor:
     def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
         self.plan = plan
         self.status = Status()
-        self._on_output = on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr))
+        self._words = Words(on_output or (lambda label, line: print(f"[{label}] {line}", file=sys.stderr)))
         self._plans = host_plans(plan)
         self._processes: dict[str, Supervised] = {}
         self._covered = NEVER
@@ -215,7 +216,7 @@ class Supervisor:
         for text in process.child.lines(process.over):
             process.words.append(text)
             del process.words[:-50]
-            self._on_output(process.label, text)
+            self._words.put(process.label, text)
 
     def _barrier(self) -> None:
         """Every host ready, and every edge proven by a probe that arrived."""
@@ -524,6 +525,7 @@ class Supervisor:
     def _reap(self) -> None:
         for process in self._processes.values():
             self._close_process(process)
+        self._words.close()
         if self._nursery is not None:
             self._nursery.close()
 
