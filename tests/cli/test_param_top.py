@@ -12,6 +12,7 @@ from typing import Any
 
 import psutil
 import pytest
+from dataflow.supervision.live import LiveSupervisor
 
 from dataflow.cli.top import Board, _table, _title
 from dataflow.client.attach import find_running
@@ -19,7 +20,6 @@ from dataflow.client.processes import HostStatus
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import LiveSupervisor
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
 from dataflow.sync import NEVER

@@ -17,7 +17,6 @@ from tests_runtime_graphs import chain
 from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import supervisor_of
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.supervisor import Supervisor
@@ -160,7 +159,7 @@ def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: st
     )
 
     with pytest.raises(RunFailed):
-        supervisor_of(RunPlan(graph, record=path, placement="host_each", live=live)).run()
+        Supervisor(RunPlan(graph, record=path, placement="host_each", live=live)).run()
 
     lost = unexplained(path)
     assert {"test/left/fast", "test/bad/y", "test/smooth/mean", "test/merge/seen"} <= set(lost)

@@ -15,7 +15,7 @@ from dataflow.messages import Diagnostics
 from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision import live
+from dataflow.supervision import heartbeats
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
@@ -192,7 +192,7 @@ SMALL = {"window": (8, 64 << 20)}
 def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
     placement: str, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     graph = robot(HANGS.format("queue: newest, size: 1"), count=1000)
 
     with pytest.raises(
@@ -206,7 +206,7 @@ def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
 
 
 def test_a_hang_without_a_deadline_is_ended_by_its_restart_policy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     ran = Ran(robot(HANGS.format(f"queue: newest, size: 1, {AGAIN}"), count=400), path, **SMALL)
 
     assert ran.report.restarts == {"bad": 1}

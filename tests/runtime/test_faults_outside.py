@@ -19,12 +19,12 @@ from typing import Any
 
 import pytest
 from background_run import Background
+from dataflow.supervision.live import LiveSupervisor
 
 from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import LiveSupervisor
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
 from dataflow.verification.verify import verify
