@@ -7,7 +7,6 @@ from typing import Any
 
 from dataflow.supervision.commands import FreeEndpoints
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
-from dataflow.supervision.plan import expected_probes
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.supervised import Supervised
@@ -18,7 +17,6 @@ class Barrier:
 
     def __init__(self, run: RunState) -> None:
         self.run = run
-        self._expected = expected_probes(run.plan, run.hosts)
         self._deadline = 0.0
         self._probing = False
 
@@ -55,13 +53,14 @@ class Barrier:
         return False
 
     def _probe(self, process: Supervised) -> None:
+        run = self.run
         if process.life is not Life.READY:
             return
-        process.take(Step.PROBE, self.run.steady)
-        process.unseen = set(self._expected[process.label])
+        process.take(Step.PROBE, run.steady)
+        process.unseen = run.takes(process)
         if process.attempt:
-            expect_probes(self.run, process)
-        self.run.send(process, "probe")
+            expect_probes(run, process)
+        run.send(process, "probe")
 
     def _fail(self, processes: list[Supervised]) -> None:
         timeout = self.run.plan.start_timeout

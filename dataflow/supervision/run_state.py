@@ -8,11 +8,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from dataflow.names import firings_key
 from dataflow.supervision.commands import Command, Send, Signal, Spawn
 from dataflow.supervision.events import Moment
 from dataflow.supervision.life import WORKS, Life, Step
-from dataflow.supervision.plan import HostPlan, RunPlan
+from dataflow.supervision.plan import HostPlan, RunPlan, taken_keys
 from dataflow.supervision.report import OperatorCounts, Status
 from dataflow.supervision.supervised import Supervised
 
@@ -101,13 +100,7 @@ class RunState:
 
     def takes(self, process: Supervised) -> set[str]:
         """Returns the keys that a process takes from others."""
-        host = process.host
-        if host.sink is None:
-            return set(host.subscribe)
-        keys = set(host.streams)
-        if host.sink == "record":
-            keys |= {firings_key(self.graph.namespace, node) for node in self.graph.nodes}
-        return keys
+        return taken_keys(self.graph, process.host)
 
     def last_words(self) -> str:
         lines = [f"[{p.label}] {line}" for p in self.processes.values() for line in list(p.words)[-5:]]
