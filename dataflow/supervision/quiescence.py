@@ -20,6 +20,7 @@ from dataflow.supervision.supervised import Supervised
 
 QUIET = 0.3
 """Seconds without news after which all are asked."""
+ANSWER_WITHIN = 1.0
 LOST_AFTER = 5.0
 """Seconds after which what was sent and not received, while nothing moved, counts as lost (live runs)."""
 MAX_WINDOW_DOUBLINGS = 12
@@ -74,12 +75,14 @@ class Quiescence(Part):
 
     def __init__(self, run: RunState, *, lost_after: float | None = None) -> None:
         super().__init__(run)
-        self.answers: dict[str, Mapping[str, Any]] = {}
-        """The last answer of each process to the question that is out."""
+        self.latest: dict[str, Mapping[str, Any]] = {}
+        """The last answer of each process since anything moved."""
+        self._answers: dict[str, Mapping[str, Any]] = {}
         self.asked = False
         """Whether a question is out."""
         self._proof = Proof(lost_after)
         self._round = 0
+        self._asked_at = 0.0
         self._heard = 0.0
         self._doublings = 0
 
@@ -95,14 +98,14 @@ class Quiescence(Part):
     def _moved(self) -> None:
         self._heard = self.run.steady
         self.asked = False
-        self.answers.clear()
+        self.latest.clear()
         self._proof.moved()
 
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         if kind in ("progress", "ended"):
             self._moved()
         elif kind == "state" and self.asked and fields["round"] == self._round:
-            self.answers[process.label] = fields
+            self._answers[process.label] = self.latest[process.label] = fields
 
     def tick(self) -> None:
         run = self.run
@@ -111,23 +114,26 @@ class Quiescence(Part):
         if not all(p.life in WORKS for p in run.processes.values()):
             self._moved()  # one that is away, or on its way back, moves
             return
-        if self.asked and not self.unanswered():
-            self._conclude()
-        elif not self.asked:
+        if not self.asked:
             self._ask()
+        elif all(p.label in self._answers for p in run.working()):
+            self._conclude()
 
     def unanswered(self) -> list[Supervised]:
-        """Returns the processes that owe an answer."""
-        return [p for p in self.run.working() if self.asked and p.label not in self.answers]
+        """Returns the processes that have owed an answer for longer than one needs."""
+        if not self.asked or self.run.steady - self._asked_at < ANSWER_WITHIN:
+            return []
+        return [p for p in self.run.working() if p.label not in self._answers]
 
     def _ask(self) -> None:
         self._round += 1
+        self._asked_at = self.run.steady
         self.asked = True
-        self.answers.clear()
+        self._answers.clear()
         self.run.send_all("poll", replaces=True, round=self._round)
 
     def _conclude(self) -> None:
-        match self._proof.judge(list(self.answers.values()), self.run.steady):
+        match self._proof.judge(list(self._answers.values()), self.run.steady):
             case Verdict.PROVEN:
                 self._proven()
             case Verdict.SETTLED | Verdict.MOVING:
@@ -135,7 +141,7 @@ class Quiescence(Part):
 
     def _proven(self) -> None:
         run = self.run
-        full = [label for label, answer in self.answers.items() if answer["full"]]
+        full = [label for label, answer in self._answers.items() if answer["full"]]
         if not full or self._doublings >= MAX_WINDOW_DOUBLINGS:
             raise RunFailed("the graph is stuck: nothing is on its way and no operator can fire", self._who_waits())
         self._doublings += 1
@@ -148,7 +154,7 @@ class Quiescence(Part):
         self._moved()
 
     def _who_waits(self) -> str:
-        waiting = {node: held for answer in self.answers.values() for node, held in answer["waiting"].items()}
+        waiting = {node: held for answer in self._answers.values() for node, held in answer["waiting"].items()}
         return "\n".join(
             f"  {node} waits at stamp {stamp} for " + (", ".join(f"{i} (≥ {f})" for i, f in needs.items()) or "input")
             for node, (stamp, needs) in waiting.items()

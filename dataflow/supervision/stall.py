@@ -62,7 +62,7 @@ class StallWatch(Part):
 
     def _waits_for_clock(self) -> str:
         """Names a source that has nothing to do for long because its next message is due late."""
-        dues = [(due, label) for label, a in self.quiescence.answers.items() if (due := a.get("due")) is not None]
+        dues = [(due, label) for label, a in self.quiescence.latest.items() if (due := a.get("due")) is not None]
         due, label = max(dues, default=(0.0, ""))
         if due <= self.run.plan.stall_timeout:
             return ""
