@@ -25,6 +25,8 @@ from dataflow.operator import Context, Operator, OperatorSpec, OutputError, Outp
 from dataflow.records.firing import WITHHELD, DropRecord, Emission, FiringRecord, Kind
 from dataflow.sync import FOREVER, NEVER, Aligner, Entry, Firing, InputValue, refs_of
 
+MOST_OF_A_TRACEBACK = 20_000
+
 
 class OperatorFailure(RuntimeError):
     """An operator raised or broke its contract. Carries its name, the firing and the operator's own traceback."""
@@ -33,7 +35,7 @@ class OperatorFailure(RuntimeError):
         self.operator, self.when = operator, when
         self.summary = readable(error)
         try:
-            self.traceback = _printable("".join(traceback.format_exception(error)))
+            self.traceback = cut(_printable("".join(traceback.format_exception(error))), MOST_OF_A_TRACEBACK)
         except Exception:  # its own text cannot be made
             self.traceback = "".join(traceback.format_tb(error.__traceback__)) + self.summary
         super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
@@ -45,7 +47,14 @@ def readable(error: BaseException) -> str:
         text = str(error)
     except Exception as problem:
         text = f"(its text cannot be made: {type(problem).__name__})"
-    return _printable(f"{type(error).__name__}: {text}" if text else type(error).__name__)
+    return cut(_printable(f"{type(error).__name__}: {text}" if text else type(error).__name__))
+
+
+def cut(text: str, most: int = 2000) -> str:
+    """The beginning and the end of a text that is longer than `most` characters, with a note of what is left out."""
+    if len(text) <= most:
+        return text
+    return f"{text[: most // 2]} [... {len(text) - most // 2 * 2} characters left out ...] {text[-(most // 2) :]}"
 
 
 def _printable(text: str) -> str:
@@ -225,7 +234,7 @@ def set_up(
         if not already:
             operator.setup()
         emissions = ports.prepare(checked_statics(operator, node), NEVER)
-    except (Exception, SystemExit, KeyboardInterrupt) as error:
+    except BaseException as error:
         raise OperatorFailure(node.name, "setup()", error) from error
     detail = {"params": operator.params.model_dump(mode="json"), "files": dict(operator.files)}
     records.add("setup", NEVER + 1, started, outputs=emissions, detail=detail)
@@ -243,7 +252,7 @@ def set_up_again(operator: Operator, ports: OutputPorts, records: Recorder, node
         operator.rng = seed_generators(firing_seed(seed, node.name, NEVER))
         operator.setup()
         checked_statics(operator, node)
-    except (Exception, SystemExit, KeyboardInterrupt) as error:
+    except BaseException as error:
         raise OperatorFailure(node.name, "setup()", error) from error
     detail = {"params": operator.params.model_dump(mode="json"), "files": dict(operator.files)}
     records.add("setup", NEVER + 1, started, outputs=(None,) * len(ports.states), detail=detail)
@@ -370,7 +379,7 @@ class OperatorRunner:
             if self.paranoid and (problem := changed_input(self.node, firing)) is not None:
                 raise problem
             emissions = self.ports.prepare(messages, firing.stamp)
-        except (Exception, SystemExit, KeyboardInterrupt) as error:
+        except BaseException as error:
             failure = OperatorFailure(self.node.name, f"{kind} at stamp {firing.stamp}", error)
             self._record(kind, firing, started, (), failure.summary)
             raise failure from error

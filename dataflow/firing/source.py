@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from dataflow.firing.runner import Emitter, OperatorFailure, OutputPorts, Recorder, change_parameter, set_up
+from dataflow.firing.runner import (
+    Emitter,
+    OperatorFailure,
+    OutputPorts,
+    Recorder,
+    change_parameter,
+    readable,
+    set_up,
+    set_up_again,
+)
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import OutputError, Source, outputs_of
@@ -33,19 +43,24 @@ class SourceRunner:
         self._recorded: Counter[str] = Counter()
         self._backwards: list[int] = []
         self._resumed = False
+        self._changed: dict[str, Any] = {}
         self.records = Recorder(node.name, emitter)
         self.firings = 0
         self.ended = False
         self.busy_ns = 0
         self.last = NEVER
+        self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
 
     def setup(self) -> None:
         set_up(self.operator, self.ports, self.records, self.node, self.seed)
+        self._begin_stream()
+
+    def _begin_stream(self) -> None:
         try:
             self._steps = iter(self.source.stream())
-        except Exception as error:
+        except BaseException as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
 
     def look_ahead(self) -> int | None:
@@ -82,9 +97,10 @@ class SourceRunner:
                             f"{self.node.name} yielded stamps {sorted(stamps)} together; "
                             "one step of stream() has one stamp"
                         )
+                    (self._read,) = stamps
                     return messages
-        except (Exception, SystemExit, KeyboardInterrupt) as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+        except BaseException as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
         return None
 
     def admit(self) -> tuple[int, int]:
@@ -156,12 +172,38 @@ class SourceRunner:
         self.ports.resume(incarnation, last)
         self.last = max(last.values(), default=NEVER)
         self._resumed = not self.source.live
+        self._change(changed)
+
+    def start_again(self) -> None:
+        """Puts a fresh source in the place of one that failed, with the parameters as they were last set; its streams
+        begin a new incarnation. Raises `OperatorFailure` when that fails too."""
+        old, self.operator = self.operator, self.node.make()
+        assert isinstance(self.operator, Source)
+        self.source = self.operator
+        self._steps, self._next = iter(()), None
+        self._backwards.clear()
+        incarnation = self.records.incarnation + 1
+        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation)
+        self._resumed = not self.source.live
+        try:
+            old.close()
+        except Exception as error:  # the first failure is known
+            print(f"{self.node.name}: close() after a failure: {readable(error)}", file=sys.stderr)
+        self._change(self._changed)
+        set_up_again(self.operator, self.ports, self.records, self.node, self.seed)
+        self._begin_stream()
+
+    def _change(self, changed: Mapping[str, Any]) -> None:
+        self._changed = dict(changed)
         for name, value in changed.items():
             self.operator.set_parameter(name, value)
 
     def set_parameter(self, name: str, value: Any) -> Any:
         """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`."""
-        return change_parameter(self.operator, self.records, name, value, max(self.last, NEVER + 1))
+        changed = change_parameter(self.operator, self.records, name, value, max(self.last, NEVER + 1))
+        self._changed[name] = value
+        return changed
 
     def finish(self, reason: str = "end of source") -> None:
         """Ends the streams; the source is done."""
@@ -178,7 +220,7 @@ class SourceRunner:
         if close is not None:
             try:
                 close()
-            except Exception as error:
+            except BaseException as error:
                 raise OperatorFailure(self.node.name, "the end of stream()", error) from error
 
 

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from dataflow.messages.base import Message, message_type
 from dataflow.operator import InputPort, Operator, OperatorSpec, OutputPort
 
 QueuePolicy = Literal["newest", "oldest", "block"]
@@ -332,3 +333,8 @@ def _node_from_json(values: Mapping[str, Any]) -> Node:
             "live": Live(**{**live, "restart": Restart(**live["restart"])}),
         }
     )
+
+
+def stream_types(graph: Graph, stream: str) -> tuple[type[Message], ...]:
+    """Returns the message classes that a stream may carry."""
+    return tuple(message_type(schema) for schema in graph.streams[stream].types)

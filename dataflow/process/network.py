@@ -9,7 +9,7 @@ from dataflow.transport import NetworkConfig
 
 
 def network_config(network: Network, listen: Iterable[str], connect: Iterable[str]) -> NetworkConfig:
-    """The configuration of a host: its own endpoints, and what the graph says of TLS, access and other machines."""
+    """The configuration of a process: its own endpoints, and what the graph says of TLS, access and other machines."""
     settings = {
         "transport/link/tls": dict(network.tls),
         "access_control": dict(network.access_control),

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, stream_types
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
-from dataflow.process.sink import stream_types
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import ENDS, OUTCOME
 

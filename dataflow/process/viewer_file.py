@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, stream_types
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
-from dataflow.process.sink import SinkFailure, stream_types
+from dataflow.process.sink import SinkFailure
 from dataflow.view import Save, ViewerSink
 
 PATIENCE = 30.0

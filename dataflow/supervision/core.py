@@ -27,7 +27,7 @@ from dataflow.supervision.events import (
     StopAsked,
     Tick,
 )
-from dataflow.supervision.life import Life, Step
+from dataflow.supervision.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.outcome import how_it_ended, report_of
 from dataflow.supervision.part import Part
 from dataflow.supervision.report import RunFailed, Status
@@ -171,7 +171,8 @@ class Core:
             return  # its end is decided
         operator, summary = fields["operator"], fields["summary"]
         what = f"operator {operator!r} failed in {fields['when']}: {summary}" if operator else f"failed: {summary}"
-        if self._closing is None and self._restarts.grant(process, operator):
+        by_policy = operator is None or process.life in ON_ITS_WAY  # at work its process has restarted it by it
+        if by_policy and self._closing is None and self._restarts.grant(process):
             process.take(Step.LEAVE_FAILED, self.run.steady)
             process.cause = f"has left: {what}" if operator else what
             self.run.send(process, "leave", outcome=f"failed: {what}")

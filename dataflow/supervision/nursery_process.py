@@ -29,7 +29,7 @@ import psutil  # type: ignore[import-untyped]
 LEAVE_WITHIN = 12.0
 """Seconds that hosts get after the supervisor is gone."""
 DIE_WITHIN = 1.0
-PRELOAD = ("dataflow.process.host", "dataflow.process.sink", "dataflow.process.recorder", "dataflow.process.main")
+PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
 
 _PR_SET_CHILD_SUBREAPER = 36
 

@@ -1,8 +1,8 @@
 """Restarts of processes in a live run: who may come back, how often, and how it takes part again.
 
-The rule, for a process that dies, is killed for breaking a rule, or says that something failed, whether it works or is
-still being started: its restart policy decides, the strictest of its operators'. An operator that its process has made
-anew by that policy already, and that failed once too often, has used it up.
+The rule: a process that dies, that is killed for breaking a rule, that cannot set up its operators, or that fails
+itself, is restarted by its policy, the strictest of its operators', whether it works or is still being started. An
+operator that raises while it works is restarted within its process, by the same policy; that used up, the run ends.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ class RestartPolicy(Part):
         """Whether the policy of a process allows any restart at all."""
         return False
 
-    def grant(self, process: Supervised, operator: str | None = None) -> bool:
-        """Uses up one attempt of a process that has failed (in one of its operators); False when none is left."""
+    def grant(self, process: Supervised) -> bool:
+        """Uses up one attempt of a process that has failed; False when none is left."""
         return False
 
     def await_turn(self, process: Supervised, how: str) -> None:
@@ -51,7 +51,6 @@ class LiveRestarts(RestartPolicy):
         self._held = held
         self._tell = tell
         self._attempts: dict[str, Restarts] = {}
-        self._made_anew: set[str] = set()  # operators that the processes of now have restarted by themselves
         self._ended_streams: dict[str, str] = {}
 
     # Policy
@@ -66,8 +65,8 @@ class LiveRestarts(RestartPolicy):
         policies = [self.run.graph.nodes[name].live.restart for name in process.nodes]
         return Restart(min((p.max for p in policies), default=0), max((p.backoff for p in policies), default=0))
 
-    def grant(self, process: Supervised, operator: str | None = None) -> bool:
-        if operator in self._made_anew or not self.may_restart(process):
+    def grant(self, process: Supervised) -> bool:
+        if not self.may_restart(process):
             return False
         attempts = self._attempts.get(process.label)
         if attempts is None:
@@ -80,7 +79,6 @@ class LiveRestarts(RestartPolicy):
         run = self.run
         process.take(Step.AWAIT, run.steady)
         process.cause = how
-        self._made_anew.difference_update(process.nodes)
         for name in process.nodes:
             run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
         if run.release is not None:
@@ -160,7 +158,6 @@ class LiveRestarts(RestartPolicy):
         match kind:
             case "restarting":
                 name = fields["operator"]
-                self._made_anew.add(name)
                 run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
                 run.event(
                     "restart",

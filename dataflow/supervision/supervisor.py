@@ -21,8 +21,8 @@ from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
 from dataflow.supervision.plan import RunPlan, host_plans
-from dataflow.supervision.printer import Printer
 from dataflow.supervision.report import RunFailed, RunReport, Status
+from dataflow.supervision.words import Words
 from dataflow.transport import registry, reserve_endpoints
 
 TICK = 0.05
@@ -77,8 +77,8 @@ class Supervisor:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
-            self._printer = Printer(self._on_output)
-            stack.callback(self._printer.close)
+            self._words = Words(self._on_output)
+            stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
             self._nursery = self._start_nursery()
             stack.callback(self._bury)
@@ -199,7 +199,7 @@ class Supervisor:
             self._selector.unregister(descriptor)
 
     def _heard(self, label: str, line: str) -> None:
-        self._printer.take(label, line)
+        self._words.put(label, line)
         self._feed(events.Printed(label, line))
 
     def _tick(self) -> None:

@@ -383,3 +383,30 @@ def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
     assert ran.report.restarts == {"device": 1}
     assert [i for i, kind in ran.kinds("device") if kind == "setup"] == [0, 1]
     assert ran.is_repeated()
+
+
+def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+    graph = graph_of(
+        f"camera: {{use: faulty_operators:Camera, live: {{{AGAIN}}}}}",
+        "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}",
+        "other: {use: faulty_operators:Fallback, inputs: {x: camera/count, other: camera/constant}}",
+    )
+
+    ran = Ran(graph, path)
+
+    assert ran.report.restarts == {"camera": 1}
+    assert "operator 'camera' failed in stream() after stamp " in ran.events("restart")[0]
+    assert "OSError: no such device; made anew in 0.02 s" in ran.events("restart")[0]
+    assert [i for i, kind in ran.kinds("camera") if kind == "setup"] == [0, 1]
+    assert len(ran.numbers("test/resets/y")) == 130
+    assert {row[1] for row in ran.numbers("test/other/y")} == {42.0}
+    assert ran.is_repeated()
+
+
+def test_without_a_policy_a_source_that_raises_ends_the_run(path: Path) -> None:
+    graph = graph_of(
+        "camera: {use: faulty_operators:Camera}", "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}"
+    )
+
+    with pytest.raises(RunFailed, match=r"'camera' failed in stream\(\) after stamp \d+: OSError: no such device"):
+        Ran(graph, path)

@@ -1,0 +1,154 @@
+"""Makes the runners of a process: which kind drives an operator follows from what the supervisor has said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from dataflow.feeds.log import LogFeed
+from dataflow.firing.admission import LiveRunner
+from dataflow.firing.runner import Emitter, OperatorFailure, OperatorRunner
+from dataflow.firing.source import SourceRunner
+from dataflow.graph.model import Graph, Node
+from dataflow.process.config import ProcessConfig, Resumed
+from dataflow.recording import Recording
+from dataflow.reexecution.recorded import RecordedRunner, recorded_digests, recorded_firings
+
+Runner = OperatorRunner | RecordedRunner
+"""Drives an operator that has inputs."""
+Maker = SourceRunner | OperatorRunner | RecordedRunner
+"""Drives an operator that emits."""
+
+
+class Runners:
+    """The runners of one process, and which of them take a stream."""
+
+    def __init__(self) -> None:
+        self.sources: list[SourceRunner] = []
+        self.operators: list[Runner] = []
+        self.consumers: dict[str, list[Runner]] = {}
+
+    @property
+    def all(self) -> list[Maker]:
+        """Everything that emits, sources first."""
+        return [*self.sources, *self.operators]
+
+    def __getitem__(self, name: str) -> Maker:
+        return next(maker for maker in self.all if maker.node.name == name)
+
+    def add(self, runner: Runner) -> None:
+        self.operators.append(runner)
+        for stream in {s for streams in runner.node.inputs.values() for s in streams}:
+            self.consumers.setdefault(stream, []).append(runner)
+
+    def taking(self, stream: str) -> Iterable[Runner]:
+        return self.consumers.get(stream, ())
+
+    def live_taking(self, stream: str) -> Iterator[LiveRunner]:
+        return (runner for runner in self.taking(stream) if isinstance(runner, LiveRunner))
+
+    @property
+    def live(self) -> list[LiveRunner]:
+        return [runner for runner in self.operators if isinstance(runner, LiveRunner)]
+
+    @property
+    def watched(self) -> list[OperatorRunner]:
+        """Those whose calls may take too long."""
+        return [runner for runner in self.operators if isinstance(runner, OperatorRunner)]
+
+
+def make_source(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitter) -> SourceRunner:
+    """The runner of a source; it goes on where the process before this one died."""
+    source = SourceRunner(node, emitter, seed=graph.seed, live=config.live)
+    _resume(source, config.resumed(node.name))
+    return source
+
+
+def make_runner(
+    node: Node,
+    graph: Graph,
+    config: ProcessConfig,
+    emitter: Emitter,
+    *,
+    event_clock: Callable[[], int],
+    on_failure: Callable[[OperatorFailure, float], None],
+) -> Runner:
+    """The runner of an operator that has inputs."""
+    if config.verify is not None:
+        return _recorded_runner(node, graph, Path(config.verify), emitter, paranoid=config.paranoid)
+    common: dict[str, Any] = {
+        "static": statics_of(graph),
+        "seed": graph.seed,
+        "paranoid": config.paranoid,
+        "snapshots": config.snapshots,
+    }
+    if config.live:
+        live = LiveRunner(node, emitter, **common, event_clock=event_clock, on_failure=on_failure)
+        _resume(live, config.resumed(node.name))
+        return live
+    runner = OperatorRunner(node, emitter, **common)
+    if config.warm is not None:
+        _begin_in_the_middle(runner, graph, Path(config.warm["path"]), config.warm["stamp"])
+    return runner
+
+
+def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed | None:
+    """The recording that stands in for sources, if there is one."""
+    replay = config.replay
+    if replay is None:
+        return None
+    nodes = {graph.streams[s].node for s in replay["streams"]}
+    return LogFeed(
+        Recording(replay["path"]),
+        {s: graph.streams[s].node for s in replay["streams"]},
+        emitter,
+        ports={n: tuple(graph.nodes[n].outputs.values()) for n in nodes},
+        finals=replay["finals"],
+        start=replay["start"],
+        end=replay["end"],
+        promises=config.verify is None,
+    )
+
+
+def statics_of(graph: Graph) -> frozenset[str]:
+    """The static streams of a graph."""
+    return frozenset(name for name, stream in graph.streams.items() if stream.static)
+
+
+def verifications_of(runners: Iterable[Runner]) -> list[dict[str, Any]]:
+    """What the operators that were driven by recorded firings found, in plain values."""
+    return [runner.result.to_wire() for runner in runners if isinstance(runner, RecordedRunner)]
+
+
+def _resume(runner: SourceRunner | LiveRunner, resumed: Resumed) -> None:
+    if resumed.incarnation:
+        runner.resume(resumed.incarnation, resumed.last, resumed.changed)
+
+
+def _begin_in_the_middle(runner: OperatorRunner, graph: Graph, path: Path, stamp: int) -> None:
+    from dataflow.reexecution.warm_start import held_before, warm_start
+
+    held, began = held_before(path, runner.node, stamp, statics_of(graph))
+    if began:
+        runner.aligner.begin_at(stamp)
+    warm = warm_start(path, graph, runner.node, stamp)
+    if warm is not None:
+        runner.take_over(warm.operator, stamp)
+    for entry in held:
+        runner.aligner.push(entry.stream, entry)
+
+
+def _recorded_runner(node: Node, graph: Graph, path: Path, emitter: Emitter, *, paranoid: bool) -> RecordedRunner:
+    inputs = frozenset(s for streams in node.inputs.values() for s in streams)
+    producers = [graph.nodes[name] for name in {graph.streams[s].node for s in inputs}]
+    with Recording(path) as recording:
+        return RecordedRunner(
+            node,
+            emitter,
+            static=statics_of(graph),
+            records=recorded_firings(recording, node.name),
+            inputs=recorded_digests(recording, producers, inputs),
+            seed=graph.seed,
+            paranoid=paranoid,
+        )
