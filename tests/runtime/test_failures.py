@@ -80,6 +80,18 @@ def test_what_operators_start_ends_with_their_host_and_holds_nobody_up() -> None
         time.sleep(0.02)
 
 
+def test_a_daemon_that_an_operator_leaves_is_named_and_ends_with_its_host() -> None:
+    lines: list[str] = []
+
+    report = Supervisor(RunPlan(broken("daemon")), on_output=lambda label, line: lines.append(line)).run()
+
+    left = int(next(line for line in lines if "left behind" in line).rpartition(" ")[2])
+    (note,) = report.notes
+    assert note.startswith("host 'bad' left processes behind, which were killed: ")
+    assert note.endswith(f"(process {left})")
+    assert not psutil.pid_exists(left)
+
+
 def test_a_source_that_is_stopped_runs_its_finally(tmp_path: Path) -> None:
     note = tmp_path / "note"
     graph = chain(f"tidy: {{use: runtime_operators:Tidy, params: {{note: {note}}}}}")

@@ -23,6 +23,7 @@ def graph_of(*operators: str) -> Any:
     return load_text(f"graph: robot\nnamespace: test\noperators:\n  {lines}\n")
 
 
+IDLE = {"idle": True, "sent": 0, "received": 0, "full": False, "waiting": {}, "due": None}
 LEFT = "left: {use: runtime_operators:Counter}"
 SUM = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}"
 
@@ -42,6 +43,8 @@ class Play:
         self.deaf: set[str] = set()
         self.broken: set[str] = set()
         self.beating = live
+        self.state: Mapping[str, Any] | None = None
+        """What processes answer when they are asked how they are; None: they are too busy to answer."""
         self.alive: set[str] = set()
         self._answers: deque[Event] = deque()
 
@@ -108,6 +111,8 @@ class Play:
                     if other in self.alive and other not in self.deaf
                     for stream in self.hosts[label].publish
                 ]
+            case "poll" if self.state is not None:
+                return [Said(label, "state", IDLE | self.state | {"round": fields["round"]})]
             case "leave":
                 self.alive.discard(label)
                 return [Said(label, "closed", {"facts": {}}), Died(label, 0)]
@@ -127,8 +132,11 @@ class Play:
 
     # Scenes
 
-    def starts(self) -> Play:
+    def begins(self) -> None:
         self.tell(Begin())
+
+    def starts(self) -> Play:
+        self.begins()
         self.wait(2 * STEP)
         assert self.core.status.phase == "running", self.over
         return self

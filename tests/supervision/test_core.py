@@ -137,22 +137,11 @@ def test_nobody_makes_progress_and_who_does_not_answer_is_killed_and_named() -> 
     assert "sum" in killed(play.commands)
 
 
-def state(label: str, round: int, **more: object) -> Said:
-    fields = {"idle": True, "sent": 0, "received": 0, "full": False, "waiting": {}, "due": None}
-    return Said(label, "state", fields | {"round": round} | more)
-
-
-def answers(play: Play, **more: object) -> None:
-    """Lets time pass while all processes answer as `more` says."""
-    for _ in range(12):
-        for _, fields in sent(play.wait(0.05), "poll")[:1]:
-            play.tell(*(state(label, fields["round"], **more) for label in play.hosts))
-
-
 def test_a_stuck_graph_is_proven_and_who_waits_is_named() -> None:
     play = Play().starts()
 
-    answers(play, waiting={"sum": [7, {"x": 5}]})
+    play.state = {"waiting": {"sum": [7, {"x": 5}]}}
+    play.wait(2.0)
 
     assert play.failure() == "the graph is stuck: nothing is on its way and no operator can fire"
     assert play.over is not None
@@ -163,7 +152,8 @@ def test_a_stuck_graph_is_proven_and_who_waits_is_named() -> None:
 def test_a_full_window_is_doubled_when_nothing_else_helps() -> None:
     play = Play(window=(8, 1 << 20)).starts()
 
-    answers(play, full=True)
+    play.state = {"full": True}
+    play.wait(0.6)
 
     assert {label for label, _ in sent(play.commands, "grow")} == {"left", "sum"}
     assert play.core.status.notes == ["the graph looks further ahead than the window: doubled to 16 messages"]
@@ -172,18 +162,21 @@ def test_a_full_window_is_doubled_when_nothing_else_helps() -> None:
 def test_what_is_under_way_is_no_proof() -> None:
     play = Play().starts()
 
-    for k in range(3):
-        answers(play, sent=5 + k, received=4 + k)
-    answers(play, idle=False)
+    for k in range(100):
+        play.state = {"sent": 5 + k, "received": 4 + k}
+        play.wait(0.05)
+    play.state = {"idle": False}
+    play.wait(5.0)
+    play.state = {"sent": 5, "received": 4}
+    play.wait(5.0)
 
     assert play.over is None
 
 
 def test_a_rate_at_which_nothing_is_ever_due_is_named() -> None:
     play = Play(rate=1e-300, stall_timeout=3.0).starts()
-    for _ in range(100):
-        for _, fields in sent(play.wait(0.05), "poll")[:1]:
-            play.tell(*(state(label, fields["round"], idle=False, due=1e298) for label in play.hosts))
+    play.state = {"idle": False, "due": 1e298}
+    play.wait(5.0)
 
     assert "no progress for 3 s" in play.failure()
     assert "the next message of host 'sum' is due in 3.17e+290 years at rate 1e-300" in play.failure()
