@@ -177,9 +177,7 @@ class SourceRunner:
     def start_again(self) -> None:
         """Puts a fresh source in the place of one that failed, with the parameters as they were last set; its streams
         begin a new incarnation. Raises `OperatorFailure` when that fails too."""
-        old, self.operator = self.operator, self.node.make()
-        assert isinstance(self.operator, Source)
-        self.source = self.operator
+        old = self.operator
         self._steps, self._next = iter(()), None
         self._backwards.clear()
         incarnation = self.records.incarnation + 1
@@ -190,7 +188,13 @@ class SourceRunner:
             old.close()
         except Exception as error:  # the first failure is known
             print(f"{self.node.name}: close() after a failure: {readable(error)}", file=sys.stderr)
-        self._change(self._changed)
+        try:
+            self.operator = self.node.make()
+            assert isinstance(self.operator, Source)
+            self.source = self.operator
+            self._change(self._changed)
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "construction", error) from error
         set_up_again(self.operator, self.ports, self.records, self.node, self.seed)
         self._begin_stream()
 

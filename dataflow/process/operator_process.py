@@ -14,41 +14,34 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dataflow.feeds.window import Window
-from dataflow.firing.admission import LiveRunner
 from dataflow.firing.runner import OperatorFailure
 from dataflow.firing.source import SourceRunner
 from dataflow.firing.threads import limit_threads
-from dataflow.graph.model import Graph
-from dataflow.operator import ParameterError
+from dataflow.graph.model import Graph, Node
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
-from dataflow.process.inlet import AnyOrder, Inlet
+from dataflow.process.inlet import AnyOrder, Inlet, fetch_statics
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.network import network_config
 from dataflow.process.outlet import Links, Outlet, incarnations_of
 from dataflow.process.pace import Pace
+from dataflow.process.planned_faults import do_fault
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
-from dataflow.process.runners import Runner, Runners, make_log, make_runner, make_source, statics_of
+from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, statics_of
 from dataflow.process.stream_order import StreamOrder
 from dataflow.process.watchdog import Watchdog
-from dataflow.reexecution.recorded import RecordedRunner
-from dataflow.sync import FOREVER, NEVER, Entry, StreamOrderError
-from dataflow.transport import Bus, Envelope, Kind, TapServer
+from dataflow.sync import FOREVER, StreamOrderError
+from dataflow.transport import Bus, Envelope, TapServer
 from dataflow.transport.bus import BusError
 
 IDLE_WAIT = 0.1
 TAKE_WITHIN = 0.001
 """Seconds for what has arrived, before what is decided is run; live runs take all, to know the newest."""
 PROBE_EVERY = 0.01
-STATICS_WITHIN = 5.0
 BACKLOG = (16, 8)
 """How many windows of messages and of bytes may wait for operators that no source waits for."""
-
-
-class ProcessFailure(RuntimeError):
-    """A failure of the process itself, not of one of its operators."""
 
 
 class OperatorProcess:
@@ -109,7 +102,7 @@ class OperatorProcess:
         self.requests.serve(self.bus, graph.namespace, self.inbox)
         self.set_up()
         if config.resume is not None:
-            self._fetch_statics()
+            fetch_statics(self.bus, graph.namespace, self.inlet, config.subscribe)
         for log in self.feeding.logs:
             log.setup()
         first = [*self.feeding.first_stamps(), *self.live.first_stamps()]
@@ -117,30 +110,30 @@ class OperatorProcess:
         self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
 
     def make(self) -> None:
-        """Makes the operators, and what stands in for sources."""
+        """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
         for name in self.config.nodes:
-            node = self.graph.nodes[name]
-            if node.source:
-                source = make_source(node, self.graph, self.config, self.outlet)
-                self.runners.sources.append(source)
-                if self.config.live:
-                    self.live.add(source)
-                else:
-                    self.feeding.feeds.append(source)
-            else:
-                self.runners.add(
-                    make_runner(
-                        node,
-                        self.graph,
-                        self.config,
-                        self.outlet,
-                        event_clock=self.pace.event_time,
-                        on_failure=self._on_outlived_failure,
-                    )
-                )
+            try:
+                self._make(self.graph.nodes[name])
+            except OperatorFailure:
+                raise
+            except Exception as error:
+                raise OperatorFailure(name, "construction", error) from error
         log = make_log(self.graph, self.config, self.outlet)
         if log is not None:
             self.feeding.feeds.append(log)
+
+    def _make(self, node: Node) -> None:
+        config, outlet = self.config, self.outlet
+        if not node.source:
+            clock, tell = self.pace.event_time, self._on_outlived_failure
+            self.runners.add(make_runner(node, self.graph, config, outlet, event_clock=clock, on_failure=tell))
+            return
+        source = make_source(node, self.graph, config, outlet)
+        self.runners.sources.append(source)
+        if config.live:
+            self.live.add(source)
+        else:
+            self.feeding.feeds.append(source)
 
     def set_up(self) -> None:
         """Calls `setup()` of every operator, with as many library threads as the graph allows."""
@@ -157,21 +150,6 @@ class OperatorProcess:
             put(("envelope", stream, payload))
 
         return receive
-
-    def _fetch_statics(self) -> None:
-        """Asks for the static streams that were given before this process came to be."""
-        deadline = time.monotonic() + STATICS_WITHIN
-        while missing := self.inlet.statics_missing(self.config.subscribe):
-            for stream, payload in self.bus.query_static(self.graph.namespace, timeout=1.0).items():
-                if stream in missing:
-                    self.inlet.take(stream, payload)
-            if time.monotonic() > deadline:
-                missing = self.inlet.statics_missing(self.config.subscribe)
-                raise ProcessFailure(
-                    f"process {self.config.label!r} was restarted and did not get the static streams "
-                    f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"
-                )
-            time.sleep(0.01)
 
     def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
         self.channel.send(
@@ -267,7 +245,7 @@ class OperatorProcess:
         a live run."""
         for runner in self.runners.taking(stream):
             try:
-                _give(runner, stream, envelope)
+                give(runner, stream, envelope)
             except StreamOrderError as error:
                 if not self.config.live:
                     raise
@@ -353,7 +331,8 @@ class OperatorProcess:
                     for runner in self.runners.taking(stream):
                         runner.end(stream, None, fields["reason"])
             case "fault":
-                self._fault(fields["fault"], fields["operator"], fields["fields"])
+                kind, operator = fields["fault"], fields["operator"]
+                do_fault(kind, operator, fields["fields"], runners=self.runners, live=self.live, outlet=self.outlet)
             case "covered":
                 self.window.cover(fields["frontier"])
                 self.backlog.cover(fields.get("backlog", FOREVER))
@@ -376,35 +355,3 @@ class OperatorProcess:
         self.pace.begin(first, at)
         self.live.start()
         self._watch = Watchdog(self.channel, self.runners.watched, deadlines=self.config.live)
-
-    def _fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> None:
-        """Does a planned fault to an operator or source of this process."""
-        print(f"planned fault: {kind} {operator} {dict(fields)}", file=sys.stderr)
-        if self.live.begin_fault(kind, operator, fields):
-            return
-        maker = self.runners[operator]
-        match kind:
-            case "param" if not isinstance(maker, RecordedRunner):
-                try:
-                    maker.set_parameter(fields["name"], fields["value"])
-                except ParameterError as error:
-                    print(f"planned fault: {error}", file=sys.stderr)
-            case "malformed":
-                for stream in maker.node.outputs.values():
-                    self.outlet.put_raw(stream, b"\x00malformed\xff" * 8)
-            case "raise" | "hang" | "slow" | "leak":
-                if isinstance(maker, LiveRunner):
-                    maker.begin_fault(kind, fields)
-
-
-def _give(runner: Runner, stream: str, envelope: Envelope) -> None:
-    match envelope.kind:
-        case Kind.MESSAGE:
-            message = envelope.message
-            assert message is not None
-            entry = Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, message.digest(), stream)
-            runner.push(stream, entry)
-        case Kind.FRONTIER:
-            runner.advance(stream, envelope.stamp)
-        case Kind.END:
-            runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)

@@ -14,6 +14,8 @@ from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import RecordedRunner, recorded_digests, recorded_firings
+from dataflow.sync import NEVER, Entry
+from dataflow.transport import Envelope, Kind
 
 Runner = OperatorRunner | RecordedRunner
 """Drives an operator that has inputs."""
@@ -56,6 +58,20 @@ class Runners:
     def watched(self) -> list[OperatorRunner]:
         """Those whose calls may take too long."""
         return [runner for runner in self.operators if isinstance(runner, OperatorRunner)]
+
+
+def give(runner: Runner, stream: str, envelope: Envelope) -> None:
+    """Gives a runner what another process says on a stream. Raises `StreamOrderError` for what contradicts it."""
+    match envelope.kind:
+        case Kind.MESSAGE:
+            message = envelope.message
+            assert message is not None
+            entry = Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, message.digest(), stream)
+            runner.push(stream, entry)
+        case Kind.FRONTIER:
+            runner.advance(stream, envelope.stamp)
+        case Kind.END:
+            runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
 
 
 def make_source(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitter) -> SourceRunner:

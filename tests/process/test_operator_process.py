@@ -9,6 +9,7 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+import process_operators
 import pytest
 from process_doubles import RecordedChannel
 from process_operators import value
@@ -151,3 +152,13 @@ def test_libraries_that_setup_imports_are_limited_to_the_threads_of_the_graph(mo
     one.process.set_up()
 
     assert limits == [1]
+
+
+def test_an_operator_that_cannot_be_made_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(self: process_operators.Twice, **params: Any) -> None:
+        raise ImportError("no such library")
+
+    monkeypatch.setattr(process_operators.Twice, "__init__", refuse)
+
+    with pytest.raises(OperatorFailure, match="'last' failed in construction: ImportError: no such library"):
+        OneProcess()
