@@ -31,12 +31,17 @@ class DrainLimit(Part):
         run = self.run
         reached = [run.status.operators[n].done for n, node in run.graph.nodes.items() if node.source]
         front = max((stamp for stamp in reached if stamp not in (NEVER, FOREVER)), default=None)
-        upto = "" if front is None else f", of the {front} that sources had given"
+        upto = "" if front is None else f", sources had given up to {front}"
         behind = [
-            f"{name} was at stamp {done}{upto}" if done != NEVER else f"{name} had done nothing"
+            self._at(name)
             for process in run.working()
             if process.report is None
             for name in run.consumers(process)
-            if (done := process.done.get(name, NEVER)) != FOREVER
+            if process.done.get(name) != FOREVER
         ]
-        return "; ".join(behind) or "; ".join(p.describe() for p in run.working() if p.report is None)
+        return ("; ".join(behind) or "; ".join(p.describe() for p in run.working() if p.report is None)) + upto
+
+    def _at(self, name: str) -> str:
+        counts = self.run.status.operators[name]
+        stamp = "no stamp" if counts.done in (NEVER, FOREVER) else f"stamp {counts.done}"
+        return f"{name} was at {stamp} after {counts.firings} firings"

@@ -162,7 +162,7 @@ class LiveRestarts(RestartPolicy):
                 run.event(
                     "restart",
                     f"operator {name!r} failed in {fields['when']}: {fields['summary']}; "
-                    f"restarted in {fields['pause']:.2g} s",
+                    f"made anew in {fields['pause']:.2g} s",
                     operators=[name],
                     cause=fields["summary"],
                 )
