@@ -5,7 +5,7 @@ Only the latest news counts, so it replaces what a process has not read yet.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 from dataflow.supervision.life import Life
@@ -64,8 +64,9 @@ class LosslessCover(Cover):
 class LiveCover(Cover):
     """How far those are behind for whom sources wait (the window), and how far anybody is (the backlog).
 
-    An operator does not count while its process is away or gives no sign of life. When it is back, what was sent
-    meanwhile is not held against the sources: its backlog begins anew at what they had given by then.
+    An operator does not count while its process is away or gives no sign of life. A new process owes nothing of what
+    was given before it. One that is heard again begins its backlog anew, too, where its queue bounds what it has to
+    take in; with `queue: block` nothing else does, so sources drop until it has caught up.
     """
 
     def __init__(self, run: RunState) -> None:
@@ -94,9 +95,17 @@ class LiveCover(Cover):
         self.cover()
 
     def back(self, process: Supervised) -> None:
-        """Nothing that was given before is held against a process that takes part again."""
         self._told.pop(process.label, None)
-        for name in self.run.consumers(process):
+        self._excuse(self.run.consumers(process))
+
+    def heard_again(self, process: Supervised) -> None:
+        """A process that gave no sign of life gives one."""
+        nodes = self.run.graph.nodes
+        self._excuse([name for name in self.run.consumers(process) if nodes[name].live.queue != "block"])
+
+    def _excuse(self, operators: Iterable[str]) -> None:
+        """Holds nothing against these operators that was given until now."""
+        for name in operators:
             if (given := self.flow.given(name)) != NEVER:
                 self._excused[name] = given
         self.cover()

@@ -73,7 +73,7 @@ class Heartbeats(Part):
         if process.silent:
             process.silent = False
             self.run.event("heard", f"{process.describe()} is heard again", operators=list(process.nodes))
-            self._cover.back(process)
+            self._cover.heard_again(process)
         self._check_memory(process, fields["memory"])
 
     def _check_memory(self, process: Supervised, taken: int) -> None:

@@ -332,6 +332,20 @@ def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -
     assert ran.is_repeated()
 
 
+def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Path) -> None:
+    graph = graph_of(
+        "left: {use: runtime_operators:Counter, params: {count: 40, sleep: 0.15}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
+    )
+
+    ran = Ran(graph, path)
+
+    (event,) = ran.events("behind")
+    assert event.startswith("source 'left' has fallen behind the clock: reading it waits")
+    assert ran.report.notes[-1].startswith("source 'left' was ")
+    assert "s behind the clock at the end" in ran.report.notes[-1]
+
+
 def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 

@@ -157,8 +157,13 @@ def covered(play: Play, stamp: int) -> tuple[int, int]:
     return fields["frontier"], fields["backlog"]
 
 
-def test_a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_when_it_is_back() -> None:
-    play = Play(LEFT, SUM, "other: {use: runtime_operators:Sum, inputs: {x: left/fast}}", live=True).starts()
+OTHER = "other: {use: runtime_operators:Sum, inputs: {x: left/fast}}"
+DROPS = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {queue: newest, size: 1}}"
+
+
+def stopped_for_a_while(consumer: str) -> Play:
+    """A run in which the consumer `sum` was stopped at stamp 100, and is heard again at 900."""
+    play = Play(LEFT, consumer, OTHER, live=True).starts()
     play.wait(0.1)
     play.tell(play.progress("left", {"left": 100}))
     play.tell(play.progress("sum", {"sum": 100}), play.progress("other", {"other": 100}))
@@ -173,10 +178,21 @@ def test_a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_wh
 
     play.deaf.discard("sum")
     play.tell(play.beat("sum"))
-    assert covered(play, 1000)[1] == 900  # what it owes counts from when it was back
     play.tell(play.progress("sum", {"sum": 300}), play.progress("other", {"other": 1000}))
-    assert covered(play, 1100)[1] == 900
     assert killed(play.commands) == []
+    return play
+
+
+def test_a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_when_it_is_back() -> None:
+    play = stopped_for_a_while(DROPS)
+
+    assert covered(play, 1100)[1] == 900  # what it owes counts from when it was back
+
+
+def test_one_that_drops_nothing_catches_up_first_since_nothing_else_bounds_what_it_holds() -> None:
+    play = stopped_for_a_while(SUM)
+
+    assert covered(play, 1100)[1] == 300
 
 
 def test_what_did_not_reach_a_consumer_is_counted_against_it() -> None:
