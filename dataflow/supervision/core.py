@@ -28,12 +28,13 @@ from dataflow.supervision.events import (
     Tick,
 )
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
-from dataflow.supervision.outcome import how_it_ended, report_of
+from dataflow.supervision.outcome import report_of
 from dataflow.supervision.part import Part
 from dataflow.supervision.report import RunFailed, Status
 from dataflow.supervision.restarts import RestartPolicy
 from dataflow.supervision.run_state import Phase, Release, RunState
 from dataflow.supervision.supervised import Supervised
+from dataflow.supervision.wording import how_it_ended
 
 
 class Core:

@@ -12,6 +12,7 @@ from typing import Any
 from dataflow.supervision.part import Part
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.supervised import Supervised
+from dataflow.supervision.wording import how_long
 
 LATE = 1.0
 """Seconds behind the clock that are worth a word."""
@@ -61,8 +62,9 @@ class Lateness(Part):
         return f"reading it waits, for a device or a file, or because it shares the CPU {beside}which are busy"
 
     def _waits(self, source: str, last: int | None, stamp: int, seconds: float) -> None:
-        jump = "" if last is None else f", its stamps jumped from {last} to {stamp}"
-        text = f"source {source!r} waits {seconds:.0f} s for the clock{jump}: nothing comes from it until then"
+        jump = "" if last is None else f", its stamps jump from {last} to {stamp}"
+        rate = "" if self.run.plan.rate in (None, 1.0) else f" at rate {self.run.plan.rate:g}"
+        text = f"source {source!r} waits {how_long(seconds)} for the clock{rate}{jump}: nothing comes until then"
         self.run.event("clock_wait", text, operator=source, stamp=stamp, seconds=seconds)
 
     def closing(self) -> None:

@@ -1,24 +1,10 @@
-"""How a run ended, in words and as a report."""
+"""The report of a run that has ended in order."""
 
 from __future__ import annotations
-
-import signal
 
 from dataflow.supervision.report import RunReport
 from dataflow.supervision.run_state import RunState
 from dataflow.sync import FOREVER, NEVER
-
-
-def how_it_ended(code: int | None) -> str:
-    """Returns what an exit code says of a process."""
-    if code is None:
-        return "ended, nobody knows how"
-    if code >= 0:
-        return f"exited with code {code}"
-    try:
-        return f"was killed by {signal.Signals(-code).name}"
-    except ValueError:
-        return f"was killed by signal {-code}"
 
 
 def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport:

@@ -11,6 +11,7 @@ from dataflow.supervision.quiescence import Quiescence
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.supervised import Supervised
+from dataflow.supervision.wording import how_long
 
 PING_AFTER = 1.0
 """Seconds after which a process that says nothing is asked for a sign of life."""
@@ -67,7 +68,7 @@ class StallWatch(Part):
         if due <= self.run.plan.stall_timeout:
             return ""
         rate = 1.0 if self.run.plan.rate is None else self.run.plan.rate
-        return f"; the next message of host {label!r} is due in {_span(due)} at rate {rate:g}"
+        return f"; the next message of host {label!r} is due in {how_long(due)} at rate {rate:g}"
 
 
 class LiveStallWatch(StallWatch):
@@ -106,11 +107,3 @@ class LiveStallWatch(StallWatch):
                 raise RunFailed(f"{process.describe()} gave no sign of life for {silence:.0f} s", words)
             if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # hosts give one by themselves
                 self.run.send(process, "poll", replaces=True, round=NO_ROUND)
-
-
-def _span(seconds: float) -> str:
-    """Returns a span in words, however long it is."""
-    for unit, length in (("years", 365.25 * 86400), ("days", 86400.0), ("hours", 3600.0)):
-        if seconds >= 2 * length:
-            return f"{seconds / length:.3g} {unit}"
-    return f"{seconds:.0f} s"

@@ -275,8 +275,8 @@ def test_a_source_whose_stamps_jumped_far_ahead_is_named() -> None:
     play.tell(Said("left", "early", {"operator": "left", "last": 5, "stamp": 10**18, "seconds": 999_999_999.6}))
 
     assert play.core.status.notes == [
-        "source 'left' waits 1000000000 s for the clock, its stamps jumped from 5 to 1000000000000000000: "
-        "nothing comes from it until then"
+        "source 'left' waits 31.7 years for the clock, its stamps jump from 5 to 1000000000000000000: "
+        "nothing comes until then"
     ]
 
 
