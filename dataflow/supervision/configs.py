@@ -8,7 +8,7 @@ from typing import Any
 from dataflow.supervision.plan import HostPlan, RunPlan
 
 Config = tuple[str, dict[str, Any]]
-"""Kind of process ("host" or "sink"), and the fields of its `HostConfig` or `SinkConfig`."""
+"""Kind of process ("host" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
 
 
 def configurations(plan: RunPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str]) -> dict[str, Config]:
