@@ -1,7 +1,7 @@
 """The inlet of a process: from the bytes that arrive on its keys to envelopes that belong to its streams.
 
 Whatever does not belong there is dropped, counted and complained about: bytes that are no envelope (`malformed`), and
-envelopes that contradict what their stream has said so far (`foreign`). Neither ends a process.
+envelopes that contradict what their stream has said so far (`misplaced`). Neither ends a process.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Inlet:
         self.label, self.live = label, live
         self.received = 0
         """Envelopes that counted, for the proof of quiescence."""
-        self.malformed = self.foreign = 0
+        self.malformed = self.misplaced = 0
         self._channel, self._deliver, self._static, self._make_order = channel, deliver, frozenset(static), order
         self._complaints = complaints or Complaints()
         self._orders: dict[str, Order] = {}
@@ -90,8 +90,8 @@ class Inlet:
 
     def refuse(self, stream: str, what: str, number: int = 1) -> None:
         """Counts, and complains about, what arrived on a key and does not belong to its stream."""
-        self.foreign += number
-        self._complaints.say(f"foreign {stream}", f"dropped {what} on {stream!r}: it does not go on from that stream")
+        self.misplaced += number
+        self._complaints.say(f"misplaced {stream}", f"dropped {what} on {stream!r}: it does not go on from that stream")
 
     def refuse_malformed(self, stream: str, error: Exception) -> None:
         """Counts, and complains about, bytes that mean nothing."""

@@ -289,7 +289,7 @@ class OperatorProcess:
             self._ended = True
             self.outlet.flush_all()
             self.progress.report(idle=True)
-            transport = {**self.bus.counters(), "malformed": self.inlet.malformed, "foreign": self.inlet.foreign}
+            transport = {**self.bus.counters(), "malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
             self.channel.send("ended", report=self.progress.final_report(transport))
 
     def _answer_poll(self, *, idle: bool) -> None:

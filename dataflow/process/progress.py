@@ -13,7 +13,7 @@ from dataflow.process.live_sources import LiveSources
 from dataflow.process.runners import Runner, Runners, verifications_of
 
 REPORT_EVERY = 0.004
-REPORT_IDLE = 0.001
+REPORT_IDLE = 0.002
 """Seconds between two reports of a process that has nothing more to do: others may be waiting for this one."""
 
 

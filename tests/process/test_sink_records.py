@@ -82,5 +82,5 @@ def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys:
     recorder.arrives((0, 0))
 
     assert recorder.stored.places == [(0, 0)]
-    assert (recorder.process.inlet.malformed, recorder.process.inlet.foreign) == (1, 1)
+    assert (recorder.process.inlet.malformed, recorder.process.inlet.misplaced) == (1, 1)
     assert capsys.readouterr().err.count(KEY) == 2

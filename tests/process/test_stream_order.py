@@ -38,7 +38,7 @@ def envelope_of(kind: Kind, incarnation: int, seq: int, stamp: int) -> Envelope:
 
 foreign = st.builds(
     envelope_of,
-    st.sampled_from([Kind.MESSAGE, Kind.FRONTIER, Kind.END, Kind.RESET]),
+    st.sampled_from([Kind.MESSAGE, Kind.FRONTIER, Kind.END]),
     st.integers(0, 3),
     st.integers(0, 12) | st.just(10**6),
     st.integers(0, 10_000) | st.sampled_from([FOREVER - 1, FOREVER]),
