@@ -8,8 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from dataflow.cli.arguments import FLAG, Json, Settings, check_offset, existing, output_file
-from dataflow.cli.execution import HostEach, OneHost, Quiet
+from dataflow.cli.arguments import (
+    FLAG,
+    Json,
+    ModuleFolders,
+    Settings,
+    check_offset,
+    existing,
+    find_modules_in,
+    output_file,
+)
+from dataflow.cli.execution import OneProcess, ProcessEach, Quiet
 from dataflow.cli.output import (
     COULD_NOT_RUN,
     DIFFERENT,
@@ -40,6 +49,7 @@ def verify(
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
     settings: Settings = None,
+    path: ModuleFolders = None,
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
     ] = None,
@@ -83,8 +93,8 @@ def verify(
         ),
     ] = None,
     quiet: Quiet = False,
-    one_host: OneHost = False,
-    host_each: HostEach = False,
+    one_process: OneProcess = False,
+    process_each: ProcessEach = False,
     json: Json = False,
 ) -> None:
     """Re-execute recorded runs by their firing records, and compare every output.
@@ -115,8 +125,8 @@ def verify(
     from dataflow.verification.gate import Baseline, BaselineError, recordings_in
 
     with friendly_errors():
-        if one_host and host_each:
-            raise fail("--one-host and --host-each exclude each other")
+        if one_process and process_each:
+            raise fail("--one-process and --process-each exclude each other")
         if first is not None and only is not None:
             raise fail("--from and --only exclude each other")
         if graph is None and settings:
@@ -124,7 +134,7 @@ def verify(
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
         check_offset("--start", start)
-        if start is not None and (tolerance is not None or one_host or host_each or baseline is not None):
+        if start is not None and (tolerance is not None or one_process or process_each or baseline is not None):
             raise fail("--start goes with --from, --only, --graph and --json only")
         if accept and baseline is None:
             raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
@@ -141,6 +151,7 @@ def verify(
             known = None if baseline is None else Baseline.load(baseline)
         except BaselineError as error:
             raise fail(str(error)) from None
+        find_modules_in(path)
         loaded = None if graph is None else load_graph(existing(graph, "a graph file"), settings=settings or ())
         options: dict[str, Any] = {
             "graph": loaded,
@@ -148,7 +159,7 @@ def verify(
             "only": only,
             "tolerance": tolerance,
             "start": start,
-            "placement": "one_host" if one_host else "host_each" if host_each else "graph",
+            "placement": "one_host" if one_process else "host_each" if process_each else "graph",
         }
         single = len(recordings) == 1 and not recordings[0].is_dir()
         checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)

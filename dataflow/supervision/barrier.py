@@ -46,11 +46,17 @@ class Barrier:
         if self._probing:
             for process in processes:
                 self._probe(process)
-            if all(p.life is Life.PROBING and not p.unseen for p in processes):
+            if not any(map(self._missing, processes)):
+                run.status.waiting = ()
                 return True
+        run.status.waiting = tuple(p.label for p in processes if p.life is not Life.READY and self._missing(p))
         if run.steady > self._deadline:
             self._fail(processes)
         return False
+
+    def _missing(self, process: Supervised) -> bool:
+        """Whether a process is not ready, or does not see all of its edges."""
+        return process.life is not Life.PROBING or bool(process.unseen)
 
     def _probe(self, process: Supervised) -> None:
         run = self.run

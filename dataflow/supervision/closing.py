@@ -17,13 +17,13 @@ from dataflow.supervision.supervised import Supervised
 LEAVE_TIMEOUT = 10.0
 LEAVE_AT_ONCE = 1.0
 CLOSE_TIMEOUT = 60.0
-"""Seconds for `close()` of every operator, at the orderly end of a run; `patience` shortens it."""
+"""Seconds for `close()` of every operator, at the orderly end of a run; a shorter `stall_timeout` shortens it."""
 SHORTEST = 5.0
 
 
-def bounded(patience: float) -> float:
+def bounded(stall_timeout: float) -> float:
     """Returns the seconds that a run which is to end may take for it."""
-    return max(SHORTEST, min(CLOSE_TIMEOUT, patience))
+    return max(SHORTEST, min(CLOSE_TIMEOUT, stall_timeout))
 
 
 @dataclass(slots=True)

@@ -44,7 +44,7 @@ def apart(
     channel, descriptor = Channel.pair()
     with tempfile.TemporaryFile() as words:
         process = subprocess.Popen(
-            [sys.executable, "-m", "dataflow.verification.worker", str(descriptor)],
+            [sys.executable, "-P", "-m", "dataflow.verification.worker", str(descriptor)],
             pass_fds=(descriptor,),
             env=environment(threads),
             stdin=subprocess.DEVNULL,
