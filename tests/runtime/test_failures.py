@@ -193,7 +193,11 @@ class Running:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "dataflow.cli.main", *arguments],
             cwd=cwd,
-            env={**os.environ, "PYTHONPATH": str(HERE), "XDG_RUNTIME_DIR": str(cwd)},
+            env={
+                **os.environ,
+                "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent.parent)]),
+                "XDG_RUNTIME_DIR": str(cwd),
+            },
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
