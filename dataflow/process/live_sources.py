@@ -27,6 +27,8 @@ from dataflow.process.pace import Pace
 MISSED_AFTER = 0.2
 """Seconds after which a step of a restarted source counts as missed."""
 BACKLOG_EVERY = 0.5
+EARLY = 10.0
+"""Seconds for which a source waits for the clock that are worth a word."""
 RETURN_WITHIN = 3.0
 """Seconds that `stream()` has to return when the process is closed."""
 
@@ -43,6 +45,9 @@ class Reader:
         """What went wrong on the thread, until somebody has dealt with it."""
         self.condemned: OperatorFailure | None = None
         """Why what it reads is of no use any more; it stops as soon as it can."""
+        self.read_late = self.sent_late = 0.0
+        """Seconds by which the last step was behind the clock: when it was read, and when it was sent."""
+        self._last: int | None = None
         self._owner, self._faults, self._behind = owner, faults, behind
         self._lost = 0
         self._thread = threading.Thread(target=self._run, name=f"source {runner.node.name}", daemon=True)
@@ -89,7 +94,12 @@ class Reader:
         if self._behind and pace.due_in(stamp) < -MISSED_AFTER:
             return False
         self._behind = False
-        self._owner.stopping.wait(max(0.0, pace.due_in(stamp)))
+        early = pace.due_in(stamp)
+        self.read_late = max(0.0, -early)
+        if early > EARLY:
+            self._owner.tell_early(self.runner.node.name, self._last, stamp, early)
+        self._last = stamp
+        self._owner.stopping.wait(min(max(0.0, early), threading.TIMEOUT_MAX))
         return True
 
     def _hand_over(self, step: Step) -> None:
@@ -194,6 +204,8 @@ class LiveSources:
             self._window.clear()
             self.backlog.clear()
             self._channel.send("jumped", operator=runner.node.name, stamp=runner.last)
+        if not runner.source.live:
+            reader.sent_late = max(0.0, -self.pace.due_in(runner.last))
         runner.promise()
         self._window.add(runner.last, *admitted)
         self.backlog.add(runner.last, *admitted)
@@ -205,6 +217,16 @@ class LiveSources:
             self._backlog_due = now + BACKLOG_EVERY
             with contextlib.suppress(ChannelClosed):  # the control thread sees to it
                 self._channel.send("backlog", messages=messages, bytes=nbytes)
+
+    def tell_early(self, operator: str, last: int | None, stamp: int, seconds: float) -> None:
+        """Tells the supervisor that a source waits long for the clock, after a step at `last`; on any thread."""
+        with contextlib.suppress(ChannelClosed):  # the control thread sees to it
+            self._channel.send("early", operator=operator, last=last, stamp=stamp, seconds=seconds)
+
+    def behind(self) -> dict[str, list[float]]:
+        """For each source that could wait: seconds by which its last step was read and sent behind the clock."""
+        readers = {name: reader for name, reader in self._readers.items() if not reader.runner.source.live}
+        return {name: [reader.read_late, reader.sent_late] for name, reader in readers.items()}
 
     # Restarts
 

@@ -309,6 +309,7 @@ class OperatorProcess:
             received=self.inlet.received,
             full=self.feeding.full,
             waiting=self.progress.waiting(),
+            due=self.feeding.next_due(),
         )
 
     def _waits_for_clock(self) -> bool:

@@ -61,7 +61,8 @@ class Progress:
         self._dropped |= drops
         waits = {name: found for name, found in self.waits().items() if found != self._waited.get(name)}
         self._waited |= waits
-        self._channel.send("progress", done=done, counts=self.counted, drops=drops, waits=waits)
+        behind = self._live.behind()
+        self._channel.send("progress", done=done, counts=self.counted, drops=drops, waits=waits, behind=behind)
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""

@@ -153,14 +153,11 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
     return plans
 
 
-def expected_probes(plan: RunPlan, plans: Mapping[str, HostPlan]) -> dict[str, set[str]]:
-    """Label → the keys on which that process must have seen a probe before sources are released."""
-    expected = {}
-    for label, host in plans.items():
-        keys = set(host.subscribe)
-        if host.sink is not None:
-            keys = set(host.streams)
-            if host.sink == "record":
-                keys |= {firings_key(plan.graph.namespace, node) for node in plan.graph.nodes}
-        expected[label] = keys
-    return expected
+def taken_keys(graph: Graph, host: HostPlan) -> set[str]:
+    """Returns the keys that a process takes: on each it must have seen a probe before sources are released."""
+    if host.sink is None:
+        return set(host.subscribe)
+    keys = set(host.streams)
+    if host.sink == "record":
+        keys |= {firings_key(graph.namespace, node) for node in graph.nodes}
+    return keys

@@ -1,4 +1,4 @@
-"""What a run tells while it goes on and at its end."""
+"""The status of a run while it goes on, its report at the end, and its failure."""
 
 from __future__ import annotations
 
@@ -51,6 +51,8 @@ class Status:
     notes: list[str] = field(default_factory=list)
     health: list[Health] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
+    behind: dict[str, float] = field(default_factory=dict)
+    """Seconds by which each source of a live run is behind the clock."""
 
     @property
     def covered(self) -> int:
@@ -59,10 +61,10 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What a run came to.
+    """The result of a run.
 
     `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples, those of
-    processes that were started again included, with the input "" for what a source has not sent; `summaries` holds what
+    processes that were restarted included, with the input "" for what a source has not sent; `summaries` holds what
     metrics sinks report; `wall` is in seconds from the release of the sources; `restarts` counts by operator.
     """
 
@@ -73,7 +75,6 @@ class RunReport:
     summaries: Mapping[str, Mapping[str, Any]]
     transport: Mapping[str, Mapping[str, int]]
     files: Mapping[str, Mapping[str, Any]]
-    verifications: tuple[Mapping[str, Any], ...]
     first: int | None
     last: int | None
     wall: float

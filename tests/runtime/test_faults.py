@@ -15,7 +15,7 @@ from dataflow.messages import Diagnostics
 from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision import live
+from dataflow.supervision import heartbeats
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
@@ -192,7 +192,7 @@ SMALL = {"window": (8, 64 << 20)}
 def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
     placement: str, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     graph = robot(HANGS.format("queue: newest, size: 1"), count=1000)
 
     with pytest.raises(
@@ -206,7 +206,7 @@ def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
 
 
 def test_a_hang_without_a_deadline_is_ended_by_its_restart_policy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     ran = Ran(robot(HANGS.format(f"queue: newest, size: 1, {AGAIN}"), count=400), path, **SMALL)
 
     assert ran.report.restarts == {"bad": 1}
@@ -330,6 +330,20 @@ def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -
     assert ran.report.operators["slow"].dropped == sum(n for _, _, n in ran.report.drops["slow"])
     assert int(ran.diagnosed("slow")["dropped.x.overflow"]) > 50
     assert ran.is_repeated()
+
+
+def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Path) -> None:
+    graph = graph_of(
+        "left: {use: runtime_operators:Counter, params: {count: 40, sleep: 0.15}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
+    )
+
+    ran = Ran(graph, path)
+
+    (event,) = ran.events("behind")
+    assert event.startswith("source 'left' has fallen behind the clock: reading it waits")
+    assert ran.report.notes[-1].startswith("source 'left' was ")
+    assert "s behind the clock at the end" in ran.report.notes[-1]
 
 
 def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(path: Path) -> None:

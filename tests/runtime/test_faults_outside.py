@@ -23,9 +23,9 @@ from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import LiveSupervisor
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
+from dataflow.supervision.supervisor import Supervisor
 from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
@@ -220,22 +220,12 @@ def links() -> Iterator[list[Link]]:
         link.end()
 
 
-def run_with_a_cut(
-    label: str, graph: Graph, path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
-) -> RunReport:
+def run_with_a_cut(label: str, graph: Graph, path: Path, links: list[Link]) -> RunReport:
     """A live run, a host each, in which every link to the process `label` is cut for half a second."""
-    spawn = LiveSupervisor._spawn
-
-    def through_a_link(
-        self: LiveSupervisor, spawned: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]
-    ) -> None:
-        if spawned == label:
-            links.extend(Link(endpoint) for endpoint in config["connect"])
-            config = {**config, "connect": [link.endpoint for link in links]}
-        spawn(self, spawned, nodes, kind, config)
-
-    monkeypatch.setattr(LiveSupervisor, "_spawn", through_a_link)
-    supervisor = LiveSupervisor(RunPlan(graph, live=True, placement="host_each", record=path))
+    supervisor = Supervisor(RunPlan(graph, live=True, placement="host_each", record=path))
+    _, config = supervisor.core.run.configs[label]
+    links.extend(Link(endpoint) for endpoint in config["connect"])
+    config["connect"] = [link.endpoint for link in links]
     reports: list[RunReport] = []
     thread = threading.Thread(target=lambda: reports.append(supervisor.run()))
     thread.start()
@@ -260,12 +250,12 @@ def gaps_in(path: Path) -> list[Mapping[str, Any]]:
 
 
 def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor_the_proof(
-    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, links: list[Link]
 ) -> None:
     """The link from `left` to `smooth`; everything else stays connected."""
     graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
 
-    report = run_with_a_cut("smooth", graph, path, links, monkeypatch)
+    report = run_with_a_cut("smooth", graph, path, links)
 
     assert report.summaries["sum"]["count"] == 300  # whose link was whole
     gaps = gaps_in(path)
@@ -277,11 +267,11 @@ def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor
 
 
 def test_a_recorder_that_was_cut_off_has_every_firing_record_and_its_gaps_are_said(
-    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, links: list[Link]
 ) -> None:
     graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
 
-    run_with_a_cut("@recorder", graph, path, links, monkeypatch)
+    run_with_a_cut("@recorder", graph, path, links)
 
     assert {gap["taker"] for gap in gaps_in(path)} == {"@recorder"}
     with Recording(path) as recording:
