@@ -34,7 +34,8 @@ from dataflow.process.network import network_config
 from dataflow.process.outlet import Outlet
 from dataflow.process.watchdog import Watchdog
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import RecordedRunner, recorded_digests, recorded_firings
+from dataflow.records.reading import recorded_digests, recorded_firings
+from dataflow.reexecution.recorded import RecordedRunner
 from dataflow.sync import FOREVER, NEVER, Entry
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, TapServer, decode
 from dataflow.transport.bus import BusError

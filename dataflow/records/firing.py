@@ -20,14 +20,15 @@ Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "
 Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
 OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
-
+CALLS: tuple[Kind, ...] = ("fire", "tick", "finish")
+"""The kinds that stand for a call with messages."""
 
 WITHHELD = -1
 """The place in its stream of a message that was not sent, since its stamp did not increase (live runs only)."""
 
 
 class FiringRecordError(ValueError):
-    """A batch of firing records that cannot be read: says which operator and what is wrong."""
+    """A batch of firing records that cannot be written or read: says what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,8 +171,9 @@ def decode_batch(data: bytes) -> Batch:
         last = bool(batch["last"])
     except FiringRecordError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, msgpack.UnpackException) as error:
-        raise FiringRecordError(f"not a batch of firing records: {type(error).__name__}: {error}") from error
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, msgpack.UnpackException) as error:
+        what = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise FiringRecordError(f"not a batch of firing records ({what})") from error
     return Batch(operator, incarnation, last, records)
 
 

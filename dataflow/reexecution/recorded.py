@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import PurePath
-from typing import Any, Literal
+from typing import Any
 
 from dataflow.firing.align import align_spec
 from dataflow.firing.runner import (
@@ -30,196 +29,15 @@ from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import Operator, OperatorSpec, outputs_of
-from dataflow.recording import Recording
-from dataflow.records.firing import WITHHELD, Emission, FiringRecord, decode_batch
-from dataflow.sync import FOREVER, NEVER, Entry, Firing, InputRef, MessageRef, RecordedAligner
-
-CALLS = ("fire", "tick", "finish")
-"""The kinds of records that stand for a call with messages."""
+from dataflow.records.comparison import Difference, Verification
+from dataflow.records.firing import CALLS, WITHHELD, Emission, FiringRecord
+from dataflow.records.reading import Digests, beginning, needed_from, whole
+from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
 
 RAISED = (Exception, SystemExit, KeyboardInterrupt)
 """What an operator may raise; a live run records all of it as the operator's error."""
 
 _ADDRESS = re.compile(r"0x[0-9a-fA-F]+")
-
-Verdict = Literal["identical", "culprit", "downstream", "unverifiable"]
-Digests = Mapping[str, Mapping[tuple[int, int], bytes]]
-"""Stream → (incarnation, seq) → the recorded digest."""
-
-
-@dataclass(frozen=True, slots=True)
-class Difference:
-    """The first firing of an operator that came out otherwise. `expected` and `got` are digests, or say what else."""
-
-    index: int
-    kind: str
-    stamp: int
-    port: str
-    expected: str
-    got: str
-    incarnation: int = 0
-
-
-@dataclass(slots=True)
-class Verification:
-    """What re-executing one operator came to.
-
-    `verified` firings were repeated and compared; `unverifiable` ones could not be, because a message they were given
-    is not to be had; `lost_records` are missing between others, so the firings that follow them in their incarnation
-    cannot be repeated either. `beyond` of the unverifiable ones wait for a message after the last one of its stream.
-    `unaccounted` messages were made by no record, `unfinished` says that the records end before the run did: records
-    are lost. `cut` says that the recording itself ends before the run did, and before this operator; `after_cut` are
-    then the messages without a record. `not_stored` messages were made again, but are not in the recording.
-    `tainted` is the index of the first firing that was given anything other than recorded, `own_fault` says that the
-    first difference came before; `states` of the differences are in snapshots, not in messages.
-    `began` says from where it was repeated: "start", "snapshot" (its recorded state) or "stateless".
-    """
-
-    operator: str
-    firings: int = 0
-    verified: int = 0
-    outputs: int = 0
-    differing: int = 0
-    states: int = 0
-    unverifiable: int = 0
-    beyond: int = 0
-    lost_records: int = 0
-    unaccounted: int = 0
-    unfinished: bool = False
-    cut: bool = False
-    after_cut: int = 0
-    not_stored: int = 0
-    began: str = "start"
-    own_fault: bool = False
-    tainted: int | None = None
-    first: Difference | None = None
-    missing: str = ""
-    files_changed: list[str] = field(default_factory=list)
-
-    @property
-    def verdict(self) -> Verdict:
-        if self.first is not None:
-            return "culprit" if self.own_fault else "downstream"
-        return "identical" if self.whole else "unverifiable"
-
-    @property
-    def whole(self) -> bool:
-        """Everything that was recorded before the cut, if there is one, was repeated, and there was anything."""
-        if self.lost_records or self.unaccounted or self.unfinished:
-            return False
-        if self.cut:
-            return self.unverifiable == self.beyond and (self.verified > 0 or not (self.beyond or self.after_cut))
-        return not self.unverifiable
-
-    def to_wire(self) -> dict[str, Any]:
-        return asdict(self)
-
-    @staticmethod
-    def from_wire(values: Mapping[str, Any]) -> Verification:
-        first = values["first"]
-        return Verification(**{**values, "first": None if first is None else Difference(**first)})
-
-
-def recorded_firings(recording: Recording, operator: str) -> Iterator[FiringRecord]:
-    """The firing records of one operator, in order."""
-    for _, payload in recording.firings(operator):
-        yield from decode_batch(payload).records
-
-
-def first_places(ref: InputRef) -> Iterator[tuple[str, tuple[int, int]]]:
-    """(stream, (incarnation, number)) of the first message that a reference names on each stream."""
-    match ref:
-        case None:
-            return
-        case MessageRef():
-            yield ref.stream, (ref.incarnation, ref.seq)
-        case tuple():
-            for run in ref:
-                yield run.stream, (run.incarnation, run.first_seq)
-        case _:
-            for one in ref.values():
-                yield one.stream, (one.incarnation, one.seq)
-
-
-def needed_from(records: Iterable[FiringRecord]) -> dict[str, tuple[int, int]]:
-    """By stream, the first message (incarnation, number) that the calls of `records` took."""
-    needed: dict[str, tuple[int, int]] = {}
-    for record in records:
-        for ref in record.inputs.values():
-            for stream, place in first_places(ref):
-                needed[stream] = min(place, needed.get(stream, place))
-    return needed
-
-
-def messages_of(ref: InputRef) -> Iterator[MessageRef]:
-    """Every message that a reference names."""
-    match ref:
-        case None:
-            return
-        case MessageRef():
-            yield ref
-        case tuple():
-            for run in ref:
-                yield from run
-        case _:
-            yield from ref.values()
-
-
-def recorded_digests(recording: Recording, nodes: Iterable[Node], streams: frozenset[str]) -> Digests:
-    """What the given nodes had emitted on the given streams."""
-    found: dict[str, dict[tuple[int, int], bytes]] = {stream: {} for stream in streams}
-    for node in nodes:
-        outputs = list(node.outputs.values())
-        if not streams.isdisjoint(outputs):
-            for record in recorded_firings(recording, node.name):
-                for stream, emission in zip(outputs, record.outputs, strict=False):  # a failed call has none
-                    if emission is not None and stream in found:
-                        found[stream][record.incarnation, emission.seq] = emission.digest
-    return found
-
-
-def whole(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
-    """The records by (incarnation, index), each once, and how many calls had to be left out.
-
-    Where records are missing, those after them in the same incarnation cannot be repeated: the operator's state there
-    is not known. The next incarnation begins from `setup()` again (or, after a jump of the clock, does not).
-    """
-    kept: list[FiringRecord] = []
-    lost = 0
-    following = (0, 0)
-    known = True
-    for record in sorted(records, key=lambda r: (r.incarnation, r.index)):
-        place = (record.incarnation, record.index)
-        if place < following:
-            continue  # handed over twice, when its process died
-        begins = record.incarnation > following[0] or not following[1]
-        if begins:
-            known = record.index == 0 and (record.kind != "reset" or known)
-        else:
-            known = known and place == following
-        following = (record.incarnation, record.index + 1)
-        if known:
-            kept.append(record)
-        else:
-            lost += record.kind in CALLS
-    return kept, lost
-
-
-def beginning(
-    records: list[FiringRecord], begin: int | None, *, stateless: bool
-) -> tuple[list[FiringRecord], list[FiringRecord], str]:
-    """What lies before the place from which records are repeated, the rest, and how that place was found.
-
-    It is after the last snapshot at or before the stamp `begin`, or at `begin` itself for an operator without state;
-    for any other at the start, since its state in the middle is not known.
-    """
-    if begin is None:
-        return [], records, "start"
-    place = max((k + 1 for k, r in enumerate(records) if r.kind == "snapshot" and r.stamp <= begin), default=0)
-    if stateless:
-        place = next((k for k, r in enumerate(records) if r.kind in CALLS and r.stamp >= begin), len(records))
-    found = "stateless" if stateless else "snapshot" if place else "start"
-    return records[:place], records[place:], found
 
 
 class RecordedRunner:

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from dataflow.graph import load_bundle
 from dataflow.graph.model import Graph
-from dataflow.recording import Recording
+from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH
 
 
@@ -16,10 +16,18 @@ class ReplayError(ValueError):
 
 
 def recorded_graph(recording: Recording) -> Graph:
-    """The graph that made a recording. Raises `ReplayError` when it does not hold one."""
+    """The graph that made a recording; its operators are imported. Raises `ReplayError`, `GraphError`."""
     bundle = recording.metadata.get(GRAPH, {}).get("bundle")
     if bundle is None:
         raise ReplayError(f"{recording.path} does not hold the graph that made it: name one with --graph")
+    try:
+        packed = json.loads(bundle)
+    except (ValueError, RecursionError):
+        packed = None
+    if not isinstance(packed, dict) or not packed.keys() >= {"format", "file", "files"}:
+        raise ReplayError(
+            f"{recording.path}: what it holds in place of the graph that made it is no graph: name one with --graph"
+        )
     return load_bundle(bundle)
 
 
@@ -40,7 +48,17 @@ def check_type(recording: Recording, graph: Graph, stream: str) -> None:
 
 
 def final_stamps(recording: Recording, streams: Iterable[str]) -> dict[str, int]:
-    """The stamps that streams ended with in the recorded run, where the recording says so."""
+    """The stamps that streams ended with in the recorded run, where the recording says so.
+
+    Raises `RecordingError` where it cannot be read.
+    """
     ends = recording.metadata.get(ENDS, {})
-    known = {s: json.loads(ends[s]) for s in streams if s in ends}
-    return {s: end["final"] for s, end in known.items() if end["final"] is not None}
+    finals: dict[str, int] = {}
+    for stream in streams:
+        try:
+            final = json.loads(ends[stream])["final"] if stream in ends else None
+            if final is not None:
+                finals[stream] = int(final)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise RecordingError(f"{recording.path}: how stream {stream!r} ended cannot be read: {error!r}") from error
+    return finals

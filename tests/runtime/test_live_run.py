@@ -10,7 +10,7 @@ from dataflow.firing.source import SourceRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.run import run
 from dataflow.sync import Entry
 from dataflow.verification.verify import verify

@@ -9,7 +9,7 @@ import pytest
 from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
