@@ -86,7 +86,10 @@ def verify(
     jobs: Annotated[
         int | None,
         typer.Option(
-            "--jobs", "-j", metavar="N", help="Worker processes. Default: one for each core that may be used."
+            "--jobs",
+            "-j",
+            metavar="N",
+            help="Worker processes. Default: one for each core, fewer where little is to do.",
         ),
     ] = None,
     quiet: Quiet = False,

@@ -260,7 +260,7 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
 
     | here | accepted | | verdict |
     | --- | --- | --- | --- |
-    | as recorded | another outcome | whole | not as accepted |
+    | as recorded, or within tolerance | another outcome | whole | not as accepted |
     | as recorded, or within tolerance | anything | not whole | unverifiable |
     | as recorded | | a stored message differs from its record | changed |
     | as recorded, or within tolerance | | | identical, within tolerance |

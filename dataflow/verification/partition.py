@@ -9,6 +9,8 @@ from dataflow.graph.model import Graph
 
 PER_FIRING_NS = 50_000
 """Work that the runtime adds to each firing, roughly."""
+START_NS = 1_000_000_000
+"""Work of starting a worker, roughly."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,11 @@ def units(graph: Graph, recorded: Collection[str], operators: Collection[str]) -
                     group[other] = group[name]
     found = {id(members): members for members in group.values()}
     return [tuple(name for name in graph.nodes if name in members) for members in found.values()]
+
+
+def jobs_for(work: Mapping[str, int], cores: int) -> int:
+    """As many workers as there are cores, but none that would take longer to start than to work. Work is in ns."""
+    return min(cores, 1 + sum(work.values()) // START_NS)
 
 
 def balanced(groups: Sequence[tuple[str, ...]], work: Mapping[str, int], jobs: int) -> list[tuple[str, ...]]:

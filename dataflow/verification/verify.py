@@ -72,8 +72,9 @@ def verify(
     differ alike.
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
-    `jobs`: worker processes; by default as many as there are cores to use. `stall_timeout`: seconds allowed without
-    progress. `placement` is deprecated: "one_host" means one job, anything else nothing.
+    `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
+    `stall_timeout`: seconds allowed without progress. `placement` is deprecated: "one_host" means
+    one job, anything else nothing.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
     began = time.monotonic()
@@ -83,7 +84,7 @@ def verify(
         raise ReplayError(f"{jobs} jobs: expected 1 or more")
     if placement == "one_host":
         jobs = 1
-    task = _prepare(path, graph, first, only, start, jobs or len(os.sched_getaffinity(0)))
+    task = _prepare(path, graph, first, only, start, jobs)
     options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
     with shared_records(task.log) as (descriptor, batches):
         options |= {"descriptors": (descriptor,), "locate": _locate(task)}
@@ -110,7 +111,7 @@ def verify(
 
 
 def _prepare(
-    path: Path, graph: Graph | None, first: str | None, only: str | None, start: float | None, jobs: int
+    path: Path, graph: Graph | None, first: str | None, only: str | None, start: float | None, jobs: int | None
 ) -> _Task:
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
@@ -128,6 +129,7 @@ def _prepare(
         checks, unchecked = _checks(recording, played, log, [*operators, *stand_ins])
         groups = partition.units(played, recording.streams, operators)
         work = {n: sum(r.duration + partition.PER_FIRING_NS for r in log.of(n)) for n in operators}
+        jobs = jobs or partition.jobs_for(work, len(os.sched_getaffinity(0)))
         begin, last = _span(recording, start)
         return _Task(
             path=path,
