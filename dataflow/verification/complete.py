@@ -172,8 +172,10 @@ class _Store:
             self.sink.end(stream, known["final"], known["reason"])
         for event in recording.events():
             self.sink.writer.write_event(event.name, event.stamp, event.data)
-        for operator, payload in recording.firings():
-            self.sink.firings(operator, decode_batch(payload).records[-1].stamp, payload)
+        first = min((info.first for info in recording.streams.values() if info.first), default=0)
+        for operator, payload in recording.firings():  # those of setup() have no stamp, and keep their place
+            stamp = decode_batch(payload).records[-1].stamp
+            self.sink.firings(operator, stamp if stamp > 0 else first, payload)
         self._copied = 0
         self._taken: dict[str, set[tuple[int, int]]] = {stream: set() for stream in self.streams}
         for stream in sorted(recording.streams.keys() - graph.streams.keys()):
