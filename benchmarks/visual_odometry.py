@@ -28,7 +28,7 @@ from evo.core.trajectory import PosePath3D  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
-from operators.odometry import se3  # noqa: E402
+from operators.geometry import se3  # noqa: E402
 from operators.odometry.camera import RgbdCamera  # noqa: E402
 from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, TrackResult  # noqa: E402
 

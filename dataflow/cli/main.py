@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli import execution, inspection, live, param, recordings, top, verification, viewing
+from dataflow.cli import execution, inspection, latency, live, param, recordings, top, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup
@@ -99,6 +99,7 @@ _add(inspection.show, _LOOK)
 _add(inspection.operators, _LOOK)
 _add(recordings.info, _LOOK)
 _add(recordings.diff, _LOOK)
+_add(latency.latency, _LOOK)
 _add(viewing.view, _LOOK)
 _add(live.list_running, _FOLLOW, "list")
 _add(live.echo, _FOLLOW)

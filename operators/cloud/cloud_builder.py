@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Transforms
-from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.back_projection import Rays, beside_edge, sample_colors, within_range
+from operators.geometry.calibration import check_calibration
+from operators.geometry.extrinsics import transform_between
 
 
 class CloudBuilder(Operator):
@@ -52,8 +50,8 @@ class CloudBuilder(Operator):
         extrinsics: Transforms | None = None,
     ) -> PointCloud:
         """Raises ValueError where an image has not the size or frame of its calibration, or no transform fits."""
-        _check("depth", depth, depth_info)
-        _check("image", image, image_info)
+        check_calibration("depth", depth, depth_info)
+        check_calibration("image", image, image_info)
         usable = within_range(depth.data, self.stride, self.min_range, self.max_range)
         if self.edge_ratio:
             usable &= ~beside_edge(depth.data, self.stride, self.edge_ratio)
@@ -71,31 +69,3 @@ class CloudBuilder(Operator):
         rays = Rays.through(info.K, (info.width, info.height), self.stride)
         self._rays = info, rays
         return rays
-
-
-def transform_between(extrinsics: Transforms | None, depth_frame: str, image_frame: str) -> NDArray[np.float64]:
-    """`T_image_depth` (4, 4): the identity where the frames are one or no extrinsics are given.
-
-    Raises ValueError where the extrinsics do not relate the two.
-    """
-    if extrinsics is None or depth_frame == image_frame:
-        return np.eye(4)
-    known = list(zip(extrinsics.frames, extrinsics.child_frames, strict=True))
-    if (image_frame, depth_frame) in known:
-        T_image_depth: NDArray[np.float64] = extrinsics.matrices()[known.index((image_frame, depth_frame))]
-        return T_image_depth
-    if (depth_frame, image_frame) in known:
-        return invert(extrinsics.matrices()[known.index((depth_frame, image_frame))])
-    listed = ", ".join(f"{child} in {parent}" for parent, child in known) or "none"
-    raise ValueError(f"extrinsics hold no transform between {depth_frame!r} and {image_frame!r}; they hold {listed}")
-
-
-def _check(port: str, image: DepthImage | Image, info: CameraInfo) -> None:
-    if (image.width, image.height) != (info.width, info.height):
-        raise ValueError(
-            f"{port} has {image.width}x{image.height} pixels, but {port}_info describes {info.width}x{info.height}"
-        )
-    if image.frame != info.frame:
-        raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")
-    if info.distortion is not None and np.any(info.distortion):
-        raise ValueError(f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first")

@@ -14,13 +14,10 @@ from operators.detection.coco import COCO_CLASSES
 from operators.detection.decode import LAYOUTS, Candidates, DecoderName
 from operators.detection.fit import Fit, FitMode
 from operators.detection.nms import class_wise_nms
+from operators.inference import ModelError, open_session
 
 if TYPE_CHECKING:
     import onnxruntime
-
-
-class ModelError(ValueError):
-    """A model that does not fit its use: names the file, what it has and what would be right."""
 
 
 class OnnxDetector(Operator):
@@ -48,7 +45,7 @@ class OnnxDetector(Operator):
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError or ModelError."""
         file = self.use_file(self.model)
-        self._session = _open(file)
+        self._session = open_session(file)
         self._input = self._session.get_inputs()[0].name
         self._size = _input_size(file, self._session, self.input_size)
         self._layout = LAYOUTS[self.decoder]
@@ -90,22 +87,6 @@ class OnnxDetector(Operator):
                 f"{self.model} found class {found.classes.max()}, but there are {len(self._names)} class names; "
                 f"give the model's own in OnnxDetector.classes"
             )
-
-
-def _open(file: Path) -> onnxruntime.InferenceSession:
-    """A session whose results do not depend on the machine's load or core count."""
-    import onnxruntime  # heavy, and needed only where a detector runs
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.use_deterministic_compute = True
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exception classes share no public base
-        raise ModelError(f"{file} cannot be loaded as an ONNX model: {error}") from error
 
 
 def _input_size(file: Path, session: onnxruntime.InferenceSession, free: int) -> tuple[int, int]:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.odometry import se3
-from operators.odometry.camera import Pixels, Points, project
-from operators.odometry.se3 import Matrix, Vector
+from operators.geometry import se3
+from operators.geometry.pinhole import Pixels, Points, project
+from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.surface import DepthNoise, Surface
 
 CAUCHY = 2.0  # residuals of this many sigmas count half

@@ -6,10 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.odometry.se3 import Matrix
-
-Points = NDArray[np.float64]
-Pixels = NDArray[np.float64]
+from operators.geometry.pinhole import Pixels, Points, project, unproject
+from operators.geometry.se3 import Matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,18 +66,3 @@ class RgbdCamera:
         known &= high - low < 0.04 * low + 0.01
         z = np.nanmedian(around, axis=0) - origin[2]
         return origin + rays * (z / rays[:, 2])[:, None], known
-
-
-def unproject(pixels: Pixels, K: Matrix) -> Points:
-    """Rays (N, 3) with z = 1 through pixels (N, 2)."""
-    return np.column_stack(
-        [(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(pixels))]
-    )
-
-
-def project(points: Points, K: Matrix) -> Pixels:
-    """Pixels (N, 2) of points (N, 3); those at or behind the camera land far outside any image."""
-    z = points[:, 2]
-    safe = np.where(z > 1e-3, z, 1e-9)
-    uv = np.column_stack([points[:, 0] / safe * K[0, 0] + K[0, 2], points[:, 1] / safe * K[1, 1] + K[1, 2]])
-    return np.clip(np.where((z > 1e-3)[:, None], uv, -1e6), -1e6, 1e6)

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
-from operators.odometry.camera import Pixels, Points
+from operators.geometry.pinhole import Pixels, Points
+from operators.geometry.se3 import Matrix
 from operators.odometry.features import Gray
-from operators.odometry.se3 import Matrix
 from operators.odometry.surface import Surface
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dataflow.messages.geometry import invert
-from operators.odometry import se3
-from operators.odometry.se3 import Matrix, Vector
+from operators.geometry import se3
+from operators.geometry.se3 import Matrix, Vector
 
 UNKNOWN_SPEED = 1.0  # m/s and rad/s: how fast a hand or a small robot may already move when first seen
 

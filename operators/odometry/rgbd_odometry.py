@@ -13,13 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
-from operators.odometry import se3
+from operators.geometry import se3
+from operators.geometry.pinhole import Pixels, Points, project
+from operators.geometry.se3 import Matrix
 from operators.odometry.alignment import PixelTerm, PlaneTerm, PriorTerm, Term, align
-from operators.odometry.camera import Pixels, Points, RgbdCamera, project
+from operators.odometry.camera import RgbdCamera
 from operators.odometry.features import Gray, OrbMatcher, detect_corners, track_corners, with_exposure_of
 from operators.odometry.keyframe import Keyframe, view_distance
 from operators.odometry.motion import Motion
-from operators.odometry.se3 import Matrix
 from operators.odometry.surface import DepthNoise, Surface, scaled_intrinsics
 
 # Share of the summed information that is believed. Neighbouring residuals err together (depth noise is smooth

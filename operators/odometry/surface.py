@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.odometry.se3 import Matrix
+from operators.geometry.se3 import Matrix
 
 Array32 = NDArray[np.float32]
 

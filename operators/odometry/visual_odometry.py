@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from dataflow.messages import CameraInfo, DepthImage, Image, Odometry, Transforms
 from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.cloud.cloud_builder import transform_between
+from operators.geometry.calibration import check_calibration
+from operators.geometry.extrinsics import transform_between
+from operators.geometry.se3 import about_fixed_axes
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.memory import from_plain, to_plain
 from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, State
-from operators.odometry.se3 import Matrix
 from operators.odometry.surface import DepthNoise
 
 
@@ -70,8 +68,8 @@ class VisualOdometry(Operator):
         extrinsics: Transforms | None = None,
     ) -> Odometry:
         """Raises ValueError where an image does not fit its calibration, or no transform fits."""
-        _check("image", image, image_info)
-        _check("depth", depth, depth_info)
+        check_calibration("image", image, image_info)
+        check_calibration("depth", depth, depth_info)
         result = self._tracking(image_info, depth_info, extrinsics).track(image.data, depth.data, depth.stamp)
         return Odometry.from_matrix(
             result.T_world_camera,
@@ -121,21 +119,3 @@ class VisualOdometry(Operator):
             patience_s=self.patience,
             give_up_s=self.patience + self.give_up,
         )
-
-
-def about_fixed_axes(covariance: Matrix, T_world_camera: Matrix) -> NDArray[np.float64]:
-    """Covariance (6, 6) of (position, rotation about the world's axes) from a right perturbation's."""
-    A = np.zeros((6, 6))
-    A[:3, :3] = A[3:, 3:] = T_world_camera[:3, :3]
-    return A @ covariance @ A.T
-
-
-def _check(port: str, image: Image | DepthImage, info: CameraInfo) -> None:
-    if (image.width, image.height) != (info.width, info.height):
-        raise ValueError(
-            f"{port} has {image.width}x{image.height} pixels, but {port}_info describes {info.width}x{info.height}"
-        )
-    if image.frame != info.frame:
-        raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")
-    if info.distortion is not None and np.any(info.distortion):
-        raise ValueError(f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first")

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.inference import ModelError, open_session
+
 if TYPE_CHECKING:
     import onnxruntime
 
@@ -21,7 +23,7 @@ KEY = "dataflow.network"
 _FOLDER = Path(__file__).parent
 
 
-class NetworkFileError(ValueError):
+class NetworkFileError(ModelError):
     """A network file that does not fit its use: names the file, what it has and what would be right."""
 
 
@@ -53,7 +55,7 @@ def open_network(file: Path, kind: str) -> Network:
 
     Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`).
     """
-    session = _session(file)
+    session = open_session(file)
     facts = _facts(file, session)
     if facts.get("kind") != kind:
         raise NetworkFileError(f"{file} is a {facts.get('kind')}; a {kind} is needed: `dataflow train {kind} DATA`")
@@ -69,7 +71,7 @@ def open_network(file: Path, kind: str) -> Network:
 
 def read_facts(file: Path) -> dict[str, Any]:
     """The metadata of a network file. Raises NetworkFileError."""
-    return _facts(file, _session(file))
+    return _facts(file, open_session(file))
 
 
 def training_seed(file: Path) -> int:
@@ -95,20 +97,3 @@ def _facts(file: Path, session: onnxruntime.InferenceSession) -> dict[str, Any]:
     if missing:
         raise NetworkFileError(f"{file}: metadata {KEY!r} lacks {', '.join(missing)}")
     return dict(facts)
-
-
-def _session(file: Path) -> onnxruntime.InferenceSession:
-    import onnxruntime  # heavy, and needed only where a network runs
-
-    if not file.is_file():
-        raise FileNotFoundError(f"no network file {str(file)!r} (looked for {file.absolute()})")
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.use_deterministic_compute = True
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # onnxruntime's exception classes share no public base
-        raise NetworkFileError(f"{file} cannot be loaded as an ONNX model: {error}") from error

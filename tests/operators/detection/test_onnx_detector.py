@@ -10,7 +10,7 @@ import pytest
 
 from dataflow.messages import Image
 from operators.detection import OnnxDetector
-from operators.detection.onnx_detector import ModelError
+from operators.inference import ModelError
 
 onnx = pytest.importorskip("onnx")
 

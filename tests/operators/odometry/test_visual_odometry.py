@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
 from dataflow.messages.geometry import invert
-from operators.odometry import VisualOdometry, se3
+from operators.geometry import se3
+from operators.odometry import VisualOdometry
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, Status, TrackResult
 

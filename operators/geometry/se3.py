@@ -11,13 +11,13 @@ Vector = NDArray[np.float64]
 
 
 def skew(v: Vector) -> Matrix:
-    """The (3, 3) matrix of the cross product v ×."""
+    """Returns the (3, 3) matrix of the cross product v ×."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def exp(twist: Vector) -> Matrix:
-    """The motion (4, 4) of a twist (6,)."""
+    """Returns the motion (4, 4) of a twist (6,)."""
     v, w = twist[:3], twist[3:]
     angle = float(np.linalg.norm(w))
     W = skew(w)
@@ -34,7 +34,7 @@ def exp(twist: Vector) -> Matrix:
 
 
 def log(T: Matrix) -> Vector:
-    """The twist (6,) of a motion (4, 4), |rotation| < pi."""
+    """Returns the twist (6,) of a motion (4, 4); |rotation| ≤ pi, at pi with either sign of the axis."""
     R, p = T[:3, :3], T[:3, 3]
     vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
     sine, cosine = float(np.linalg.norm(vee)), (float(np.trace(R)) - 1.0) / 2.0
@@ -53,7 +53,7 @@ def log(T: Matrix) -> Vector:
 
 
 def adjoint(T: Matrix) -> Matrix:
-    """(6, 6) such that T exp(x) T^-1 = exp(adjoint(T) x)."""
+    """Returns the (6, 6) for which T exp(x) T^-1 = exp(adjoint(T) x)."""
     R = T[:3, :3]
     out = np.zeros((6, 6))
     out[:3, :3] = out[3:, 3:] = R
@@ -62,9 +62,16 @@ def adjoint(T: Matrix) -> Matrix:
 
 
 def orthonormalised(T: Matrix) -> Matrix:
-    """The nearest rigid motion to a nearly rigid matrix: products of many motions drift off SO(3)."""
+    """Returns the nearest rigid motion to a nearly rigid matrix: products of many motions drift off SO(3)."""
     u, _, vt = np.linalg.svd(T[:3, :3])
     out = np.eye(4)
     out[:3, :3] = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     out[:3, 3] = T[:3, 3]
     return out
+
+
+def about_fixed_axes(covariance: Matrix, T_world_body: Matrix) -> Matrix:
+    """Returns the covariance (6, 6) of (position, rotation about the world's axes) of that of a right perturbation."""
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = T_world_body[:3, :3]
+    return A @ covariance @ A.T

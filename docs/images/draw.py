@@ -1,0 +1,253 @@
+"""Draws the pictures of docs/design.md as SVG: `python docs/images/draw.py`.
+
+The picture of time is computed: the aligner that ships decides what it shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from xml.sax.saxutils import escape
+
+from dataflow.sync import Aligner, AlignSpec, BatchSpec, Entry, Firing, SampledSpec, TriggerSpec
+
+HERE = Path(__file__).parent
+MS = 1_000_000
+INK, FAINT, BLUE, GREEN, ORANGE, RED, VIOLET = (
+    "#1f2430",
+    "#98a1b3",
+    "#2f6fde",
+    "#1c8c5a",
+    "#c46a13",
+    "#c2303a",
+    "#7a4fc9",
+)
+
+
+class Drawing:
+    """Collects the elements of one SVG picture."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._size = (width, height)
+        self._items: list[str] = []
+
+    def line(
+        self,
+        x1: float,
+        y1: float,
+        x2: float,
+        y2: float,
+        color: str = INK,
+        *,
+        width: float = 1.5,
+        arrow: bool = False,
+        dashes: str = "",
+    ) -> None:
+        end = ' marker-end="url(#arrow)"' if arrow else ""
+        dash = f' stroke-dasharray="{dashes}"' if dashes else ""
+        self._items.append(
+            f'<line x1="{x1:g}" y1="{y1:g}" x2="{x2:g}" y2="{y2:g}" stroke="{color}" stroke-width="{width:g}"'
+            f"{end}{dash}/>"
+        )
+
+    def dot(self, x: float, y: float, color: str, *, filled: bool = True, radius: float = 6) -> None:
+        fill = color if filled else "#ffffff"
+        self._items.append(
+            f'<circle cx="{x:g}" cy="{y:g}" r="{radius:g}" fill="{fill}" stroke="{color}" stroke-width="2"/>'
+        )
+
+    def box(
+        self, x: float, y: float, w: float, h: float, color: str, *, fill: str = "#ffffff", dashes: str = ""
+    ) -> None:
+        dash = f' stroke-dasharray="{dashes}"' if dashes else ""
+        self._items.append(
+            f'<rect x="{x:g}" y="{y:g}" width="{w:g}" height="{h:g}" rx="6" fill="{fill}" stroke="{color}" '
+            f'stroke-width="1.5"{dash}/>'
+        )
+
+    def text(self, x: float, y: float, words: str, color: str = INK, *, size: int = 14, anchor: str = "start") -> None:
+        self._items.append(
+            f'<text x="{x:g}" y="{y:g}" fill="{color}" font-size="{size}" text-anchor="{anchor}" '
+            f'paint-order="stroke" stroke="#ffffff" stroke-width="4">{escape(words)}</text>'
+        )
+
+    def svg(self) -> str:
+        width, height = self._size
+        head = (
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" viewBox="0 0 {width} {height}" '
+            'font-family="Helvetica, Arial, sans-serif">\n'
+            '<defs><marker id="arrow" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7" '
+            f'orient="auto-start-reverse"><path d="M0 0 L10 5 L0 10 z" fill="{INK}"/></marker></defs>\n'
+            f'<rect width="{width}" height="{height}" fill="#ffffff"/>\n'
+        )
+        return head + "\n".join(self._items) + "\n</svg>\n"
+
+
+# Time
+
+STREAMS: Mapping[str, tuple[int, ...]] = {
+    "color": (10, 43, 76, 110, 143),
+    "depth": (13, 46, 113, 146),
+    "pose": (5, 55, 105, 152),
+    "imu": tuple(range(0, 150, 10)),
+}
+SPEC = AlignSpec(
+    triggers=(TriggerSpec("color", ("color",)), TriggerSpec("depth", ("depth",))),
+    sampled=(SampledSpec("pose", ("pose",)),),
+    batches=(BatchSpec("imu", ("imu",)),),
+    tolerance=10 * MS,
+)
+
+
+def decide() -> tuple[list[Firing], list[tuple[str, int]]]:
+    """The firings of `SPEC` for `STREAMS`, and the messages dropped: (stream, ms)."""
+    aligner = Aligner(SPEC)
+    firings: list[Firing] = []
+    for stream, stamps in STREAMS.items():
+        for seq, stamp in enumerate(stamps):
+            aligner.push(stream, Entry(stamp * MS, seq=seq))
+    while (firing := aligner.poll()) is not None:
+        firings.append(firing)
+    return firings, [(d.stream, d.stamp // MS) for d in aligner.take_drops()]
+
+
+def entries_of(firing: Firing) -> Iterable[tuple[str, int]]:
+    for value in firing.inputs.values():
+        for entry in value if isinstance(value, tuple) else (value,):
+            if isinstance(entry, Entry):
+                yield entry.stream, entry.stamp // MS
+
+
+def time() -> str:
+    firings, dropped = decide()
+    drawing = Drawing(1000, 470)
+    rows = {"color": 70, "depth": 130, "pose": 190, "imu": 250}
+    colors = {"color": BLUE, "depth": BLUE, "pose": GREEN, "imu": ORANGE}
+    notes = {
+        "color": "In: triggers, the anchor of the join",
+        "depth": "In, tolerance 10 ms",
+        "pose": "Sampled: the newest at or before",
+        "imu": "Batch: all since the last firing",
+    }
+
+    def x(ms: float) -> float:
+        return 270 + ms * 4.6
+
+    drawing.text(20, 30, "One operator, four inputs: event time decides what each firing is given", size=17)
+    for firing in firings:
+        at = firing.stamp / MS
+        drawing.line(x(at), 55, x(at), 330, FAINT, width=1, dashes="4 4")
+        for stream, stamp in entries_of(firing):
+            drawing.line(x(stamp), rows[stream], x(at), 330, colors[stream], width=1)
+    for stream, y in rows.items():
+        drawing.text(20, y - 2, stream, colors[stream], size=16)
+        drawing.text(20, y + 16, notes[stream], FAINT, size=12)
+        drawing.line(x(-3), y, x(155), y, FAINT, width=1)
+        for stamp in STREAMS[stream]:
+            lost = (stream, stamp) in dropped
+            drawing.dot(
+                x(stamp), y, RED if lost else colors[stream], filled=not lost, radius=4 if stream == "imu" else 6
+            )
+            if lost:
+                drawing.text(x(stamp), y - 12, "unmatched: dropped, counted", RED, size=12, anchor="middle")
+        last = STREAMS[stream][-1]
+        drawing.line(x(last), y - 10, x(last), y + 10, VIOLET, width=3)
+    drawing.text(20, 336, "firings", size=16)
+    for firing in firings:
+        at = firing.stamp / MS
+        drawing.box(x(at) - 40, 330, 80, 30, INK, fill="#eef2fb")
+        drawing.text(x(at), 350, f"t = {at:g} ms", size=12, anchor="middle")
+        drawing.text(
+            x(at), 378, f"{sum(s == 'imu' for s, _ in entries_of(firing))} imu", ORANGE, size=12, anchor="middle"
+        )
+    drawing.line(x(-3), 410, x(155), 410, arrow=True)
+    drawing.text(x(155), 430, "event time (timestamps of messages)", size=12, anchor="end")
+    drawing.line(30, 448, 30, 462, VIOLET, width=3)
+    legend = "frontier (watermark): no later message has a timestamp at or before it."
+    legend += " 143 ms is undecided until imu's reaches it."
+    drawing.text(42, 460, legend, VIOLET, size=13)
+    return drawing.svg()
+
+
+# One firing
+
+
+def firing() -> str:
+    drawing = Drawing(1000, 520)
+    columns = {"producer": 90, "aligner": 290, "operator": 480, "firing log": 670, "subscribers": 870}
+    drawing.text(20, 30, "One firing, in the process of the operator", size=17)
+    for name, at in columns.items():
+        drawing.box(at - 65, 48, 130, 32, INK, fill="#eef2fb")
+        drawing.text(at, 69, name, anchor="middle")
+        drawing.line(at, 80, at, 500, FAINT, width=1, dashes="4 4")
+    steps = [
+        ("producer", "aligner", "messages and frontiers, in any order"),
+        ("aligner", "aligner", "decides: timestamp t and its messages"),
+        ("aligner", "subscribers", "frontier t − 1: nothing earlier will come"),
+        ("aligner", "operator", "seeds the generators, calls process()"),
+        ("operator", "operator", "returns messages by port"),
+        ("operator", "firing log", "record: inputs by reference, outputs by digest"),
+        ("firing log", "firing log", "kept in memory that outlives the process"),
+        ("operator", "subscribers", "messages: no message without a record"),
+    ]
+    for number, (start, end, words) in enumerate(steps):
+        y = 118 + 48 * number
+        a, b = columns[start], columns[end]
+        if start == end:
+            drawing.dot(a, y, BLUE, radius=4)
+            drawing.text(a + 12, y + 5, f"{number + 1}. {words}", size=13)
+        else:
+            drawing.line(a, y, b, y, arrow=True)
+            drawing.text((a + b) / 2, y - 7, f"{number + 1}. {words}", size=13, anchor="middle")
+    return drawing.svg()
+
+
+# Processes
+
+
+def processes() -> str:
+    drawing = Drawing(1000, 470)
+    drawing.text(20, 30, "The processes of a run", size=17)
+    drawing.box(330, 50, 170, 44, INK, fill="#eef2fb")
+    drawing.text(415, 77, "supervisor", anchor="middle")
+    drawing.box(600, 50, 170, 44, INK, fill="#eef2fb")
+    drawing.text(685, 77, "nursery", anchor="middle")
+    drawing.line(500, 72, 600, 72, arrow=True)
+    drawing.text(550, 62, "fork", size=12, anchor="middle")
+    places = {"source": 60, "detector": 280, "odometry": 500}
+    for name, x in places.items():
+        drawing.box(x, 200, 170, 60, BLUE)
+        drawing.text(x + 85, 226, f"process '{name}'", BLUE, anchor="middle")
+        drawing.text(x + 85, 246, "operators, one thread", FAINT, size=12, anchor="middle")
+        drawing.line(415, 94, x + 85, 200, FAINT, dashes="5 4")
+    drawing.text(60, 110, "control channel: a socket pair each;", FAINT, size=12)
+    drawing.text(60, 126, "carries progress and commands, no data", FAINT, size=12)
+    for name, x, words in (("@recorder", 390, "FILE.mcap"), ("@view", 610, "FILE.rrd")):
+        drawing.box(x, 340, 150, 50, GREEN)
+        drawing.text(x + 75, 362, name, GREEN, anchor="middle")
+        drawing.text(x + 75, 380, "takes everything", FAINT, size=12, anchor="middle")
+        drawing.line(x + 75, 390, x + 75, 430, GREEN, arrow=True)
+        drawing.text(x + 75, 448, words, anchor="middle")
+    drawing.line(60, 300, 760, 300, INK, width=5)
+    drawing.text(60, 324, "Zenoh and shared memory", size=13)
+    drawing.text(60, 342, "every edge lossless, in order", FAINT, size=12)
+    for x in places.values():
+        drawing.line(x + 75, 260, x + 75, 298, arrow=True)
+        drawing.line(x + 95, 298, x + 95, 260, arrow=True)
+    for x in (465, 685):
+        drawing.line(x, 302, x, 340, arrow=True)
+    drawing.box(800, 200, 170, 190, ORANGE, dashes="6 4")
+    drawing.text(885, 226, "tools that attach", ORANGE, anchor="middle")
+    for number, words in enumerate(("viewer", "echo, hz, top", "param")):
+        drawing.text(885, 262 + 26 * number, words, anchor="middle")
+    drawing.text(885, 352, "taps: copies that", FAINT, size=12, anchor="middle")
+    drawing.text(885, 368, "may be skipped", FAINT, size=12, anchor="middle")
+    drawing.line(760, 300, 800, 300, ORANGE, dashes="5 4", arrow=True)
+    return drawing.svg()
+
+
+PICTURES = {"time.svg": time, "firing.svg": firing, "processes.svg": processes}
+
+if __name__ == "__main__":
+    for name, draw in PICTURES.items():
+        (HERE / name).write_text(draw(), encoding="utf-8")

@@ -1,0 +1,1 @@
+"""Geometry that many operators share: rigid motions, pinhole cameras, calibrations, extrinsics."""

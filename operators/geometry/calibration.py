@@ -1,0 +1,22 @@
+"""Images against their calibrations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dataflow.messages import CameraInfo, DepthImage, Image
+
+
+def check_calibration(port: str, image: DepthImage | Image, info: CameraInfo) -> None:
+    """Raises ValueError unless an image has the size and frame of its calibration, which must be without distortion.
+
+    `port` names the input; its calibration is named `<port>_info`.
+    """
+    if (image.width, image.height) != (info.width, info.height):
+        raise ValueError(
+            f"{port} has {image.width}x{image.height} pixels, but {port}_info describes {info.width}x{info.height}"
+        )
+    if image.frame != info.frame:
+        raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")
+    if info.distortion is not None and np.any(info.distortion):
+        raise ValueError(f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first")

@@ -1,0 +1,26 @@
+"""Extrinsics: the transform between the frames of two sensors of one robot."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dataflow.messages import Transforms
+from dataflow.messages.geometry import invert
+from operators.geometry.se3 import Matrix
+
+
+def transform_between(extrinsics: Transforms | None, source: str, target: str) -> Matrix:
+    """Returns `T_target_source` (4, 4): the identity where the frames are one or no extrinsics are given.
+
+    Raises ValueError where the extrinsics do not relate the two frames directly, in either direction.
+    """
+    if extrinsics is None or source == target:
+        return np.eye(4)
+    known = list(zip(extrinsics.frames, extrinsics.child_frames, strict=True))
+    if (target, source) in known:
+        T_target_source: Matrix = extrinsics.matrices()[known.index((target, source))]
+        return T_target_source
+    if (source, target) in known:
+        return invert(extrinsics.matrices()[known.index((source, target))])
+    listed = ", ".join(f"{child} in {parent}" for parent, child in known) or "none"
+    raise ValueError(f"extrinsics hold no transform between {source!r} and {target!r}; they hold {listed}")

@@ -1,0 +1,26 @@
+"""The pinhole camera: optical frame (z forward, x right, y down), pixels (u, v), intrinsics K (3, 3) in pixels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.geometry.se3 import Matrix
+
+Points = NDArray[np.float64]
+Pixels = NDArray[np.float64]
+
+
+def unproject(pixels: Pixels, K: Matrix) -> Points:
+    """Returns rays (N, 3) with z = 1 through pixels (N, 2)."""
+    return np.column_stack(
+        [(pixels[:, 0] - K[0, 2]) / K[0, 0], (pixels[:, 1] - K[1, 2]) / K[1, 1], np.ones(len(pixels))]
+    )
+
+
+def project(points: Points, K: Matrix) -> Pixels:
+    """Returns pixels (N, 2) of points (N, 3), metres; points at or behind the camera land far outside any image."""
+    z = points[:, 2]
+    safe = np.where(z > 1e-3, z, 1e-9)
+    uv = np.column_stack([points[:, 0] / safe * K[0, 0] + K[0, 2], points[:, 1] / safe * K[1, 1] + K[1, 2]])
+    return np.clip(np.where((z > 1e-3)[:, None], uv, -1e6), -1e6, 1e6)

@@ -1,0 +1,151 @@
+"""Path latencies are what the wall times of the records say, along the critical path."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from dataflow.analysis.latency import latencies
+from dataflow.cli.main import app
+from dataflow.graph import load_text
+from dataflow.graph.model import Graph
+from dataflow.records.firing import WITHHELD, Emission, FiringRecord
+from dataflow.sync import InputRef, MessageRef, RunRef
+
+sys.path.append(str(Path(__file__).resolve().parent))
+
+MS = 1_000_000
+DIAMOND = """
+graph: diamond
+operators:
+  camera: {use: latency_operators:Device}
+  lidar: {use: latency_operators:Device}
+  fast: {use: latency_operators:Relay, inputs: {x: camera/value}}
+  slow: {use: latency_operators:Relay, inputs: {x: camera/value}}
+  join: {use: latency_operators:Join, inputs: {a: fast/y, b: slow/y, hint: lidar/value}}
+"""
+TIMER = """
+graph: timer
+operators:
+  camera: {use: latency_operators:Device}
+  gather: {use: latency_operators:Gather, inputs: {recent: camera/value}}
+"""
+
+
+def record(
+    operator: str, index: int, begin: float, work: float, inputs: Mapping[str, InputRef] | None = None, seq: int = -2
+) -> FiringRecord:
+    """A call that began at `begin` ms and took `work` ms, and emitted its `index`-th message, or that of `seq`."""
+    output = Emission(index if seq == -2 else seq, index, bytes(16))
+    return FiringRecord(
+        operator,
+        0,
+        index,
+        "fire",
+        index,
+        inputs=inputs or {},
+        outputs=(output,),
+        wall_start=round(begin * MS),
+        duration=round(work * MS),
+    )
+
+
+def message(graph: Graph, operator: str, seq: int) -> MessageRef:
+    return MessageRef(next(iter(graph.nodes[operator].outputs.values())), 0, seq)
+
+
+@pytest.fixture
+def diamond() -> Graph:
+    return load_text(DIAMOND)
+
+
+def one_round(graph: Graph, index: int, begin: float, slow: float) -> dict[str, list[FiringRecord]]:
+    """The camera gives at `begin`; `fast` works 1 ms, `slow` as long as said, the join 2 ms after a wait of 3."""
+    camera, end = message(graph, "camera", index), begin + 1 + slow
+    return {
+        "camera": [record("camera", index, begin, 0.5)],
+        "fast": [record("fast", index, begin + 1, 1, {"x": camera})],
+        "slow": [record("slow", index, begin + 1, slow, {"x": camera})],
+        "join": [
+            record(
+                "join",
+                index,
+                end + 3,
+                2,
+                {"a": message(graph, "fast", index), "b": message(graph, "slow", index), "hint": None},
+            )
+        ],
+    }
+
+
+def test_a_latency_ends_with_the_sink_and_is_shared_along_the_critical_path(diamond: Graph) -> None:
+    (path,) = latencies(diamond, one_round(diamond, 0, 100, slow=10))
+    assert (path.source, path.sink, path.count) == ("camera", "join", 1)
+    assert path.p50 == path.largest == 16 * MS
+    assert [(s.operator, s.work / MS, s.wait / MS) for s in path.shares] == [
+        ("camera", 0.5, 0),
+        ("slow", 10, 0.5),
+        ("join", 2, 3),
+    ]
+    assert path.costliest == "slow"
+
+
+def test_percentiles_are_over_all_firings(diamond: Graph) -> None:
+    rounds = [one_round(diamond, k, 100.0 * k, slow=10 + k) for k in range(101)]
+    (path,) = latencies(diamond, {name: [r for each in rounds for r in each[name]] for name in rounds[0]})
+    assert (path.count, path.p50, path.p99, path.largest) == (101, 66 * MS, 115 * MS, 116 * MS)
+
+
+def test_what_is_sampled_causes_nothing_while_there_is_a_trigger(diamond: Graph) -> None:
+    given = one_round(diamond, 0, 100, slow=10)
+    join = given["join"][0]
+    given["lidar"] = [record("lidar", 0, 1, 0.5)]
+    given["join"] = [record("join", 0, 114, 2, {**join.inputs, "hint": message(diamond, "lidar", 0)})]
+    assert [path.source for path in latencies(diamond, given)] == ["camera"]
+
+
+def test_a_timer_is_caused_by_the_newest_message_of_its_batch() -> None:
+    graph = load_text(TIMER)
+    stream = next(iter(graph.nodes["camera"].outputs.values()))
+    camera = [record("camera", k, 10.0 * k, 0.5) for k in range(5)]
+    gather = [record("gather", 0, 50, 1, {"recent": (RunRef(stream, 0, 0, 4),)})]
+    (path,) = latencies(graph, {"camera": camera, "gather": gather})
+    assert path.p50 == 11 * MS
+
+
+def test_firings_whose_causes_are_not_recorded_are_left_out(diamond: Graph) -> None:
+    given = one_round(diamond, 0, 100, slow=10)
+    given["camera"] = []
+    assert latencies(diamond, given) == []
+
+
+def test_a_message_that_was_not_sent_causes_nothing(diamond: Graph) -> None:
+    given = one_round(diamond, 0, 100, slow=10)
+    camera = message(diamond, "camera", 0)
+    given["slow"] = [record("slow", 0, 101, 10, {"x": camera}, seq=WITHHELD)]
+    (path,) = latencies(diamond, given)
+    assert [s.operator for s in path.shares] == ["camera", "fast", "join"]
+
+
+def test_the_command_prints_every_path_of_a_recording(tmp_path: Path, repository: Path) -> None:
+    recording = tmp_path / "run.mcap"
+    graph = repository / "graphs" / "synthetic_rgbd.yaml"
+    runner = CliRunner()
+    arguments = ["run", str(graph), "--one-host", "--quiet", "--set", "camera.frames=5", "--record", str(recording)]
+    assert runner.invoke(app, arguments).exit_code == 0
+    result = runner.invoke(app, ["latency", str(recording), "--json"])
+    assert result.exit_code == 0, result.output
+    paths = json.loads(result.output)
+    assert paths
+    for path in paths:
+        assert 0 < path["p50_ms"] <= path["p99_ms"] <= path["max_ms"]
+        assert path["count"] <= 5
+        assert path["shares"][0]["operator"] == path["source"]
+        assert path["shares"][-1]["operator"] == path["sink"]
+    printed = runner.invoke(app, ["latency", str(recording)])
+    assert paths[0]["sink"] in printed.output

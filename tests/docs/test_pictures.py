@@ -1,0 +1,19 @@
+"""The pictures of the design page are what their script draws."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+
+def test_the_pictures_of_the_design_page_are_current(repository: Path) -> None:
+    script = repository / "docs" / "images" / "draw.py"
+    spec = importlib.util.spec_from_file_location("draw", script)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    page = (repository / "docs" / "design.md").read_text(encoding="utf-8")
+    for name, draw in module.PICTURES.items():
+        assert (script.parent / name).read_text(encoding="utf-8") == draw(), f"run {script.relative_to(repository)}"
+        assert f"(images/{name})" in page

@@ -1,0 +1,74 @@
+"""Extrinsics are found in either direction; images must fit their calibration."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.messages import CameraInfo, Image, Transforms
+from dataflow.messages.geometry import invert, split_matrix, transform_points
+from operators.geometry import se3
+from operators.geometry.calibration import check_calibration
+from operators.geometry.extrinsics import transform_between
+
+T_depth_color = se3.exp(np.array([0.02, -0.01, 0.03, 0.05, -0.02, 0.1]))
+
+
+def transforms(parent: str, child: str, T: np.ndarray) -> Transforms:
+    position, orientation = split_matrix(T)
+    return Transforms(
+        stamp=0,
+        frames=(parent,),
+        child_frames=(child,),
+        translations=position[None],
+        rotations=orientation[None],
+    )
+
+
+@given(st.integers(0, 100))
+def test_both_directions_map_the_same_point(seed: int) -> None:
+    points = np.random.default_rng(seed).normal(size=(5, 3))
+    expected = transform_points(T_depth_color, points)
+    for extrinsics in (
+        transforms("depth", "color", T_depth_color),
+        transforms("color", "depth", invert(T_depth_color)),
+    ):
+        found = transform_between(extrinsics, "color", "depth")
+        np.testing.assert_allclose(transform_points(found, points), expected, atol=1e-12)
+
+
+def test_one_frame_needs_no_extrinsics() -> None:
+    np.testing.assert_array_equal(transform_between(None, "a", "b"), np.eye(4))
+    np.testing.assert_array_equal(transform_between(transforms("x", "y", T_depth_color), "a", "a"), np.eye(4))
+
+
+def test_frames_that_are_not_related_are_named() -> None:
+    with pytest.raises(ValueError, match="no transform between 'depth' and 'lidar'; they hold color in depth"):
+        transform_between(transforms("depth", "color", T_depth_color), "depth", "lidar")
+
+
+def info(**changes: object) -> CameraInfo:
+    given = {"stamp": 0, "frame": "camera", "width": 4, "height": 3, "K": np.diag([5.0, 5.0, 1.0])}
+    return CameraInfo(**given | changes)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("calibration", "words"),
+    [
+        (info(width=5), "image has 4x3 pixels, but image_info describes 5x3"),
+        (info(frame="other"), "image is in frame 'camera', but image_info in 'other'"),
+        (info(distortion_model="plumb_bob", distortion=np.array([0.1, 0, 0, 0, 0])), "has lens distortion"),
+    ],
+)
+def test_an_image_that_does_not_fit_its_calibration_is_refused(calibration: CameraInfo, words: str) -> None:
+    image = Image(stamp=0, frame="camera", data=np.zeros((3, 4, 3), np.uint8))
+    with pytest.raises(ValueError, match=words):
+        check_calibration("image", image, calibration)
+
+
+def test_an_image_that_fits_is_taken() -> None:
+    image = Image(stamp=0, frame="camera", data=np.zeros((3, 4, 3), np.uint8))
+    check_calibration("image", image, info())
+    check_calibration("image", image, info(distortion_model="plumb_bob", distortion=np.zeros(5)))
