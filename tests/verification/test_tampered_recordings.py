@@ -10,8 +10,9 @@ import pytest
 from tampering import Kept, as_it_is, duplicated, ended, tampered
 
 from dataflow.messages import FeatureVector, Imu, Message
-from dataflow.recording import Recorded
+from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import FiringRecord
+from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.verification.gate import Checked, check
 from dataflow.verification.verify import verify
 
@@ -202,3 +203,11 @@ def test_an_end_of_a_stream_that_cannot_be_read_is_an_error_of_the_recording(kep
     assert one.report is None
     assert "how stream 'kept/robot/imu' ended cannot be read" in one.error
     assert not one.internal
+
+
+def test_the_graph_in_the_file_is_not_even_read_where_another_is_named(kept: Path, tmp_path: Path) -> None:
+    with Recording(kept) as recording:
+        graph = recorded_graph(recording)
+    path = tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:graph": {"bundle": "no graph"}})
+
+    assert verify(path, graph=graph).identical
