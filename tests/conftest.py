@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from pathlib import Path
 
 import hypothesis
@@ -12,6 +13,7 @@ hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=No
 hypothesis.settings.load_profile("repeatable")
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path += [str(REPOSITORY / "tests" / "support"), str(REPOSITORY / "tools")]
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -29,7 +30,30 @@ Start = Annotated[
 End = Annotated[
     float | None, typer.Option("--end", metavar="SECONDS", help="End so long after the recording's first message.")
 ]
+ModuleFolders = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--path",
+        metavar="DIR",
+        help="Look for the operators' modules in DIR too, before the current folder. May be repeated.",
+    ),
+]
 Overwrite = Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace output files that exist.")]
+
+
+def number(low: float, high: float, meaning: str) -> Callable[[str], float]:
+    """A parser of numbers from `low` to `high`, for `typer.Option(parser=...)`; `meaning` goes into its error."""
+
+    def parse(word: str) -> float:
+        try:
+            value = float(word)
+        except ValueError:
+            value = math.nan
+        if not low <= value <= high:
+            raise typer.BadParameter(f"{word}: expected a number from {low:g} to {high:,.0f} ({meaning})")
+        return value
+
+    return parse
 
 
 def existing(path: Path, what: str) -> Path:
@@ -47,6 +71,17 @@ def existing(path: Path, what: str) -> Path:
         raise fail(f"no file {path}: there is no folder {folder}")
     near = nearest(path.name, sorted(p.name for p in folder.iterdir() if p.is_file()))
     raise fail(f"no file {path}" + (f"; did you mean {folder / near}?" if near else f"; expected {what}"))
+
+
+def find_modules_in(folders: Sequence[Path] | None) -> None:
+    """Lets operators be found in `folders` and in the current folder, after installed packages."""
+    from dataflow.graph.search import add_current_folder, add_folder
+
+    for folder in folders or ():
+        if not folder.is_dir():
+            raise fail(f"--path {folder}: no such folder")
+        add_folder(folder)
+    add_current_folder()
 
 
 def output_file(path: Path, suffix: str, *, overwrite: bool, option: str) -> Path:

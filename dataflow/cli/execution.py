@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,13 @@ from dataflow.cli.arguments import (
     FLAG,
     End,
     GraphFile,
+    ModuleFolders,
     RecordingFile,
     Settings,
     Start,
     existing,
+    find_modules_in,
+    number,
     output_file,
     span,
     window,
@@ -32,23 +36,23 @@ if TYPE_CHECKING:
 
 _PLACEMENT, _OUTPUT = "Placement", "Results"
 
-OneHost = Annotated[
+OneProcess = Annotated[
     bool,
-    typer.Option("--one-host", metavar=FLAG, rich_help_panel=_PLACEMENT, help="Run all operators in one process."),
+    typer.Option("--one-process", metavar=FLAG, rich_help_panel=_PLACEMENT, help="Run all operators in one process."),
 ]
-HostEach = Annotated[
+ProcessEach = Annotated[
     bool,
     typer.Option(
-        "--host-each", metavar=FLAG, rich_help_panel=_PLACEMENT, help="Run every operator in a process of its own."
+        "--process-each", metavar=FLAG, rich_help_panel=_PLACEMENT, help="Run every operator in a process of its own."
     ),
 ]
 Place = Annotated[
     list[str] | None,
     typer.Option(
         "--place",
-        metavar="OPERATOR=HOST",
+        metavar="OPERATOR=PROCESS",
         rich_help_panel=_PLACEMENT,
-        help="Run OPERATOR in the process HOST. May be repeated.",
+        help="Run OPERATOR in the process of that name. May be repeated.",
     ),
 ]
 Record = Annotated[
@@ -85,13 +89,19 @@ Json = Annotated[
 ]
 Rate = Annotated[
     float | None,
-    typer.Option("--rate", metavar="RATE", help="Pace: 1 is real time. Default: as fast as the graph goes."),
+    typer.Option(
+        "--rate",
+        metavar="RATE",
+        parser=number(0.001, 1000, "1 is real time"),
+        help="Pace: 1 is real time. Default: as fast as the graph goes.",
+    ),
 ]
-Patience = Annotated[
+Timeout = Annotated[
     float,
     typer.Option(
-        "--patience",
+        "--timeout",
         metavar="SECONDS",
+        parser=number(0.1, 1e6, "seconds"),
         help="Give up after so long without any progress, and when the operators take longer to be set up.",
     ),
 ]
@@ -124,8 +134,9 @@ class _Outputs:
 def run(
     graph: GraphFile,
     settings: Settings = None,
+    path: ModuleFolders = None,
     rate: Rate = None,
-    patience: Patience = 120.0,
+    timeout: Timeout = 120.0,
     live: Live = False,
     paranoid: Paranoid = False,
     chaos: Annotated[
@@ -136,8 +147,8 @@ def run(
         int | None, typer.Option("--chaos-seed", metavar="N", help="Another seed than the plan's own.")
     ] = None,
     quiet: Quiet = False,
-    one_host: OneHost = False,
-    host_each: HostEach = False,
+    one_process: OneProcess = False,
+    process_each: ProcessEach = False,
     place: Place = None,
     record: Record = None,
     view: View = None,
@@ -156,10 +167,11 @@ def run(
       dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --view spawn
       dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
-      dataflow run graphs/synthetic_rgbd.yaml --host-each --rate 1 --json
+      dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
+    began = time.monotonic()
     from dataflow.chaos.plan import load_plan
     from dataflow.graph import load_graph
     from dataflow.supervision.run import run as run_graph
@@ -167,14 +179,23 @@ def run(
     with friendly_errors():
         if chaos_seed is not None and chaos is None:
             raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+        find_modules_in(path)
         live = live or chaos is not None
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
         outputs = _outputs(record, view, open_view, overwrite)
-        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid, patience)
+        options = _options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live
         if chaos is not None:
             options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
-        _execute(lambda watch: run_graph(loaded, watch=watch, **options), loaded, outputs, None, json=json, quiet=quiet)
+        _execute(
+            lambda watch: run_graph(loaded, watch=watch, **options),
+            loaded,
+            outputs,
+            None,
+            began=began,
+            json=json,
+            quiet=quiet,
+        )
 
 
 def replay(
@@ -184,14 +205,15 @@ def replay(
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
     settings: Settings = None,
+    path: ModuleFolders = None,
     start: Start = None,
     end: End = None,
     rate: Rate = None,
-    patience: Patience = 120.0,
+    timeout: Timeout = 120.0,
     paranoid: Paranoid = False,
     quiet: Quiet = False,
-    one_host: OneHost = False,
-    host_each: HostEach = False,
+    one_process: OneProcess = False,
+    process_each: ProcessEach = False,
     place: Place = None,
     record: Record = None,
     view: View = None,
@@ -234,6 +256,7 @@ def replay(
       dataflow replay run.mcap --record again.mcap --view again.rrd --open
       dataflow replay thin.mcap --complete full.mcap
     """
+    began = time.monotonic()
     from dataflow.graph import load_graph
     from dataflow.recording import Recording
     from dataflow.reexecution.recorded_run import recorded_graph
@@ -246,6 +269,7 @@ def replay(
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
         with Recording(recording) as opened:
             if graph is None:
                 loaded = recorded_graph(opened)
@@ -253,7 +277,7 @@ def replay(
                 loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
             if complete is not None:
                 alone = (start, end, rate, record, view, place) == (None,) * 6
-                if not alone or open_view or one_host or host_each or paranoid:
+                if not alone or open_view or one_process or process_each or paranoid:
                     raise fail(
                         "--complete repeats a run as it was, in one process: of the other options only --graph, "
                         "--set, --overwrite, --quiet and --json go with it"
@@ -263,11 +287,12 @@ def replay(
             whole = span(opened, plan_replay(opened, loaded).streams)
             begin, finish = window(whole, start, end, recording)
             if opened.torn:
-                say(f"[yellow]{recording} has no proper end:[/] what its writer had not stored when it died is missing")
+                name = escape(str(recording))
+                say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
             if begin is not None:
                 _say_what_begins_fresh(opened, loaded)
         outputs = _outputs(record, view, open_view, overwrite)
-        options = _options(loaded, outputs, one_host, host_each, place, rate, paranoid, patience)
+        options = _options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         shown = None
         if whole is not None:
             shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
@@ -276,6 +301,7 @@ def replay(
             loaded,
             outputs,
             shown,
+            began=began,
             json=json,
             quiet=quiet,
         )
@@ -287,7 +313,7 @@ def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
 
     for node in graph.nodes.values():
         if not node.source and (reason := fresh_because(recording, graph, node)) is not None:
-            say(f"[yellow]{node.name} begins with fresh state:[/] {escape(reason)}")
+            say(f"[yellow]{escape(node.name)} begins with fresh state:[/] {escape(reason)}")
 
 
 def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:
@@ -329,41 +355,37 @@ def _outputs(record: Path | None, view: str | None, open_view: bool, overwrite: 
 def _options(
     graph: Graph,
     outputs: _Outputs,
-    one_host: bool,
-    host_each: bool,
+    one_process: bool,
+    process_each: bool,
     place: list[str] | None,
     rate: float | None,
     paranoid: bool,
-    patience: float,
+    timeout: float,
 ) -> dict[str, Any]:
-    if not 0 < patience < float("inf"):
-        raise fail(f"--patience {patience:g}: expected seconds, more than 0")
-    if rate is not None and not 0 < rate < float("inf"):
-        raise fail(f"--rate {rate:g}: expected a number above 0; 1 is real time")
     return {
-        "placement": _placement(graph, one_host, host_each, place),
+        "placement": _placement(graph, one_process, process_each, place),
         "record": outputs.record,
         "overwrite": outputs.overwrite,
         "view_file": outputs.view_file,
         "rate": rate,
         "paranoid": paranoid,
-        "stall_timeout": patience,
-        "start_timeout": patience,
+        "stall_timeout": timeout,
+        "start_timeout": timeout,
     }
 
 
-def _placement(graph: Graph, one_host: bool, host_each: bool, place: list[str] | None) -> Any:
-    if one_host + host_each + bool(place) > 1:
-        raise fail("--one-host, --host-each and --place exclude each other")
+def _placement(graph: Graph, one_process: bool, process_each: bool, place: list[str] | None) -> Any:
+    if one_process + process_each + bool(place) > 1:
+        raise fail("--one-process, --process-each and --place exclude each other")
     if not place:
-        return "one_host" if one_host else "host_each" if host_each else "graph"
+        return "one_host" if one_process else "host_each" if process_each else "graph"
     placement = {}
     for word in place:
-        operator, separator, host = word.partition("=")
-        if not separator or not host or operator not in graph.nodes:
+        operator, separator, process = word.partition("=")
+        if not separator or not process or operator not in graph.nodes:
             known = ", ".join(graph.nodes)
-            raise fail(f"--place {word!r}: expected OPERATOR=HOST with an operator of the graph ({known})")
-        placement[operator] = host
+            raise fail(f"--place {word!r}: expected OPERATOR=PROCESS with an operator of the graph ({known})")
+        placement[operator] = process
     return placement
 
 
@@ -373,6 +395,7 @@ def _execute(
     outputs: _Outputs,
     shown_span: tuple[int, int] | None,
     *,
+    began: float,
     json: bool,
     quiet: bool,
 ) -> None:
@@ -390,9 +413,9 @@ def _execute(
         _say_what_is_left(before)
         raise
     if json:
-        print_json(report_json(report))
+        print_json({**report_json(report), "total_s": time.monotonic() - began})
     else:
-        print_report(out, report)
+        print_report(out, report, total=time.monotonic() - began)
     if outputs.open_file and outputs.view_file is not None:
         open_saved(outputs.view_file)
     if report.interrupted:
@@ -408,4 +431,4 @@ def _say_what_is_left(before: dict[Path, tuple[int, int] | None]) -> None:
     """After a failure: which files hold what came before it, other than those that were there already."""
     for file, earlier in before.items():
         if file.exists() and _written(file) != earlier:
-            say(f"[dim]{file} ({size(file.stat().st_size)}) holds what came before the failure[/]")
+            say(f"[dim]{escape(str(file))} ({size(file.stat().st_size)}) holds what came before the failure[/]")

@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, GraphFile, Json, Settings, existing
-from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say
+from dataflow.cli.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, existing, find_modules_in
+from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say, visible
 
 if TYPE_CHECKING:
     from dataflow.graph.catalogue import Catalogue
@@ -19,12 +20,13 @@ if TYPE_CHECKING:
 def check(
     graphs: Annotated[list[Path], typer.Argument(metavar="GRAPH...", help="Graph files (.yaml).")],
     settings: Settings = None,
+    path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
     """Check graph files wholly, without running them.
 
-    Names, streams, types, parameters, cycles, hosts. Exit code 0: all are sound; 1: one has faults; 2: one cannot be
-    read.
+    Names, streams, types, parameters, cycles, processes. Exit code 0: all are sound; 1: one has faults; 2: one cannot
+    be read.
 
     Examples:
 
@@ -35,24 +37,25 @@ def check(
 
     faults: list[Problem] = []
     faulty = 0
-    for path in graphs:
-        existing(path, "a graph file")
-    for path in graphs:
+    for file in graphs:
+        existing(file, "a graph file")
+    find_modules_in(path)
+    for file in graphs:
         with friendly_errors():
             try:
-                graph = load_graph(path, settings=settings or ())
+                graph = load_graph(file, settings=settings or ())
             except GraphError as error:
                 faults += error.problems
                 faulty += 1
                 if not json:
                     out.print(
-                        Text.assemble(("faults", "bold red"), f"  {path}: {plural(len(error.problems), 'fault')}")
+                        Text.assemble(("faults", "bold red"), f"  {file}: {plural(len(error.problems), 'fault')}")
                     )
                     out.print(Text(str(error)), soft_wrap=True)
                 continue
         if not json:
             what = f"{plural(len(graph.nodes), 'operator')}, {plural(len(graph.streams), 'stream')}"
-            out.print(Text.assemble(("ok", "green"), f"  {path}: {what}"), soft_wrap=True)
+            out.print(Text.assemble(("ok", "green"), f"  {file}: {what}"), soft_wrap=True)
     if json:
         print_json({"ok": not faults, "problems": [problem.to_json() for problem in faults]})
     elif len(graphs) > 1 and faulty:
@@ -64,34 +67,32 @@ def check(
 def show(
     graph: GraphFile,
     settings: Settings = None,
+    path: ModuleFolders = None,
     mermaid: Annotated[bool, typer.Option("--mermaid", metavar=FLAG, help="Print a Mermaid flowchart.")] = False,
-    svg: Annotated[Path | None, typer.Option("--svg", metavar="FILE.svg", help="Write a picture.")] = None,
+    svg: Annotated[str | None, typer.Option("--svg", hidden=True)] = None,
     json: Json = False,
 ) -> None:
-    """Show a graph: hosts, operators, what each takes and makes.
+    """Show a graph: processes, operators, what each takes and makes.
 
     Examples:
 
       dataflow show graphs/synthetic_rgbd.yaml
-      dataflow show graphs/synthetic_rgbd.yaml --svg graph.svg
       dataflow show graphs/synthetic_rgbd.yaml --mermaid
+      dataflow show graphs/synthetic_rgbd.yaml --json
     """
     from dataflow.graph import draw, load_graph
 
     with friendly_errors():
-        if json + mermaid + (svg is not None) > 1:
-            raise fail("--json, --mermaid and --svg exclude each other")
-        if svg is not None and svg.suffix != ".svg":
-            raise fail(f"--svg {svg}: expected a file name that ends in .svg")
+        if svg is not None:
+            raise fail("--svg is gone: --mermaid prints a flowchart, which GitHub, editors and mermaid.live draw")
+        if json and mermaid:
+            raise fail("--json and --mermaid exclude each other")
+        find_modules_in(path)
         loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
         if json:
             print_json(loaded.to_json())
         elif mermaid:
-            print(draw.mermaid(loaded))
-        elif svg is not None:
-            svg.parent.mkdir(parents=True, exist_ok=True)
-            svg.write_text(draw.svg(loaded), encoding="utf-8")
-            out.print(Text(f"wrote {svg}"), soft_wrap=True)
+            print(visible(draw.mermaid(loaded)))
         else:
             out.print(draw.tree(loaded))
 
@@ -101,6 +102,7 @@ def operators(
         str | None,
         typer.Argument(metavar="NAME", help="One operator: its ports, parameters and documentation."),
     ] = None,
+    path: ModuleFolders = None,
     json: Json = False,
 ) -> None:
     """List the operators that are installed, or describe one.
@@ -114,6 +116,7 @@ def operators(
     from dataflow.graph import catalogue
 
     with friendly_errors():
+        find_modules_in(path)
         found = catalogue.discover()
         if name is None:
             if json:
@@ -142,4 +145,4 @@ def _print_operators(found: Catalogue) -> None:
         out.print(Padding(Text(flow, style="dim"), (0, 0, 0, 4)))
         out.print(Padding(Text(spec.doc.partition("\n\n")[0].replace("\n", " ")), (0, 0, 0, 4)))
     for failure in found.failures:
-        say(f"[red]failed to import[/] {failure}")
+        say(f"[red]failed to import[/] {escape(str(failure))}")

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from dataflow.cli.arguments import Json, RecordingFile, existing
+from dataflow.cli.arguments import Json, ModuleFolders, RecordingFile, existing, find_modules_in
 from dataflow.cli.output import count, fail, friendly_errors, out, print_json, table
 
 if TYPE_CHECKING:
     from dataflow.analysis.latency import PathLatency
 
 
-def latency(recording: RecordingFile, json: Json = False) -> None:
+def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json = False) -> None:
     """Print the latency of every path of a recorded run, from source to sink.
 
     The time runs from the moment a source gave a message to the end of the sink's firing that the message caused. It is
@@ -30,6 +30,7 @@ def latency(recording: RecordingFile, json: Json = False) -> None:
     from dataflow.recording import Recording
     from dataflow.reexecution.recorded_run import recorded_graph
 
+    find_modules_in(folders)
     with friendly_errors(), Recording(existing(recording, "a recording")) as opened:
         found = recorded_latencies(opened, recorded_graph(opened))
     if not found:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json as json_module
+import os
 import time
 from collections import deque
 from collections.abc import Iterator
@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, Json, chosen_streams
@@ -19,10 +20,10 @@ from dataflow.cli.output import (
     count,
     fail,
     friendly_errors,
-    jsonable,
     out,
     plural,
     print_json,
+    print_json_line,
     say,
     seconds,
     table,
@@ -37,13 +38,19 @@ if TYPE_CHECKING:
 
 GraphName = Annotated[
     str | None,
-    typer.Option("--graph", metavar="NAME", help="Which running graph, by name or process, when several run."),
+    typer.Option(
+        "--graph",
+        metavar="NAME",
+        help="Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
+    ),
 ]
 Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", help="Wait so long for the graph to run.")]
 Streams = Annotated[
     list[str] | None, typer.Argument(metavar="STREAM...", help="Streams; wildcards work. Default: all.")
 ]
 
+GRAPH_VARIABLE = "DATAFLOW_GRAPH"
+"""Environment variable: the running graph that is meant where `--graph` is not given."""
 SHOWN_ELEMENTS = 16
 """Arrays and lists up to this length are printed whole."""
 HISTORY = 2000
@@ -54,6 +61,7 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
     """The running graph of that name, or the only one; says so when it has to wait. Raises `NotRunning`."""
     from dataflow.client.attach import NotRunning, find_running
 
+    name = name or os.environ.get(GRAPH_VARIABLE) or None
     if not 0 <= wait < 1e9:
         raise fail(f"--wait {wait:g}: expected seconds, 0 or more")
     try:
@@ -61,7 +69,7 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
     except NotRunning:
         if not wait:
             raise
-    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else name} to run")
+    say(f"waiting up to {seconds(wait)} for {'a graph' if name is None else escape(name)} to run")
     return find_running(name, wait=wait)
 
 
@@ -105,11 +113,11 @@ def list_running(json: Json = False) -> None:
                 f", running for {seconds(time.time() - found.started)}",
             )
         )
-        streams = table("stream", "type", "taken by")
+        streams = table("stream", "type", "subscribers")
         for stream in graph.streams.values():
             takers = ", ".join(f"{node.name}.{port}" for node, port in graph.consumers(stream.name))
             kind = " | ".join(stream.types) + (" (static)" if stream.static else "")
-            streams.add_row(Text(graph.relative(stream.name)), Text(kind), Text(takers or "nobody"))
+            streams.add_row(Text(graph.relative(stream.name)), Text(kind), Text(takers or "no subscribers"))
         out.print(streams)
 
 
@@ -136,7 +144,7 @@ def echo(
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Annotated[
-        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line; numbers unrounded.")
+        bool, typer.Option("--json", metavar=FLAG, help="One JSON object a line: all data, numbers unrounded.")
     ] = False,
 ) -> None:
     """Print the messages of a running graph, as they come.
@@ -178,9 +186,9 @@ def echo(
 
 def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> None:
     if json:
-        values = {name: _json_value(value, full) for name, value in message.items() if value is not None}
+        values = {name: value for name, value in message.items() if value is not None}
         line = {"stream": stream, "type": message.SCHEMA, **values}
-        print(json_module.dumps(line, ensure_ascii=False, allow_nan=False), flush=True)
+        print_json_line(line)
         return
     from dataflow.sync.stamps import format_stamp
 
@@ -189,14 +197,6 @@ def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> 
     width = max((len(name) for name, _ in fields), default=0)
     for name, value in fields:
         out.print(Text.assemble(f"  {name:<{width}}  ", _text(value, full)), soft_wrap=True)
-
-
-def _json_value(value: Any, full: bool) -> Any:
-    import numpy as np
-
-    if isinstance(value, np.ndarray) and not full and value.size > SHOWN_ELEMENTS:
-        return f"{value.dtype}{list(value.shape)}"
-    return jsonable(value)
 
 
 def _text(value: Any, full: bool) -> str:
@@ -260,8 +260,8 @@ def hz(
 ) -> None:
     """Show the rates of a running graph's streams.
 
-    By the clock, by event time (the stamps), and the bandwidth. Messages that are skipped here are counted all the
-    same. Ends with the graph, after --seconds, or at Ctrl-C.
+    By the clock, by event time (the timestamps), and the bandwidth; `total` counts since the graph began. Messages that
+    are skipped here are counted all the same. Ends with the graph, after --seconds, or at Ctrl-C.
 
     Examples:
 
@@ -316,7 +316,7 @@ def _take_rate(rates: dict[str, _Rate], taken: TapMessage) -> None:
 
 
 def _rate_table(rates: dict[str, _Rate], namespace: str) -> Table:
-    numbers = ("messages", "Hz", "Hz by stamp", "kB each", "MB/s")
+    numbers = ("total", "Hz", "Hz by stamp", "kB each", "MB/s")
     shown = table("stream", *numbers, right=numbers)
     for stream, rate in sorted(rates.items()):
         row = rate.row(stream)

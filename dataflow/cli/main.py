@@ -15,7 +15,8 @@ from rich.markup import escape
 from dataflow.cli import execution, inspection, latency, live, param, recordings, top, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
-from dataflow.cli.plugins import CommandGroup
+from dataflow.cli.plugins import CommandGroup, renamed
+from dataflow.cli.start import OutputFailed
 
 app = typer.Typer(
     name="dataflow",
@@ -24,7 +25,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["--help", "-h"]},
+    context_settings={"help_option_names": ["--help", "-h"], "token_normalize_func": renamed},
 )
 
 
@@ -51,7 +52,7 @@ def dataflow(
         ),
     ] = False,
 ) -> None:
-    """Robot perception as a dataflow graph: run it live, record it, replay it bit for bit, see it.
+    """Deterministic record and replay for robot perception: run a graph live, record it, replay it bit for bit, see it.
 
     Results go to standard output, progress and errors to standard error.
 
@@ -113,11 +114,11 @@ app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 
 def main() -> None:
-    """The console script. Operators may lie in the folder it is called from."""
-    if "" not in sys.path and os.getcwd() not in sys.path:
-        sys.path.insert(0, os.getcwd())
+    """Calls the command that the arguments name."""
     try:
         app()
+    except OutputFailed:
+        raise
     except Exception as error:  # a fault of ours, or of a plug-in
         if wants_traceback():
             err.print(escape(traceback.format_exc().rstrip()), soft_wrap=True)
@@ -128,4 +129,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    from dataflow.cli.start import main as start
+
+    if not sys.flags.safe_path:
+        del sys.path[0]  # the current folder: what lies there must not replace installed modules
+    start()

@@ -5,16 +5,18 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import typer
 from rich import box
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
+from rich.segment import Segment
 from rich.table import Table
 
 DIFFERENT = 1
@@ -31,10 +33,31 @@ PIPE_WIDTH = 120
 """Columns of tables that go into a file or a pipe, unless COLUMNS says otherwise."""
 
 
+_INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
+"""Characters that move the cursor, change the terminal or turn the direction of text; all but tab and line feed."""
+
+
+def visible(text: str) -> str:
+    """`text` with control characters written out: names in recordings and graphs may hold anything."""
+    return _INVISIBLE.sub(lambda match: f"\\x{ord(match[0]):02x}" if ord(match[0]) < 256 else _escaped(match), text)
+
+
+def _escaped(match: re.Match[str]) -> str:
+    return f"\\u{ord(match[0]):04x}"
+
+
+class _VisibleConsole(Console):
+    """Passes everything that is printed through `visible`; styles and cursor movements of its own stay."""
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else segment._replace(text=visible(segment.text))
+
+
 def _console(*, stderr: bool) -> Console:
     stream = sys.stderr if stderr else sys.stdout
     piped = not stream.isatty() and "COLUMNS" not in os.environ
-    return Console(stderr=stderr, highlight=False, width=PIPE_WIDTH if piped else None)
+    return _VisibleConsole(stderr=stderr, highlight=False, width=PIPE_WIDTH if piped else None)
 
 
 out = _console(stderr=False)
@@ -42,8 +65,18 @@ err = _console(stderr=True)
 
 
 def print_json(value: Any) -> None:
-    """One JSON document on standard output."""
-    print(json.dumps(jsonable(value), indent=2, ensure_ascii=False, allow_nan=False))
+    """Prints one JSON document on standard output."""
+    print(_json(value, indent=2))
+
+
+def print_json_line(value: Any) -> None:
+    """Prints one JSON value on a line of its own, at once."""
+    print(_json(value), flush=True)
+
+
+def _json(value: Any, indent: int | None = None) -> str:
+    text = json.dumps(jsonable(value), indent=indent, ensure_ascii=False, allow_nan=False)
+    return _INVISIBLE.sub(_escaped, text)
 
 
 def jsonable(value: Any) -> Any:
@@ -132,6 +165,8 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
             return f"\n{error}", "", COULD_NOT_RUN
         case RunFailed():
             details = own_traceback(error.details) if error.internal else error.details
+            if _about_a_file(error.details) and not wants_traceback():
+                details = ""  # the message names the file; where in the operator it was opened does not help
             return str(error), details, INTERRUPTED if error.interrupted else DIFFERENT
         case BrokenPipeError():
             return None
@@ -140,6 +175,15 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         case _ if isinstance(error, known) or (viewer is not None and isinstance(error, viewer.ViewerError)):
             return str(error), "", COULD_NOT_RUN
     return None
+
+
+_FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", "PermissionError", "DatasetError")
+
+
+def _about_a_file(details: str) -> bool:
+    """Whether a traceback ends with a file that is missing or cannot be read."""
+    last = details.rstrip().rpartition("\n")[2].partition(":")[0]
+    return details.startswith("Traceback") and last.rpartition(".")[2] in _FILE_ERRORS
 
 
 def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:

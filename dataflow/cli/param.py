@@ -6,11 +6,12 @@ import json as json_module
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json
+from dataflow.cli.arguments import FLAG, Json, find_modules_in
 from dataflow.cli.live import GraphName, Wait, running_graph
-from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, say, table
+from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, print_json_line, say, table
 
 if TYPE_CHECKING:
     from dataflow.client.processes import Parameter
@@ -88,7 +89,10 @@ def get(
                 known = did_you_mean(name, parameters, "its parameters")
                 raise fail(f"{operator!r} has no parameter {name!r}: {known}")
             shown = parameters[name].value
-            print(json_module.dumps(jsonable(shown), ensure_ascii=False) if json else _text(shown))
+            if json:
+                print_json_line(shown)
+            else:
+                out.print(Text(_text(shown)), soft_wrap=True)
     elif json:
         print_json({op: {n: p.value for n, p in parameters.items()} for op, parameters in values.items()})
     else:
@@ -133,7 +137,7 @@ def list_(
             shown.add_row(*(Text(cell) for cell in (*cells, row["bounds"], row["doc"])))
         out.print(shown)
     else:
-        say(f"no parameter of {found.name} can change while it runs")
+        say(f"no parameter of {escape(found.name)} can change while it runs")
     _say_who_is_missing(operators, values, timeout)
 
 
@@ -203,6 +207,7 @@ def _declared(graph: Graph, operator: str, name: str) -> dict[str, str]:
     from dataflow.graph.catalogue import parameters
     from dataflow.graph.model import OperatorImportError
 
+    find_modules_in(None)
     try:
         rows = parameters(graph.nodes[operator].operator)
     except OperatorImportError:

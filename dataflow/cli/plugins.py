@@ -17,6 +17,7 @@ import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
+from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, err, fail, say, wants_traceback
 
 GROUP = "dataflow.commands"
@@ -28,6 +29,18 @@ BROKEN_PANEL = "Commands that do not load"
 def advertised() -> Mapping[str, EntryPoint]:
     """The commands that installed packages supply, by name, in alphabetical order."""
     return {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value))}
+
+
+RENAMED = {"one-host": "one-process", "host-each": "process-each", "patience": "timeout"}
+"""Options by their names of the version before, which still work in this one."""
+
+
+@cache
+def renamed(word: str) -> str:
+    """The name that an option has now; says so, once, where it is called by its former one."""
+    if word in RENAMED:
+        say(f"[dim]--{word} is now --{RENAMED[word]}; the old name ends with the next version[/]")
+    return RENAMED.get(word, word)
 
 
 class CommandGroup(TyperGroup):
@@ -46,10 +59,13 @@ class CommandGroup(TyperGroup):
         if present is None and cmd_name in advertised():
             self._added.add(cmd_name)
             self.add_command(load(advertised()[cmd_name]), cmd_name)
-            return super().get_command(ctx, cmd_name)
+            present = super().get_command(ctx, cmd_name)
+        if present is not None:
+            tidy(present, ctx)
         return present
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
+        tidy(self, ctx)
         super().format_help(ctx, formatter)
         for name in advertised():
             if name in self.commands and name not in self._added:
@@ -61,6 +77,18 @@ class CommandGroup(TyperGroup):
             for name in advertised():  # so that they are suggested too
                 self.get_command(ctx, name)
         return super().resolve_command(ctx, args)
+
+
+def tidy(command: Any, ctx: Any) -> None:
+    """Makes the help of a command and its subcommands alike: no type beside flags, no options to install completion."""
+    command.params = [p for p in command.params if p.name not in ("install_completion", "show_completion")]
+    own = type(ctx)(command, help_option_names=ctx.help_option_names)
+    for param in (*command.params, command.get_help_option(own)):
+        if getattr(param, "is_bool_flag", False) and param.metavar is None and not param.secondary_opts:
+            param.metavar = FLAG
+    for inner in getattr(command, "commands", {}).values():
+        if inner is not command:
+            tidy(inner, ctx)
 
 
 def load(entry: EntryPoint) -> Any:

@@ -17,6 +17,8 @@ from dataflow.supervision.report import OperatorCounts, Status
 from dataflow.supervision.run import Watch
 from dataflow.sync import FOREVER, NEVER
 
+NAMED = 3
+"""Processes that are waited for and named at most."""
 RATE_OVER = 0.8
 """Seconds over which rates are taken."""
 
@@ -59,7 +61,8 @@ class RunDisplay:
         if self.began is None and status.phase != "starting":
             self.began = time.monotonic()
         total, completed = self.fraction(status)
-        note = " · ".join(part for part in (self.reached(status), self._clock(total, completed)) if part)
+        parts = (waiting_for(status), self.reached(status), self._clock(total, completed))
+        note = " · ".join(part for part in parts if part)
         self._bar.update(self._task, description=status.phase, total=total, completed=completed, note=note)
 
     def fraction(self, status: Status) -> tuple[float | None, float]:
@@ -100,7 +103,7 @@ class RunDisplay:
         now = time.monotonic()
         table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
         table.add_column("operator", overflow="fold")
-        table.add_column("host", style="dim", overflow="fold")
+        table.add_column("process", style="dim", overflow="fold")
         for name in ("firings", "Hz", "out", "dropped", "busy", "lag"):
             table.add_column(name, justify="right", no_wrap=True)
         front = max((c.done for c in status.operators.values() if c.done not in (NEVER, FOREVER)), default=None)
@@ -118,6 +121,14 @@ class RunDisplay:
                 _lag(counts, front),
             )
         return table
+
+
+def waiting_for(status: Status) -> str:
+    """The processes that a start is waiting for, in words."""
+    if not status.waiting:
+        return ""
+    more = len(status.waiting) - NAMED
+    return f"waiting for {', '.join(status.waiting[:NAMED])}" + (f" and {more} more" if more > 0 else "")
 
 
 def _lag(counts: OperatorCounts, front: int | None) -> str:
@@ -152,6 +163,7 @@ def _line_printer(console: Console, display: RunDisplay, every: float = 5.0) -> 
         if now >= due or status.phase != phase:
             due, phase = now + every, status.phase
             spent = seconds(time.time() - status.started) if status.started else ""
-            console.print(f"{status.phase:<8}  {spent:>8}  {display.reached(status)}".rstrip(), soft_wrap=True)
+            note = waiting_for(status) or display.reached(status)
+            console.print(Text(f"{status.phase:<8}  {spent:>8}  {note}".rstrip()), soft_wrap=True)
 
     return watch

@@ -52,6 +52,7 @@ def info(
     """
     from dataflow.recording import Recording
     from dataflow.recording.info import describe
+    from dataflow.recording.layout import RECORDING
 
     with friendly_errors(), Recording(existing(recording, "a recording")) as opened:
         described = describe(opened)
@@ -59,7 +60,7 @@ def info(
     if json:
         print_json(described.as_json() | ({} if computed is None else {"digests": computed}))
         return
-    namespace = described.metadata.get("recording", {}).get("namespace", "")
+    namespace = described.metadata.get(RECORDING, {}).get("namespace", "")
     out.print(_facts(described))
     out.print(_streams(described, namespace))
     if described.events:
@@ -72,6 +73,7 @@ def info(
 
 
 def _facts(described: Description) -> Table:
+    from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RUN
     from dataflow.sync.stamps import format_stamp
 
     grid = Table.grid(padding=(0, 2))
@@ -86,15 +88,15 @@ def _facts(described: Description) -> Table:
     row("file", described.path)
     row("size", f"{size(described.bytes)}, {size(uncompressed)} uncompressed")
     row("written by", described.library + (f", profile {described.profile}" if described.profile else ""))
-    if "dataflow:graph" in made:
-        row("graph", f"{made['dataflow:graph'].get('name', '')}, namespace {made['recording'].get('namespace', '')}")
-    if "dataflow:run" in made:
-        row("made by", _made_by(made["dataflow:run"]))
+    if GRAPH in made:
+        row("graph", f"{made[GRAPH].get('name', '')}, namespace {made.get(RECORDING, {}).get('namespace', '')}")
+    if RUN in made:
+        row("made by", _made_by(made[RUN]))
     if "machine" in made:
         machine = made["machine"]
         row("machine", f"{machine.get('cpu', '')}, {machine.get('cores', '?')} cores, {machine.get('os', '')}")
-    if "dataflow:outcome" in made:
-        outcome = made["dataflow:outcome"].get("outcome", "")
+    if OUTCOME in made:
+        outcome = made[OUTCOME].get("outcome", "")
         row("outcome", outcome, "" if outcome == "complete" else "yellow")
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
@@ -124,8 +126,8 @@ def _streams(described: Description, namespace: str) -> Table:
     for s in described.streams:
         notes = ["static"] if s.static else []
         notes += [f"{s.incarnations} incarnations"] if s.incarnations > 1 else []
-        notes += ["not readable here"] if not s.readable else []
-        notes += ["declared otherwise now"] if s.declared_otherwise else []
+        notes += [f"unsupported encoding ({s.encoding})"] if not s.readable else []
+        notes += ["declared differently now"] if s.declared_otherwise else []
         kind = s.type if s.readable else f"{s.schema} ({s.encoding})" if foreign else s.schema
         rate = "" if s.rate is None or s.static else f"{s.rate:.2f}"
         row = (_relative(s.name, namespace), kind, count(s.count), rate, size(s.bytes), ", ".join(notes))
@@ -176,6 +178,7 @@ def diff(
     from dataflow.cli.arguments import chosen_streams
     from dataflow.recording import Recording
     from dataflow.recording.diff import diff as compare
+    from dataflow.recording.layout import RECORDING
 
     with (
         friendly_errors(),
@@ -184,7 +187,7 @@ def diff(
     ):
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a number, 0 or more")
-        spaces = {opened.metadata.get("recording", {}).get("namespace", "") for opened in (first, second)}
+        spaces = {opened.metadata.get(RECORDING, {}).get("namespace", "") for opened in (first, second)}
         namespace = spaces.pop() if len(spaces) == 1 else ""
         names = chosen_streams(streams, sorted({*first.streams, *second.streams}), namespace)
         report = compare(first, second, streams=names, tolerance=tolerance)

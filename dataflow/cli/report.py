@@ -19,12 +19,16 @@ _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
-def print_report(console: Console, report: RunReport) -> None:
-    """Operators, figures of metrics sinks side by side, drops, restarts, notes, files."""
+def print_report(console: Console, report: RunReport, *, total: float | None = None) -> None:
+    """Prints operators, figures of metrics sinks side by side, drops, restarts, notes, files.
+
+    `total`: seconds that the whole command took, with starting and closing its processes.
+    """
     title = Text.assemble(
         (report.graph, "bold"),
         ("  interrupted", "yellow") if report.interrupted else ("  complete", "green"),
         f"  {timing(report)}",
+        "" if total is None else f"; {seconds(total)} with start and end",
     )
     console.print(title)
     console.print(_operators(report))
@@ -52,7 +56,7 @@ def print_report(console: Console, report: RunReport) -> None:
 
 def _operators(report: RunReport) -> Table:
     """A row for each operator; Hz is firings per second of event time."""
-    numbers = ("firings", "out", "Hz", "dropped", "work", "per firing")
+    numbers = ("firings", "out", "Hz", "dropped", "CPU time", "per firing")
     made = table("operator", *numbers, right=numbers)
     span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
     for name, counts in report.operators.items():

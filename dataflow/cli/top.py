@@ -1,4 +1,4 @@
-"""`dataflow top`: how every operator of a running graph fares."""
+"""`dataflow top`: the status of every operator of a running graph."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from dataflow.client.processes import HostStatus
 
 ANSWER_WITHIN = 1.0
-"""Seconds after which a host counts as silent."""
+"""Seconds after which a process counts as silent."""
 CONNECT_WITHIN = 3.0
 
 _STYLES = {
@@ -52,7 +52,7 @@ class Row:
 
 @dataclass(slots=True)
 class Board:
-    """Turns what hosts say, again and again, into rows; an operator whose host says nothing keeps its last counts."""
+    """Turns what processes report into rows; an operator whose process does not answer keeps its last counts."""
 
     operators: Sequence[str]
     _hosts: dict[str, str] = field(default_factory=dict)
@@ -91,7 +91,7 @@ class Board:
                 health.load,
                 health.restarts,
                 lags[health.operator],
-                health.note if health.operator in answered else "its host does not answer",
+                health.note if health.operator in answered else "its process does not answer",
             )
             for health in healths
         ]
@@ -113,10 +113,10 @@ def top(
     wait: Wait = 0.0,
     json: Annotated[bool, typer.Option("--json", metavar=FLAG, help="Print one sample as JSON and end.")] = False,
 ) -> None:
-    """Show how every operator of a running graph fares: state, rates, drops, load, restarts and lag.
+    """Show the status of every operator of a running graph: state, rates, drops, load, restarts and lag.
 
     States: running, dropping (messages are lost to its queues and waits), silent (nothing for a while), starting,
-    ended, no answer (its host is being started again, or hangs). Rates and load are since the last update; lag is how
+    ended, no answer (its process is being restarted, or hangs). Rates and load are since the last update; lag is how
     far an operator's event time is behind the foremost one's. Ends with the graph, or at Ctrl-C.
 
     Examples:
@@ -164,7 +164,7 @@ def top(
     elif once or live is not None:
         out.print(_table(rows, _title(found.name, found.started)))
     if not once:
-        err.print(f"{found.name} has ended")
+        err.print(Text(f"{found.name} has ended"))
 
 
 def _title(name: str, started: float) -> Text:
@@ -172,11 +172,11 @@ def _title(name: str, started: float) -> Text:
 
 
 def _table(rows: Sequence[Row], title: Text) -> Table:
-    """Fits 80 columns; the host is named where it is not the operator's own."""
+    """Fits 80 columns; the process is named where it is not the operator's own."""
     made = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="dim")
     made.add_column("operator", overflow="fold", min_width=8)
     if any(row.host not in ("", row.operator) for row in rows):
-        made.add_column("host", overflow="ellipsis", no_wrap=True, style="dim", max_width=10)
+        made.add_column("process", overflow="ellipsis", no_wrap=True, style="dim", max_width=10)
     made.add_column("state", no_wrap=True)
     for heading in ("Hz", "drops/s", "dropped", "load", "restarts", "lag"):
         made.add_column(heading, justify="right", no_wrap=True)

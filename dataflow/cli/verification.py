@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from dataflow.cli.arguments import FLAG, Json, Settings, check_offset, existing, output_file
+from dataflow.cli.arguments import (
+    FLAG,
+    Json,
+    ModuleFolders,
+    Settings,
+    check_offset,
+    existing,
+    find_modules_in,
+    output_file,
+)
 from dataflow.cli.execution import Quiet
 from dataflow.cli.output import (
     COULD_NOT_RUN,
@@ -41,6 +50,7 @@ def verify(
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
     settings: Settings = None,
+    path: ModuleFolders = None,
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
     ] = None,
@@ -93,8 +103,12 @@ def verify(
         ),
     ] = None,
     quiet: Quiet = False,
-    one_host: Annotated[bool, typer.Option("--one-host", metavar=FLAG, help="Deprecated: means --jobs 1.")] = False,
-    host_each: Annotated[bool, typer.Option("--host-each", metavar=FLAG, help="Deprecated: has no effect.")] = False,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
+    ] = False,
+    process_each: Annotated[
+        bool, typer.Option("--process-each", metavar=FLAG, help="Deprecated: has no effect.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Re-execute recorded runs by their firing records, and compare every output.
@@ -126,13 +140,13 @@ def verify(
     from dataflow.verification.gate import Baseline, BaselineError, recordings_in
 
     with friendly_errors():
-        if one_host and host_each:
-            raise fail("--one-host and --host-each exclude each other")
-        if jobs is not None and (one_host or not 1 <= jobs <= MOST_JOBS):
-            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-host")
-        if one_host or host_each:
-            instead = "--jobs 1" if one_host else "nothing: each operator is fed from the recording"
-            say(f"[yellow]note:[/] {'--one-host' if one_host else '--host-each'} is deprecated; use {instead}")
+        if one_process and process_each:
+            raise fail("--one-process and --process-each exclude each other")
+        if jobs is not None and (one_process or not 1 <= jobs <= MOST_JOBS):
+            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-process")
+        if one_process or process_each:
+            instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
+            say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
         if first is not None and only is not None:
             raise fail("--from and --only exclude each other")
         if graph is None and settings:
@@ -157,6 +171,7 @@ def verify(
             known = None if baseline is None else Baseline.load(baseline)
         except BaselineError as error:
             raise fail(str(error)) from None
+        find_modules_in(path)
         loaded = None if graph is None else load_graph(existing(graph, "a graph file"), settings=settings or ())
         options: dict[str, Any] = {
             "graph": loaded,
@@ -164,7 +179,7 @@ def verify(
             "only": only,
             "tolerance": tolerance,
             "start": start,
-            "jobs": 1 if one_host else jobs,
+            "jobs": 1 if one_process else jobs,
         }
         single = len(recordings) == 1 and not recordings[0].is_dir()
         checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)

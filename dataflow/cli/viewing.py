@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.markup import escape
+from rich.text import Text
 
 from dataflow.cli.arguments import End, Overwrite, Start, chosen_streams, existing, output_file, span, window
 from dataflow.cli.live import GraphName, Wait, running_graph
@@ -104,21 +105,21 @@ def _view_recording(
     from rich.progress import BarColumn, Progress, TextColumn
 
     from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
+    from dataflow.recording.layout import RECORDING
+    from dataflow.reexecution.recorded_run import wiring
     from dataflow.view import Serve, from_recording
 
     with Recording(path) as opened:
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         if not readable:
             raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
-        namespace = opened.metadata.get("recording", {}).get("namespace", "")
+        namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(streams, readable, namespace)
         if not any(opened.streams[name].count for name in chosen):
             raise fail(f"{path} holds no message of {', '.join(chosen)}")
-        try:
-            graph = _showing(recorded_graph(opened), streams and chosen)
-        except ReplayError:
-            graph = None  # somebody else's recording: drawn without a graph
+        graph = wiring(opened)
+        if graph is not None:
+            graph = _showing(graph, streams and chosen)
         whole = span(opened, chosen)
         begin, finish = window(whole, start, end, path)
         first, last = whole or (0, 0)
@@ -163,7 +164,7 @@ class _Announcer:
         from dataflow.view import Serve
 
         if not self._done and isinstance(self._sink.target, Serve):
-            err.print(f"open {self._sink.target.url}", soft_wrap=True)  # whole, so that it can be clicked
+            err.print(Text(f"open {self._sink.target.url}"), soft_wrap=True)  # whole, so that it can be clicked
         self._done = True
 
     def before(self, progress: Callable[[int], None]) -> Callable[[int], None]:
@@ -188,7 +189,7 @@ def _view_running(
     with sink:
         sink.open({name: message_type(running.streams[name].types[0]) for name in chosen}, shown)
         _Announcer(sink).announce()
-        say(f"following {running.name} (process {found.pid})")
+        say(f"following {escape(running.name)} (process {found.pid})")
         with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
             while True:
                 taken = client.take(timeout=0.5)
@@ -258,15 +259,18 @@ def attached_viewer(target: str | None) -> Iterator[None]:
     if target is None:
         yield
         return
+    from dataflow.graph.search import import_path
+
     say(f"[dim]starting the viewer ({target})[/]")
     words = ["view", "--graph", str(os.getpid()), "--to", target, "--wait", "3600", "--until-end"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "dataflow.cli.main", *words],
+        [sys.executable, "-P", "-m", "dataflow.cli.main", *words],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
         process_group=0,
+        env={**os.environ, "PYTHONPATH": import_path()},
     )
     ready, following = threading.Event(), threading.Event()
     reader = threading.Thread(target=_relay, args=(process, ready, following), daemon=True)

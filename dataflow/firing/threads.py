@@ -6,6 +6,8 @@ import os
 import sys
 from typing import Any
 
+from dataflow.graph.search import import_path
+
 _VARIABLES = (
     "OMP_NUM_THREADS",
     "OPENBLAS_NUM_THREADS",
@@ -21,7 +23,7 @@ def environment(threads: int) -> dict[str, str]:
     """The environment of a host process: thread counts, the import path of this one, and hashing without a salt."""
     return {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+        "PYTHONPATH": import_path(),
         **dict.fromkeys(_VARIABLES, str(threads)),
         "PYTHONHASHSEED": "0",
         "DATAFLOW_THREADS": str(threads),

@@ -14,14 +14,13 @@ from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.error import MarkedYAMLError, YAMLError
+from ruamel.yaml.events import CollectionEndEvent, CollectionStartEvent
 from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.nodes import Node as YamlNode
 from ruamel.yaml.reader import ReaderError
 
+from dataflow.graph.limits import MAX_DIGITS, MAX_NESTING, MAX_TEXT, MAX_VALUES, Budget
 from dataflow.graph.problems import Place, Problems
-
-MAX_VALUES = 100_000
-"""Values in one file, aliases expanded: a file whose aliases multiply beyond that is refused."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +62,7 @@ class Table:
 
 Tree = Leaf | Items | Table
 
+NESTED_TOO_DEEP = f"values nest deeper than {MAX_NESTING} levels"
 _REFERENCE = re.compile(r"\$\{[^{}\n]*\}")
 _FLOW = "{}[],:#"
 _HIDDEN = "".join(chr(0xF8D0 + i) for i in range(len(_FLOW)))
@@ -74,8 +74,10 @@ def parse(text: str, file: str, problems: Problems, lines: Sequence[str] = ()) -
 
     `lines` is what messages show instead of the text's own lines.
     """
-    problems.texts[file] = lines or text.replace("\r\n", "\n").split("\n")
     start = Place(file, 1, 1)
+    if len(text) > MAX_TEXT:
+        problems.stop(start, f"the file has more than {MAX_TEXT:,} characters, which is the limit")
+    problems.texts[file] = lines or text.replace("\r\n", "\n").split("\n")
     if any(c in text for c in _HIDDEN):
         problems.add(start, f"the characters U+F8D0 to U+{ord(_HIDDEN[-1]):04X} are not allowed in a graph file")
         return None
@@ -85,7 +87,7 @@ def parse(text: str, file: str, problems: Problems, lines: Sequence[str] = ()) -
             return None
     hidden = _REFERENCE.sub(lambda match: match[0].translate(_HIDE), text)
     try:
-        node = YAML(typ="safe", pure=True).compose(hidden)
+        node = _yaml().compose(hidden)
     except MarkedYAMLError as error:
         _syntax(error, file, problems)
         return None
@@ -94,12 +96,34 @@ def parse(text: str, file: str, problems: Problems, lines: Sequence[str] = ()) -
         column = error.position - text.rfind("\n", 0, error.position)
         problems.add(Place(file, row, column), f"character U+{ord(text[error.position]):04X} is not allowed")
         return None
-    except (YAMLError, RecursionError) as error:
+    except RecursionError:
+        problems.add(_too_deep(hidden, file), NESTED_TOO_DEEP)
+        return None
+    except YAMLError as error:
         problems.add(start, f"not readable as YAML: {type(error).__name__}: {error}")
         return None
     if node is None:
         return None
     return _Builder(file, problems).build(node)
+
+
+def _yaml() -> YAML:
+    reader = YAML(typ="safe", pure=True)
+    reader.composer.warn_double_anchors = False
+    return reader
+
+
+def _too_deep(text: str, file: str) -> Place:
+    """The first value below more than `MAX_NESTING` others."""
+    depth = 0
+    for event in _yaml().parse(text):
+        if isinstance(event, CollectionStartEvent):
+            depth += 1
+            if depth > MAX_NESTING:
+                return Place(file, event.start_mark.line + 1, event.start_mark.column + 1)
+        elif isinstance(event, CollectionEndEvent):
+            depth -= 1
+    return Place(file, 1, 1)
 
 
 def plain(tree: Tree) -> Any:
@@ -172,39 +196,73 @@ Lookup = Callable[[Reference], Tree | None]
 """Gives the value of a reference; None when there is none, which it has then reported."""
 
 
-def substitute(tree: Tree, lookup: Lookup, problems: Problems) -> Tree:
-    """The tree with every `${...}` replaced. A value that is one reference keeps its type; `$${` stands for `${`."""
+def substitute(tree: Tree, lookup: Lookup, problems: Problems, budget: Budget, depth: int = 1) -> Tree:
+    """The tree with every `${...}` replaced. A value that is one reference keeps its type; `$${` stands for `${`.
+
+    What comes out is charged to `budget`: references multiply.
+    """
+    budget.charge(tree.place, 1)
+    if depth > MAX_NESTING:
+        problems.stop(tree.place, NESTED_TOO_DEEP)
     match tree:
         case Items():
-            return Items(tuple(substitute(item, lookup, problems) for item in tree.items), tree.place)
+            items = tuple(substitute(item, lookup, problems, budget, depth + 1) for item in tree.items)
+            return Items(items, tree.place)
         case Table():
-            entries = {k: Entry(e.key, substitute(e.value, lookup, problems)) for k, e in tree.entries.items()}
+            entries = {
+                k: Entry(e.key, substitute(e.value, lookup, problems, budget, depth + 1))
+                for k, e in tree.entries.items()
+            }
             return Table(entries, tree.place)
     if not isinstance(tree.value, str) or "${" not in tree.value:
         return tree
     whole = _REFERENCE.fullmatch(tree.value)
-    if whole is not None:
-        value = lookup(_reference(whole[0], tree.place, problems))
-        return Leaf(UNKNOWN, tree.place, tree.raw) if value is None else moved(value, tree.place)
+    if whole is None:
+        return _interpolated(tree, tree.value, lookup, problems, budget)
+    value = lookup(_reference(whole[0], tree.place, problems))
+    if value is None:
+        return Leaf(UNKNOWN, tree.place, tree.raw)
+    values, levels = _measured(value)
+    budget.charge(tree.place, values)
+    if depth + levels - 1 > MAX_NESTING:
+        problems.stop(tree.place, NESTED_TOO_DEEP)
+    return moved(value, tree.place)
+
+
+def _interpolated(leaf: Leaf, text: str, lookup: Lookup, problems: Problems, budget: Budget) -> Leaf:
+    """A text with references in it, as one text."""
     parts: list[str] = []
     end = 0
-    for match in _REFERENCE.finditer(tree.value):
-        parts.append(tree.value[end : match.start()])
+    for match in _REFERENCE.finditer(text):
+        parts.append(text[end : match.start()])
         end = match.end()
         if parts[-1].endswith("$"):
             parts.append(match[0][1:])
             continue
-        reference = _reference(match[0], tree.place, problems)
+        reference = _reference(match[0], leaf.place, problems)
         value = lookup(reference)
         if value is None:
-            return Leaf(UNKNOWN, tree.place, tree.raw)
+            return Leaf(UNKNOWN, leaf.place, leaf.raw)
         if not isinstance(value, Leaf):
             what = f"${{{reference.name}}} is {describe(value)}, which cannot stand inside a text"
             problems.add(reference.place, what)
-            return Leaf(UNKNOWN, tree.place, tree.raw)
+            return Leaf(UNKNOWN, leaf.place, leaf.raw)
         inner = value.value
         parts.append(str(inner).lower() if isinstance(inner, bool) else str(inner))
-    return Leaf("".join(parts) + tree.value[end:], tree.place, tree.raw)
+        budget.charge_text(leaf.place, len(parts[-1]))
+    return Leaf("".join(parts) + text[end:], leaf.place, leaf.raw)
+
+
+def _measured(tree: Tree) -> tuple[int, int]:
+    """(number of values, levels) of a tree."""
+    match tree:
+        case Leaf():
+            return 1, 1
+        case Items():
+            inner = [_measured(item) for item in tree.items]
+        case Table():
+            inner = [_measured(entry.value) for entry in tree.entries.values()]
+    return 1 + sum(values for values, _ in inner), 1 + max((levels for _, levels in inner), default=0)
 
 
 class _Unknown:
@@ -231,8 +289,8 @@ def unknown(tree: Tree) -> bool:
 def parse_scalar(text: str, place: Place) -> Leaf:
     """The text of an environment variable or of a default, as YAML reads a scalar; anything else is a text."""
     try:
-        node = YAML(typ="safe", pure=True).compose(text)
-    except YAMLError:
+        node = _yaml().compose(text)
+    except (YAMLError, RecursionError):
         return Leaf(text, place, text)
     if not isinstance(node, ScalarNode):
         return Leaf("" if node is None else text, place, text)
@@ -249,6 +307,10 @@ def _reference(text: str, around: Place, problems: Problems) -> Reference:
     column = line.find(text, around.column - 1)
     place = around if column < 0 else Place(around.file, around.line, column + 1, len(text))
     return Reference(name.strip(), default if colon else None, place)
+
+
+def _quoted(raw: str) -> str:
+    return f"{raw!r} in quotes for a text" if len(raw) <= 40 else "it in quotes for a text"
 
 
 def _syntax(error: MarkedYAMLError, file: str, problems: Problems) -> None:
@@ -281,12 +343,13 @@ class _Builder:
     def build(self, node: YamlNode) -> Tree:
         place = self.place(node)
         self.count += 1
-        if self.count > MAX_VALUES or any(node is outer for outer in self.open):
-            if self.count <= MAX_VALUES:
-                self.problems.add(place, "an alias (*) refers to the value it is part of")
-            elif self.count == MAX_VALUES + 1:
-                self.problems.add(place, f"more than {MAX_VALUES} values: aliases (*) multiply")
+        if any(node is outer for outer in self.open):
+            self.problems.add(place, "an alias (*) refers to the value it is part of")
             return Leaf(UNKNOWN, place)
+        if self.count > MAX_VALUES:
+            self.problems.stop(place, f"the file has more than {MAX_VALUES:,} values", "aliases (*) multiply them")
+        if len(self.open) >= MAX_NESTING:
+            self.problems.stop(place, NESTED_TOO_DEEP)
         tag = str(node.tag).removeprefix("tag:yaml.org,2002:")
         if isinstance(node, ScalarNode):
             return self.scalar(node, tag, place)
@@ -333,7 +396,8 @@ class _Builder:
                     return self.refuse(
                         place, f"{raw} is octal to some and decimal to others", f"write {int(digits)} or {raw!r}"
                     )
-                value = int(text, 0)
+                if len(digits) > MAX_DIGITS or not -(2**63) <= (value := int(text, 0)) < 2**64:
+                    return self.refuse(place, "whole numbers have 64 bits: this one has more", f"write {_quoted(raw)}")
             case "float":
                 value = float(text.replace(".inf", "inf").replace(".nan", "nan"))
                 if math.isnan(value):

@@ -1,4 +1,4 @@
-"""A graph for people: as a tree in the terminal, as a Mermaid flowchart, and as an SVG picture."""
+"""A graph for people: as a tree in the terminal, and as a Mermaid flowchart."""
 
 from __future__ import annotations
 
@@ -6,24 +6,21 @@ from rich.text import Text
 from rich.tree import Tree
 
 from dataflow.graph.model import Graph, Node
-from dataflow.graph.svg import svg
 from dataflow.operator import InputPort
-
-__all__ = ["mermaid", "svg", "tree"]
 
 _KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 _ARROW = {"in": "-->", "sampled": "-.->", "batch": "==>"}
 
 
 def tree(graph: Graph) -> Tree:
-    """Hosts, their operators, and of each its inputs (kind, type, streams) and outputs (type)."""
+    """Processes, their operators, and of each its inputs (kind, type, streams) and outputs (type)."""
     hosts = graph.hosts()
     title = Text.assemble((graph.name, "bold"), f"  {graph.namespace}  ", (_counts(graph), "dim"))
     root = Tree(title)
-    for host, names in hosts.items():
+    for process, names in hosts.items():
         machines = {graph.nodes[name].machine for name in names} - {None}
         where = f" on {', '.join(sorted(m for m in machines if m))}" if machines else ""
-        branch = root.add(Text.assemble(("host ", "dim"), (host, "cyan"), (where, "dim")))
+        branch = root.add(Text.assemble(("process ", "dim"), (process, "cyan"), (where, "dim")))
         for name in names:
             node = graph.nodes[name]
             label = Text.assemble((name, "bold"), "  ", (node.use, "dim"))
@@ -34,8 +31,10 @@ def tree(graph: Graph) -> Tree:
 
 
 def _counts(graph: Graph) -> str:
-    counts = ((len(graph.nodes), "operator"), (len(graph.hosts()), "host"), (len(graph.streams), "stream"))
-    return ", ".join(f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts)
+    processes = len(graph.hosts())
+    counts = ((len(graph.nodes), "operator"), (len(graph.streams), "stream"))
+    others = [f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts]
+    return ", ".join([f"{processes} process{'' if processes == 1 else 'es'}", *others])
 
 
 def _ports(graph: Graph, node: Node) -> list[Text]:
@@ -67,15 +66,15 @@ def _input_text(port: InputPort) -> str:
 
 
 def mermaid(graph: Graph) -> str:
-    """A Mermaid flowchart: a subgraph per shared host; triggers solid, Sampled dotted, Batch thick."""
+    """A Mermaid flowchart: a subgraph per shared process; triggers solid, Sampled dotted, Batch thick."""
     ids = {name: f"n{i}" for i, name in enumerate(graph.nodes)}
     lines = ["flowchart LR"]
-    for number, (host, names) in enumerate(graph.hosts().items()):
+    for number, (label, names) in enumerate(graph.hosts().items()):
         boxes = [f'{ids[name]}["<b>{name}</b><br/>{graph.nodes[name].use.rpartition(":")[2]}"]' for name in names]
         if len(names) == 1:
             lines.append(f"    {boxes[0]}")
         else:
-            lines += [f'    subgraph h{number} ["host {host}"]', *(f"        {box}" for box in boxes), "    end"]
+            lines += [f'    subgraph h{number} ["process {label}"]', *(f"        {box}" for box in boxes), "    end"]
     for edge in graph.edges():
         arrow = _ARROW[graph.nodes[edge.consumer].input_port(edge.input).kind]
         label = f"{edge.port}: {' or '.join(graph.streams[edge.stream].types)}"

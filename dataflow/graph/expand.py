@@ -17,6 +17,7 @@ from dataflow.graph import document
 from dataflow.graph.document import Entry, Items, Leaf, Reference, Table, Tree, plain
 from dataflow.graph.fields import Fields
 from dataflow.graph.keys import NAME_RULE, canonical, has_wildcard, key_fault, name_fault
+from dataflow.graph.limits import MAX_DEPTH, MAX_OPERATORS, REFERENCE_COST, SCALAR_COST, Budget
 from dataflow.graph.lookup import NotFound, find_operator
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
 from dataflow.graph.settings import Setting, put, read_settings
@@ -28,8 +29,8 @@ TOP_KEYS = (
 )  # fmt: skip
 OPERATOR_KEYS = ("use", "inputs", "params", "process", "machine", "live", "sync")
 NESTED_KEYS = ("use", "inputs", "params", "process", "machine")
-MAX_DEPTH = 16
-"""Graphs nested in one another."""
+FOLDER = "graph:folder"
+"""The reference that stands for the folder of the file it is written in."""
 
 ReadFile = Callable[[str], str]
 """Text of a graph file by its path relative to the root file's folder; raises OSError or UnicodeDecodeError."""
@@ -120,18 +121,22 @@ class _Scope:
 
 
 class Expander:
-    """Unfolds a root file. `shown(path)` is how a file is called in messages."""
+    """Unfolds a root file. `shown(path)` is how a file is called in messages, `folder()` the root file's folder."""
 
     def __init__(
         self,
         read: ReadFile,
         shown: Callable[[str], str],
         variable: Callable[[str], str | None],
+        folder: Callable[[], str],
         settings: Sequence[str],
         problems: Problems,
     ) -> None:
         self.read, self.shown, self.variable, self.problems = read, shown, variable, problems
+        self.folder = folder
         self.fields = Fields(problems)
+        self.budget = Budget(problems)
+        self.members = 0
         self.words = settings
         self.settings: list[Setting] = []
         self.parsed: dict[str, Tree | None] = {}
@@ -187,7 +192,7 @@ class Expander:
             return None
         declared, values = self.parameters(table, scope)
         rest = Table({k: e for k, e in table.entries.items() if k != "params"}, table.place)
-        done = document.substitute(rest, self.lookup(declared, values), self.problems)
+        done = document.substitute(rest, self.lookup(scope, declared, values), self.problems, self.budget)
         assert isinstance(done, Table)
         return done
 
@@ -298,22 +303,27 @@ class Expander:
                 self.problems.add(entry.key.place, f"parameter name {fault}", NAME_RULE)
             value = given.get(name, entry.value)
             if name not in given:  # what comes from outside is complete already
-                value = document.substitute(value, self.lookup(seen, values, later), self.problems)
+                value = document.substitute(value, self.lookup(scope, seen, values, later), self.problems, self.budget)
             seen.append(name)
             if not (isinstance(value, Leaf) and value.value is None):
                 values[name] = value
         return seen, values
 
-    def lookup(self, declared: Sequence[str], values: Mapping[str, Tree], later: Sequence[str] = ()) -> document.Lookup:
-        """How `${...}` is answered where `declared` names are in force."""
+    def lookup(
+        self, scope: _Scope, declared: Sequence[str], values: Mapping[str, Tree], later: Sequence[str] = ()
+    ) -> document.Lookup:
+        """Answers `${...}` where `declared` names are in force."""
 
         def find(reference: Reference) -> Tree | None:
+            self.budget.charge(reference.place, REFERENCE_COST)
             default = None
             if reference.default is not None:
+                self.budget.charge(reference.place, SCALAR_COST)
                 default = document.parse_scalar(reference.default, reference.place)
             if (variable := reference.variable) is not None:
                 word = self.variable(variable)
                 if word is not None:
+                    self.budget.charge(reference.place, SCALAR_COST)
                     return document.parse_scalar(word, reference.place)
                 if default is None:
                     self.problems.add(
@@ -323,6 +333,10 @@ class Expander:
                     )
                 return default
             name = reference.name
+            if name == FOLDER:
+                inner = posixpath.dirname(scope.file)
+                folder = posixpath.join(self.folder(), inner) if inner else self.folder()
+                return Leaf(folder, reference.place, folder)
             if name in values:
                 return values[name]
             if name in declared:
@@ -348,6 +362,10 @@ class Expander:
 
     def operator(self, name: str, entry: Entry, scope: _Scope, inputs: Mapping[str, GraphInput]) -> None:
         full = scope.prefix + name
+        self.members += 1
+        if self.members > MAX_OPERATORS:
+            what = f"the graph has more than {MAX_OPERATORS:,} operators"
+            self.problems.stop(entry.key.place, what, "nested graphs multiply them")
         table = self.fields.table(entry.value, f"operator {full!r}")
         use_tree = table.get("use") if table else None
         use = self.fields.text(use_tree, "use")

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from dataflow.graph.expand import Expander
+from dataflow.graph.limits import MAX_BUNDLE, MAX_TEXT
 from dataflow.graph.model import Bundle, Graph
 from dataflow.graph.problems import Place, Problems
 from dataflow.graph.resolve import Resolver
+from dataflow.graph.search import add_folder
 
 BUNDLE_FORMAT = "dataflow-graph/1"
 
@@ -20,10 +23,19 @@ def load_graph(path: str | Path, *, settings: Sequence[str] = (), live: bool = F
 
     `live`: every source counts as a device, which does not wait, when the operators' live policies are worked out.
 
-    Imports the operators it names. Raises `GraphError` with everything that is wrong.
+    Imports the operators it names, also from modules beside the file (`dataflow.graph.search`). Raises `GraphError`
+    with everything that is wrong.
     """
     file = Path(path)
-    return _load(file.name, _reader(file.parent), os.environ.get, settings, lambda key: _shown(file.parent, key), live)
+    return _load(
+        file.name,
+        _reader(file.parent),
+        os.environ.get,
+        lambda: file.parent.as_posix(),
+        settings,
+        lambda key: _shown(file.parent, key),
+        live,
+    )
 
 
 def load_text(
@@ -31,12 +43,14 @@ def load_text(
 ) -> Graph:
     """The graph of a YAML text. `files` holds the texts of nested graphs by path; nothing is read from disk."""
     texts = {file: text, **(files or {})}
-    return _load(file, lambda key: _from(texts, key), os.environ.get, settings, str)
+    return _load(file, lambda key: _from(texts, key), os.environ.get, lambda: ".", settings, str)
 
 
 def load_bundle(bundle: str) -> Graph:
     """The graph that `Graph.bundle()` packed, without its files and environment. Raises `GraphError`."""
     try:
+        if len(bundle) > MAX_BUNDLE:
+            raise ValueError(f"it has {len(bundle):,} characters; it may have {MAX_BUNDLE:,}")
         data = json.loads(bundle)
         if data["format"] != BUNDLE_FORMAT:
             raise ValueError(f"its format is {data['format']!r}, this version reads {BUNDLE_FORMAT!r}")
@@ -45,19 +59,28 @@ def load_bundle(bundle: str) -> Graph:
             {str(key): str(text) for key, text in data["files"].items()},
             tuple(str(word) for word in data["settings"]),
             {str(name): None if word is None else str(word) for name, word in data["environment"].items()},
+            str(data.get("folder", "")),
         )
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         problems = Problems()
         problems.add(Place("bundle", 1, 1), f"not a graph bundle: {type(error).__name__}: {error}")
         problems.check()
         raise AssertionError from error
-    return _load(packed.file, lambda key: _from(packed.files, key), packed.environment.get, packed.settings, str)
+    return _load(
+        packed.file,
+        lambda key: _from(packed.files, key),
+        packed.environment.get,
+        lambda: packed.folder,
+        packed.settings,
+        str,
+    )
 
 
 def _load(
     file: str,
     read: Callable[[str], str],
     variable: Callable[[str], str | None],
+    folder: Callable[[], str],
     settings: Sequence[str],
     shown: Callable[[str], str],
     live: bool = False,
@@ -65,6 +88,7 @@ def _load(
     problems = Problems()
     texts: dict[str, str] = {}
     environment: dict[str, str | None] = {}
+    folders: list[str] = []
 
     def noted_read(key: str) -> str:
         texts[key] = read(key)
@@ -74,17 +98,36 @@ def _load(
         environment[name] = variable(name)
         return environment[name]
 
-    expansion = Expander(noted_read, shown, noted_variable, settings, problems).expand(file)
+    def noted_folder() -> str:
+        folders[:] = [folder()]
+        return folders[0]
+
+    expansion = Expander(noted_read, shown, noted_variable, noted_folder, settings, problems).expand(file)
     if expansion is None:
         problems.check()
         raise AssertionError("a graph without a shape has a problem")
-    graph = Resolver(expansion, problems, live).resolve(Bundle(file, texts, tuple(settings), environment))
+    graph = Resolver(expansion, problems, live).resolve(
+        Bundle(file, texts, tuple(settings), environment, "".join(folders))
+    )
     problems.check()
     return graph
 
 
 def _reader(folder: Path) -> Callable[[str], str]:
-    return lambda key: (folder / key).read_text(encoding="utf-8")
+    """Reads no more of a file than tells that it is too long, and no device or pipe.
+
+    Modules are sought beside every file that is read.
+    """
+
+    def read(key: str) -> str:
+        path = folder / key
+        add_folder(path.parent)
+        if path.exists() and not path.is_file():
+            raise OSError(errno.EINVAL, "not a regular file")
+        with path.open(encoding="utf-8") as file:
+            return file.read(MAX_TEXT + 1)
+
+    return read
 
 
 def _from(texts: Mapping[str, str], key: str) -> str:

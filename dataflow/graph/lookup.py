@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from types import ModuleType
 
 from dataflow.graph.problems import did_you_mean, nearest
+from dataflow.graph.search import looked_in
 from dataflow.operator import Operator, Source
 
 
@@ -68,8 +69,8 @@ def import_module(name: str) -> ModuleType | NotFound:
             return NotFound(f"module {name!r} needs {error.name!r}, which is not installed", _where(error, name))
         if parent and not hasattr(sys.modules[parent], "__path__"):
             return NotFound(f"no module {name!r}: {parent!r} is a single module", "")
-        unknown_place = "is its package installed, or its folder on the path?"
-        return NotFound(f"no module {name!r}", _nearest_module(last, parent) or unknown_place)
+        looked = "" if parent else f"{looked_in()}; --path DIR names another folder"
+        return NotFound(f"no module {name!r}", "\n".join(filter(None, (_nearest_module(last, parent), looked))))
     except (Exception, SystemExit) as error:  # the module's own code may fail in any way
         return NotFound(f"module {name!r} fails to import: {type(error).__name__}: {error}", _where(error, name))
 
@@ -90,7 +91,8 @@ def is_concrete(cls: type[Operator]) -> bool:
 
 def _nearest_module(name: str, parent: str) -> str:
     path = sys.modules[parent].__path__ if parent else None
-    candidates = [info.name for info in pkgutil.iter_modules(path) if not info.name.startswith("_")]
+    found = (info.name for info in pkgutil.iter_modules(path) if not info.name.startswith("_"))
+    candidates = [name for name in found if parent or name not in sys.stdlib_module_names]
     if parent:
         return did_you_mean(name, candidates, f"modules in {parent!r}").replace("mean '", f"mean '{parent}.")
     near = nearest(name, candidates)

@@ -1,7 +1,7 @@
 """The resolved graph: what a graph file means once every name, stream, parameter and policy in it is settled.
 
 Everything here is plain data that travels between processes as JSON (`Graph.to_json`, `Graph.from_json`); a node's
-operator class is imported only when somebody asks for it, so a host imports its own operators and no others.
+operator class is imported only when somebody asks for it, so a process imports its own operators and no others.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Live:
       (`newest` is kept), the arriving one is dropped (`oldest` is kept), or the producer waits (`block`).
     - `wait`: per input, how long (ns) a decision waits for that input's frontier before it is forced; None: for ever.
     - `deadline`: longest one firing may take (ns) before the operator counts as hung; None: no limit.
-    - `memory`: bytes of resident memory at which its host is restarted; None: no limit.
+    - `memory`: bytes of resident memory at which its process is restarted; None: no limit.
     - `on_stale`: whether messages of an input whose producer died still serve firings or count as absent.
     """
 
@@ -108,7 +108,7 @@ class Node:
 
     @property
     def host(self) -> str:
-        """Label of the host it runs in unless the placement is overridden: its `process:` label, or its own name."""
+        """Label of the process it runs in unless the placement is overridden: its `process:` label, or its own name."""
         return self.process or self.name
 
     def input_port(self, name: str) -> InputPort:
@@ -158,7 +158,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """Where hosts listen and connect beyond loopback. The default opens nothing.
+    """Addresses by which processes listen and connect beyond loopback. The default opens nothing.
 
     `listen` and `connect` are Zenoh endpoints (`"tcp/192.168.1.2:7447"`); `tls` and `access_control` are handed to
     Zenoh's own configuration (`transport/link/tls`, `access_control`) as they are.
@@ -192,13 +192,15 @@ class Bundle:
     """Everything that a graph was loaded from, so that it can be loaded again where the files are not.
 
     `files` maps a path relative to the root file's folder (the root file itself by its name) to its text; `settings`
-    are the `--set` words; `environment` holds the variables that `${env:NAME}` asked for (None: not set).
+    are the `--set` words; `environment` holds the variables that `${env:NAME}` asked for (None: not set); `folder` is
+    the root file's folder as the graph was named, where `${graph:folder}` asked for it.
     """
 
     file: str
     files: Mapping[str, str]
     settings: tuple[str, ...] = ()
     environment: Mapping[str, str | None] = field(default_factory=dict)
+    folder: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,10 +297,10 @@ class Graph:
         return tuple(node for node in self.nodes.values() if not node.outputs)
 
     def hosts(self, placement: Placement | Mapping[str, str] = "graph") -> dict[str, tuple[str, ...]]:
-        """Host label → the nodes it runs, both in graph order.
+        """Process label → the nodes it runs, both in graph order.
 
-        `placement`: as the graph's `process:` labels say, all in one host, one host each, or an explicit mapping from
-        node name to label (nodes left out keep the graph's label). Raises ValueError for an unknown node or word.
+        `placement`: as the graph's `process:` labels say, all in one process, one process each, or an explicit mapping
+        from node name to label (nodes left out keep the graph's label). Raises ValueError for an unknown node or word.
         """
         if isinstance(placement, str) and placement not in ("graph", "one_host", "host_each"):
             raise ValueError(f"placement {placement!r}: expected graph, one_host, host_each or a mapping")

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 
 from rich.cells import cell_len
+
+MAX_PROBLEMS = 100
+"""Faults that are reported at most; the rest of the graph is not read."""
+MAX_MESSAGE = 2_000
+"""Characters of a message or a hint; its middle is left out beyond that."""
+SHOWN_WIDTH = 160
+"""Characters of a source line that are shown."""
+MAX_CHOICES = 2_000
+"""Words that a wrong one is compared with."""
+MAX_WORD = 200
+"""Characters of a word that is compared."""
+LISTED = 50
+"""Words that are listed where none is near."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -42,10 +56,10 @@ class Problem:
     def __str__(self) -> str:
         lines = [f"{self.file}:{self.line}:{self.column}: {self.message}"]
         if self.source.strip():
-            shown = self.source.replace("\t", " ")
+            shown, column = _window(self.source.replace("\t", " "), self.column)
             number = f"{self.line:>5}"
-            indent = " " * cell_len(shown[: self.column - 1])
-            caret = "^" * max(1, cell_len(shown[self.column - 1 : self.column - 1 + self.width]))
+            indent = " " * cell_len(shown[: column - 1])
+            caret = "^" * max(1, cell_len(shown[column - 1 : column - 1 + self.width]))
             lines += [f"{number} | {shown}", f"{' ' * len(number)} | {indent}{caret}"]
         lines += [f"      {place}: {word}" for place, word in self.related]
         lines += [f"      {line}" for line in self.hint.splitlines()]
@@ -88,9 +102,22 @@ class Problems:
     def add(self, place: Place, message: str, hint: str = "", related: Iterable[tuple[Place, str]] = ()) -> None:
         lines = self.texts.get(place.file, ())
         source = lines[place.line - 1] if 0 < place.line <= len(lines) else ""
-        problem = Problem(place.file, place.line, place.column, message, hint, source, place.width, tuple(related))
-        if problem not in self.found:
-            self.found.append(problem)
+        where = (place.file, place.line, place.column)
+        problem = Problem(*where, _clipped(message), _clipped(hint), source, place.width, tuple(related))
+        if problem in self.found:
+            return
+        self.found.append(problem)
+        if len(self.found) == MAX_PROBLEMS:
+            self.stop(place, f"{MAX_PROBLEMS} faults so far; the rest of the graph is not read")
+
+    def stop(self, place: Place, message: str, hint: str = "") -> NoReturn:
+        """Ends the loading here, with this fault and those found before. Raises `GraphError`."""
+        if len(self.found) < MAX_PROBLEMS - 1:
+            self.add(place, message, hint)
+        else:
+            self.found.append(Problem(place.file, place.line, place.column, message, hint))
+        self.check()
+        raise AssertionError("a graph with a fault passes")
 
     def check(self) -> None:
         """Raises `GraphError` when anything was found."""
@@ -99,10 +126,25 @@ class Problems:
             raise GraphError(sorted(self.found, key=lambda p: (order.get(p.file, len(order)), p.line, p.column)))
 
 
+def _clipped(text: str) -> str:
+    """`text`, or its beginning and end."""
+    return text if len(text) <= MAX_MESSAGE else f"{text[: MAX_MESSAGE // 2]} … {text[-MAX_MESSAGE // 2 :]}"
+
+
+def _window(line: str, column: int) -> tuple[str, int]:
+    """The part of a long line around `column`, and the column in that part."""
+    if len(line) <= SHOWN_WIDTH:
+        return line, column
+    start = max(0, min(column - 1 - SHOWN_WIDTH // 3, len(line) - SHOWN_WIDTH))
+    return line[start : start + SHOWN_WIDTH], column - start
+
+
 def nearest(word: str, choices: Iterable[str]) -> str | None:
     """The choice that `word` most likely meant, or None when nothing is near."""
+    if len(word) > MAX_WORD:
+        return None
     folded: dict[str, str] = {}
-    for choice in choices:
+    for choice in itertools.islice((choice for choice in choices if len(choice) <= MAX_WORD), MAX_CHOICES):
         folded.setdefault(choice.casefold(), choice)
     wanted = word.casefold()
     if close := difflib.get_close_matches(wanted, folded, n=1, cutoff=0.6):
@@ -116,4 +158,5 @@ def did_you_mean(word: str, choices: Iterable[str], what: str = "") -> str:
     known = list(choices)
     if (near := nearest(word, known)) is not None:
         return f"did you mean {near!r}?"
-    return f"{what}: {', '.join(known) or 'none'}" if what else ""
+    more = f" and {len(known) - LISTED:,} more" if len(known) > LISTED else ""
+    return f"{what}: {', '.join(known[:LISTED]) or 'none'}{more}" if what else ""

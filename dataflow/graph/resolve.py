@@ -342,7 +342,7 @@ class Resolver:
             edges = [e for e in edges if e not in cycle.edges]
 
     def check_machines(self, drafts: Iterable[Draft]) -> None:
-        """Operators that share a host must be on one machine."""
+        """Operators that share a process must be on one machine."""
         owners: dict[str, Draft] = {}
         for draft in drafts:
             label = draft.process.value if draft.process else draft.name

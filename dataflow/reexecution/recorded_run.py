@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
+from dataclasses import asdict, replace
+
+import pydantic
 
 from dataflow.graph import load_bundle
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Bundle, Graph
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH
 
@@ -31,9 +34,27 @@ def recorded_graph(recording: Recording) -> Graph:
     return load_bundle(bundle)
 
 
+def wiring(recording: Recording) -> Graph | None:
+    """The resolved graph that a recording holds, without its files: nothing is imported and nothing can be run by it.
+
+    None where it holds none, or none that is sound (an older recording, or another program's).
+    """
+    resolved = recording.metadata.get(GRAPH, {}).get("resolved")
+    if resolved is None:
+        return None
+    try:
+        graph: Graph = pydantic.TypeAdapter(Graph).validate_json(resolved)
+    except pydantic.ValidationError:
+        return None
+    makers = {stream.node for stream in graph.streams.values()}
+    taken = {stream for node in graph.nodes.values() for streams in node.inputs.values() for stream in streams}
+    return graph if makers <= graph.nodes.keys() and taken <= graph.streams.keys() else None
+
+
 def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
-    """What a recording must hold so that its graph can be loaded again."""
-    return {GRAPH: {"name": graph.name, "bundle": graph.bundle(), "text": graph.text}}
+    """Gives what a recording must hold so that its graph can be loaded again, and be shown without its operators."""
+    resolved = json.dumps(asdict(replace(graph, sources_bundle=Bundle("", {}))))
+    return {GRAPH: {"name": graph.name, "bundle": graph.bundle(), "text": graph.text, "resolved": resolved}}
 
 
 def check_type(recording: Recording, graph: Graph, stream: str) -> None:

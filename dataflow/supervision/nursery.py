@@ -84,7 +84,7 @@ class Nursery:
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "dataflow.supervision.nursery", str(theirs.fileno())],
+                [sys.executable, "-P", "-m", "dataflow.supervision.nursery", str(theirs.fileno())],
                 pass_fds=(theirs.fileno(),),
                 env=environment,
                 stdin=subprocess.DEVNULL,

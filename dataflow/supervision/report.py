@@ -37,6 +37,8 @@ class Status:
     """What a progress display needs; updated in place while the graph runs."""
 
     phase: str = "starting"
+    waiting: tuple[str, ...] = ()
+    """While starting: the processes that are not ready yet, or whose connections are not proven."""
     started: float = 0.0
     operators: dict[str, OperatorCounts] = field(default_factory=dict)
     drops: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)

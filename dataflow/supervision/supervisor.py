@@ -222,6 +222,7 @@ class Supervisor:
             if self._stop_asked:
                 raise RunFailed("interrupted while starting", interrupted=True)
             processes = self._processes.values()
+            self.status.waiting = tuple(p.label for p in processes if not p.ready or (probing and p.unseen))
             if all(p.ready for p in processes):
                 if not probing:
                     probing = True
@@ -246,7 +247,7 @@ class Supervisor:
             yield
 
     def _release(self) -> None:
-        self.status.phase = "running"
+        self.status.phase, self.status.waiting = "running", ()
         self._released_at = time.monotonic()
         self._heard = time.monotonic()
         self._released = {"first": self.status.first, "at": time.time()}

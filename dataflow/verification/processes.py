@@ -118,7 +118,7 @@ class _Worker:
         try:
             self.board = Board(shared, call.operators)
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "dataflow.verification.worker", *map(str, (theirs, self._letter, shared))],
+                [sys.executable, "-P", "-m", "dataflow.verification.worker", *map(str, (theirs, self._letter, shared))],
                 pass_fds=(theirs, self._letter, shared, *descriptors),
                 env=environment(threads),
                 stdin=subprocess.DEVNULL,

@@ -318,7 +318,7 @@ class ViewerSink:
         if self._outlook is None and message.stamp - self._started_at >= SETTLE:
             self._guarded("", lambda: self._settle(recording))
         for doubt in self._scene.doubts(message.stamp):
-            recording.log(VIEWER_LOG, rr.TextLog(doubt, level="WARN"))
+            recording.log(VIEWER_LOG, rr.TextLog(doubt, level="INFO"))
 
     def _settle(self, recording: rr.RecordingStream) -> None:
         """Decides, once, which way is up and where to look from."""

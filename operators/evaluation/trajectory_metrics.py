@@ -29,7 +29,7 @@ class TrajectoryMetrics(Operator):
     """
 
     estimate: In[Odometry] = In(doc="the poses to score")
-    ground_truth: Batch[Pose] = Batch(doc="the true poses of the same child frame")
+    ground_truth: Batch[Pose | Odometry] = Batch(doc="the true poses of the same child frame")
 
     alignment: Literal["se3", "sim3", "none"] = Param(
         "se3", doc="moves the whole estimate onto the truth (Umeyama): rigidly, with scale, or not at all"
@@ -44,7 +44,7 @@ class TrajectoryMetrics(Operator):
         self._not_finite = 0
         self._figures: dict[str, float | int | str] = {}
 
-    def process(self, estimate: Odometry, ground_truth: tuple[Pose, ...]) -> None:
+    def process(self, estimate: Odometry, ground_truth: tuple[Pose | Odometry, ...]) -> None:
         """Raises ValueError where estimate and truth pose different child frames."""
         for truth in ground_truth:
             if truth.child_frame and truth.child_frame != estimate.child_frame:

@@ -3,5 +3,6 @@
 from operators.sources.rgbd_folder import RgbdFolder
 from operators.sources.simulated_robot import SimulatedRobot
 from operators.sources.synthetic_rgbd import SyntheticRgbd
+from operators.sources.victoria_park import VictoriaPark
 
-__all__ = ["RgbdFolder", "SimulatedRobot", "SyntheticRgbd"]
+__all__ = ["RgbdFolder", "SimulatedRobot", "SyntheticRgbd", "VictoriaPark"]

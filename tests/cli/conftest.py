@@ -68,5 +68,5 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recorded(dataflow: Command, small: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]:
     """A recording of that graph, and the JSON report of the run that made it."""
     path = tmp_path_factory.mktemp("recorded") / "run.mcap"
-    outcome = dataflow("run", small, "--record", path, "--one-host", "--json")
+    outcome = dataflow("run", small, "--record", path, "--one-process", "--json")
     return path, json.loads(outcome.stdout)

@@ -44,13 +44,13 @@ def folder(dataflow, tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = path / "recordings"
     (made / "deep").mkdir(parents=True)
     graph_of(path, "same.yaml", SMOOTH)
-    dataflow("run", path / "same.yaml", "--record", made / "first.mcap", "--one-host", "-q")
+    dataflow("run", path / "same.yaml", "--record", made / "first.mcap", "--one-process", "-q")
     shutil.copy(made / "first.mcap", made / "deep" / "second.mcap")
     return path
 
 
 def gate(dataflow, folder: Path, *words: object, code: int):
-    return dataflow("verify", folder / "recordings", "--one-host", "-q", *words, code=code)
+    return dataflow("verify", folder / "recordings", "--one-process", "-q", *words, code=code)
 
 
 def test_a_folder_of_recordings_passes_with_a_row_each(dataflow, folder: Path) -> None:
@@ -62,10 +62,10 @@ def test_a_folder_of_recordings_passes_with_a_row_each(dataflow, folder: Path) -
 
 
 def test_both_times_are_told_and_options_that_are_gone_are_noted(dataflow, folder: Path) -> None:
-    outcome = dataflow("verify", folder / "recordings" / "first.mcap", "--host-each", "-q")
+    outcome = dataflow("verify", folder / "recordings" / "first.mcap", "--process-each", "-q")
 
     assert re.search(r"× real time \([\d.]+ s in all\)", " ".join(outcome.stdout.split()))
-    assert "--host-each is deprecated" in outcome.stderr
+    assert "--process-each is deprecated" in outcome.stderr
 
 
 def test_a_broken_file_ends_with_2_and_the_others_are_verified_all_the_same(
@@ -174,7 +174,16 @@ def test_what_could_not_be_repeated_is_not_accepted_and_ends_with_1(
 ) -> None:
     torn, baseline = tmp_path / "torn.mcap", tmp_path / "accepted.json"
     without_message(folder / "recordings" / "first.mcap", "test/left/fast", 9, torn)
-    words = ["verify", torn, "--graph", graph_of(tmp_path, "g.yaml", one), "--baseline", baseline, "--one-host", "-q"]
+    words = [
+        "verify",
+        torn,
+        "--graph",
+        graph_of(tmp_path, "g.yaml", one),
+        "--baseline",
+        baseline,
+        "--one-process",
+        "-q",
+    ]
 
     told = dataflow(*words, "--accept", code=1)
 
@@ -187,21 +196,21 @@ def test_a_tolerance_passes_with_its_own_word_and_not_as_identical(dataflow, fol
     changed = graph_of(tmp_path, "changed.yaml", NUDGED)
     one = folder / "recordings" / "first.mcap"
 
-    told = dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-host", "-q")
+    told = dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-process", "-q")
 
     assert "within tolerance of 1e-05, not identical" in told.stdout
     assert not any(line.startswith("identical") for line in told.stdout.splitlines())
     value = json.loads(
-        dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-host", "-q", "--json").stdout
+        dataflow("verify", one, "--graph", changed, "--tolerance", "1e-5", "--one-process", "-q", "--json").stdout
     )
     assert (value["identical"], value["within_tolerance"], value["verdict"]) == (False, True, "within tolerance")
-    dataflow("verify", one, "--graph", changed, "--tolerance", "1e-9", "--one-host", "-q", code=1)
+    dataflow("verify", one, "--graph", changed, "--tolerance", "1e-9", "--one-process", "-q", code=1)
 
 
 def test_an_operator_that_cannot_run_is_2_and_not_a_difference(dataflow, folder: Path, tmp_path: Path) -> None:
     broken = graph_of(tmp_path, "broken.yaml", '{use: "verified_operators:Unable", inputs: {x: left/fast}}')
 
-    words = ["verify", folder / "recordings" / "first.mcap", "--graph", broken, "--one-host", "-q"]
+    words = ["verify", folder / "recordings" / "first.mcap", "--graph", broken, "--one-process", "-q"]
     told = CliRunner().invoke(app, [str(word) for word in words])
 
     assert told.exit_code == 2
@@ -227,7 +236,7 @@ def test_a_recording_of_sources_alone_holds_nothing_to_verify(
 ) -> None:
     alone = graph_of(tmp_path, "alone.yaml", SMOOTH)
     alone.write_text("".join(line for line in alone.read_text().splitlines(True) if "one" not in line))
-    dataflow("run", alone, "--record", tmp_path / "alone.mcap", "--one-host", "-q")
+    dataflow("run", alone, "--record", tmp_path / "alone.mcap", "--one-process", "-q")
 
     told = dataflow("verify", tmp_path / "alone.mcap", "-q", *words, code=2).stderr
 
@@ -243,8 +252,8 @@ def test_a_recording_of_sources_alone_holds_nothing_to_verify(
         (["--junit", "v.txt"], "ends in .xml"),
         (["--tolerance", "-1"], "0 or more"),
         (["--jobs", "0"], "--jobs 0: expected 1 to"),
-        (["--jobs", "2"], "--jobs 2: expected 1 to 1024, without --one-host"),
-        (["--host-each"], "--one-host and --host-each exclude each other"),
+        (["--jobs", "2"], "--jobs 2: expected 1 to 1024, without --one-process"),
+        (["--process-each"], "--one-process and --process-each exclude each other"),
         (["--start", "1", "--baseline", "b.json"], "--start and --baseline exclude each other"),
         (["--start", "nan"], "--start nan: expected seconds"),
         (["--start", "inf"], "--start inf: expected seconds"),
@@ -261,12 +270,12 @@ def test_a_thin_recording_is_completed_and_is_then_verified(dataflow, folder: Pa
     thin_graph = tmp_path / "thin.yaml"
     thin_graph.write_text(same.read_text() + 'record: {topics: ["left/**"]}\n')
     thin, full = tmp_path / "thin.mcap", tmp_path / "full.mcap"
-    dataflow("run", thin_graph, "--record", thin, "--one-host", "-q")
+    dataflow("run", thin_graph, "--record", thin, "--one-process", "-q")
 
     told = dataflow("replay", thin, "--complete", full, "-q").stdout
 
     assert "computed again: test/one/mean, test/two/y" in told
-    assert "identical" in dataflow("verify", full, "--one-host", "-q").stdout
+    assert "identical" in dataflow("verify", full, "--one-process", "-q").stdout
     assert "the same" in dataflow("diff", folder / "recordings" / "first.mcap", full).stdout
     assert "replace it with --overwrite" in dataflow("replay", thin, "--complete", full, code=2).stderr
     assert json.loads(dataflow("replay", thin, "--complete", full, "--overwrite", "--json", "-q").stdout)["whole"]

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dataflow.cli import main
+from dataflow.cli import main, plugins
 from dataflow.cli.main import app
 
 COMMANDS = sorted(
@@ -88,3 +88,24 @@ def test_a_fault_of_ours_is_one_message_and_code_2(monkeypatch, capsys, asked: s
     assert ended.value.code == 2
     assert "internal error: KeyError: 'nobody thought of this'" in told
     assert ("Traceback" in told) == (asked == "1")
+
+
+@pytest.mark.parametrize("words", [["run"], ["param", "set"], ["train"], ["evaluate", "detector"], []])
+def test_help_shows_no_type_beside_flags_and_no_completion(dataflow, words: list[str]) -> None:
+    told = dataflow(*words, "--help").stdout
+
+    assert "--help" in told
+    assert "bool" not in told
+    assert "completion" not in told
+
+
+def test_options_by_their_former_names_work_and_say_so(dataflow, small: Path) -> None:
+    plugins.renamed.cache_clear()
+    told = dataflow("run", small, "--one-host", "--patience", 60, "--set", "count=3", "-q")
+    assert "--one-host is now --one-process" in told.stderr
+    assert "--patience is now --timeout" in told.stderr
+
+    told = dataflow("verify", small, "--one-host", "--host-each", code=2)
+    assert "--one-process and --process-each exclude each other" in told.stderr
+    shown = dataflow("run", "--help").stdout
+    assert not any(name in shown for name in ("--one-host", "--host-each", "--patience"))

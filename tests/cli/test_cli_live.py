@@ -62,6 +62,20 @@ def test_echo_prints_whole_messages_as_lines_of_json(dataflow) -> None:
 
 
 @pytest.mark.usefixtures("running")
+def test_echo_prints_arrays_as_numbers_where_it_prints_json(dataflow) -> None:
+    line = json.loads(dataflow("echo", "left/fast", "-n", 1, "--json").stdout)
+
+    assert isinstance(line["vectors"], list)
+    assert all(isinstance(value, (int, float)) for row in line["vectors"] for value in row)
+
+
+def test_the_graph_that_is_meant_may_stand_in_the_environment(dataflow, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("DATAFLOW_GRAPH", "kitchen")
+    assert "no graph 'kitchen' runs here" in dataflow("echo", code=2).stderr
+    assert "left/fast" in dataflow("echo", "left/fast", "--graph", "small", "-n", 1).stdout
+    assert "total" in dataflow("hz", "--graph", "small", "--seconds", 0.2).stdout
+
+
 def test_echo_prints_fields_for_people(dataflow) -> None:
     told = dataflow("echo", "left/*", "-n", 4).stdout
 

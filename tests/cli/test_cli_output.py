@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from dataflow.cli.arguments import chosen_streams, existing, output_file, window
-from dataflow.cli.output import figure, jsonable, plural, seconds, size
+from dataflow.cli.output import figure, friendly_errors, jsonable, plural, seconds, size
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report
-from dataflow.supervision.report import OperatorCounts, RunReport, Status
+from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
 
 
 @pytest.mark.parametrize(
@@ -173,3 +173,34 @@ def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
         watch(Status("running", operators={"smooth": OperatorCounts(3)}))
 
     assert console.file.getvalue().split() == ["running", "3", "firings"]  # type: ignore[attr-defined]
+
+
+def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkeypatch, capsys) -> None:
+    trace = "Traceback (most recent call last):\n  File 'x.py', line 1\nFileNotFoundError: Detector: no file 'm.onnx'\n"
+    failure = RunFailed("operator 'd' failed in setup(): FileNotFoundError: Detector: no file 'm.onnx'", trace, "d")
+
+    for asked in ("0", "1"):
+        monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
+        with pytest.raises(typer.Exit), friendly_errors():
+            raise failure
+        assert ("Traceback" in capsys.readouterr().err) == (asked == "1")
+
+
+def test_a_start_says_which_processes_it_waits_for() -> None:
+    status = Status(waiting=("camera", "cloud", "detector", "odometry", "@recorder"))
+    console = Console(file=io.StringIO(), width=100)
+    with shown(console, RunDisplay(console), quiet=False) as watch:
+        assert watch is not None
+        watch(status)
+
+    assert console.file.getvalue().split() == [
+        "starting",
+        "waiting",
+        "for",
+        "camera,",
+        "cloud,",
+        "detector",
+        "and",
+        "2",
+        "more",
+    ]

@@ -12,7 +12,7 @@ import pytest
 def longer(dataflow, small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A recording with more messages."""
     path = tmp_path_factory.mktemp("longer") / "longer.mcap"
-    dataflow("run", small, "--record", path, "--one-host", "--set", "count=35", "-q")
+    dataflow("run", small, "--record", path, "--one-process", "--set", "count=35", "-q")
     return path
 
 

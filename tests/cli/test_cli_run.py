@@ -20,7 +20,7 @@ ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 def test_a_run_reports_operators_and_figures_on_stdout_and_progress_on_stderr(dataflow, small: Path) -> None:
-    told = dataflow("run", small, "--one-host", "--set", "count=10")
+    told = dataflow("run", small, "--one-process", "--set", "count=10")
 
     assert "small  complete" in told.stdout
     assert any(line.split()[:3] == ["left", "10", "13"] for line in told.stdout.splitlines())  # firings, out
@@ -42,7 +42,7 @@ def test_a_replay_makes_the_same_digests_and_diff_agrees(dataflow, recorded, tmp
     path, report = recorded
     again = tmp_path / "again.mcap"
 
-    replayed = json.loads(dataflow("replay", path, "--record", again, "--one-host", "--json", "-q").stdout)
+    replayed = json.loads(dataflow("replay", path, "--record", again, "--one-process", "--json", "-q").stdout)
 
     assert replayed["streams"] == report["streams"]
     assert "the same: 5 streams, bit for bit" in dataflow("diff", path, again).stdout
@@ -51,7 +51,9 @@ def test_a_replay_makes_the_same_digests_and_diff_agrees(dataflow, recorded, tmp
 def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
     path, _ = recorded
 
-    replayed = json.loads(dataflow("replay", path, "--start", 0.1, "--end", 0.195, "--one-host", "--json", "-q").stdout)
+    replayed = json.loads(
+        dataflow("replay", path, "--start", 0.1, "--end", 0.195, "--one-process", "--json", "-q").stdout
+    )
 
     assert replayed["streams"]["test/left/fast"]["messages"] == 10  # stamps 0.10, 0.11 ... 0.19 s
 
@@ -59,7 +61,7 @@ def test_a_replay_of_a_part_takes_only_that_part(dataflow, recorded) -> None:
 def test_verification_of_a_recording_says_identical(dataflow, recorded) -> None:
     path, _ = recorded
 
-    told = dataflow("verify", path, "--one-host", "--json", "-q")
+    told = dataflow("verify", path, "--one-process", "--json", "-q")
 
     assert json.loads(told.stdout)["identical"] is True
     assert "exclude each other" in dataflow("verify", path, "--from", "smooth", "--only", "sum", code=2).stderr
@@ -75,8 +77,11 @@ def test_verification_of_a_recording_says_identical(dataflow, recorded) -> None:
         (["--view", "spawn"], "there is no display"),
         (["--open"], "needs --view FILE.rrd"),
         (["--open", "--view", "serve"], "needs --view FILE.rrd"),
-        (["--rate", "0"], "above 0"),
-        (["--one-host", "--host-each"], "exclude each other"),
+        (["--rate", "1e-300"], "from 0.001 to 1,000"),
+        (["--rate", "nan"], "from 0.001 to 1,000"),
+        (["--rate", "-1"], "from 0.001 to 1,000"),
+        (["--timeout", "0"], "from 0.1 to 1,000,000"),
+        (["--one-process", "--process-each"], "exclude each other"),
         (["--place", "nobody=a"], "left, smooth, gripper, sum"),
         (["--set", "cuont=3"], "did you mean 'count'?"),
         (["--set", "smooth.sleep=soon"], "sleep"),
@@ -167,7 +172,7 @@ def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_ask
 ) -> None:
     monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
 
-    told = CliRunner().invoke(app, ["replay", str(damaged), "--one-host", "-q"])
+    told = CliRunner().invoke(app, ["replay", str(damaged), "--one-process", "-q"])
 
     assert told.exit_code == 1
     assert "damaged.mcap is damaged: chunk" in told.stderr
@@ -181,7 +186,7 @@ def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_i
 ) -> None:
     path = tmp_path / "failed.mcap"
 
-    told = dataflow("run", small, "--set", "at=20", "--one-host", "--record", path, code=1)
+    told = dataflow("run", small, "--set", "at=20", "--one-process", "--record", path, code=1)
 
     assert "operator 'gripper' failed" in told.stderr
     assert "the gripper is on fire" in told.stderr
@@ -192,7 +197,17 @@ def test_a_failing_operator_ends_the_run_with_its_cause_its_traceback_and_what_i
 
 def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -> None:
     path = tmp_path / "interrupted.mcap"
-    command = ["run", str(small), "--set", "count=100000", "--set", "sleep=0.02", "--record", str(path), "--one-host"]
+    command = [
+        "run",
+        str(small),
+        "--set",
+        "count=100000",
+        "--set",
+        "sleep=0.02",
+        "--record",
+        str(path),
+        "--one-process",
+    ]
     running = subprocess.Popen(
         [sys.executable, "-m", "dataflow.cli.main", *command],
         stdout=subprocess.PIPE,
@@ -220,7 +235,7 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
     viewer.write_text(f'#!/bin/sh\nfor last; do :; done\necho "$last" > {noted}.new && mv {noted}.new {noted}\n')
     viewer.chmod(viewer.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("RERUN_CLI_PATH", str(viewer))
-    words = ["run", small, "--set", "count=5", "--one-host", "--view", saved, "--open"]
+    words = ["run", small, "--set", "count=5", "--one-process", "--view", saved, "--open"]
 
     assert "is not opened: there is no display" in dataflow(*words).stderr
     assert not noted.exists()
@@ -241,7 +256,7 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
 def test_a_viewer_that_fails_does_not_end_the_run(dataflow, small: Path, tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("RERUN_CLI_PATH", str(tmp_path / "absent"))
 
-    told = dataflow("run", small, "--view", "serve", "--one-host", "--rate", 1, "--set", "count=150")
+    told = dataflow("run", small, "--view", "serve", "--one-process", "--rate", 1, "--set", "count=150")
 
     assert "viewer: error: the Rerun program is missing" in told.stderr
     assert "small  complete" in told.stdout

@@ -164,7 +164,7 @@ def test_a_host_that_does_not_answer_is_shown_as_such_and_a_change_waits_for_it(
     finally:
         process.send_signal(signal.SIGCONT)
 
-    assert (rows["tuned"]["state"], rows["tuned"]["note"]) == ("no answer", "its host does not answer")
+    assert (rows["tuned"]["state"], rows["tuned"]["note"]) == ("no answer", "its process does not answer")
     assert rows["left"]["state"] == "running"
     assert "nobody answered for 'tuned' within 0.5 s" in told
     assert "nobody answered for tuned within 0.5 s" in missing.stderr

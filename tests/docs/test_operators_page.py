@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from operators_page import markdown, section
 
 from dataflow.graph.catalogue import BUILT_IN, Catalogue, discover
-from dataflow.graph.catalogue_page import markdown, section
 from dataflow.messages import PointCloud
 from dataflow.operator import In, Operator, Out, Param
 
-REMEDY = "run: python -m dataflow.graph.catalogue_page > docs/operators.md"
+REMEDY = "run: python tools/operators_page.py > docs/operators.md"
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.graph import Graph, GraphError, load_bundle, load_text
-from dataflow.graph.draw import mermaid, svg, tree
+from dataflow.graph.draw import mermaid, tree
 
 SEED = """\
 graph: g
@@ -89,4 +89,3 @@ def test_edited_graphs_load_or_are_refused(
         assert Graph.from_json(json.loads(json.dumps(graph.to_json()))) == graph
         tree(graph)
         mermaid(graph)
-        svg(graph)

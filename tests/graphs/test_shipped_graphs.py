@@ -44,7 +44,7 @@ def test_the_simulated_robot_is_the_one_of_the_recording() -> None:
 @needs_weights
 def test_the_demo_scores_everything_against_the_truth_and_its_recording_verifies(tmp_path: Path) -> None:
     file = tmp_path / "demo.mcap"
-    words = ["recordings/demo.mcap", "--graph", DEMO, "--end", 1.5, "--one-host", "--record", file, "--json", "-q"]
+    words = ["recordings/demo.mcap", "--graph", DEMO, "--end", 1.5, "--one-process", "--record", file, "--json", "-q"]
     report = json.loads(dataflow("replay", *words))
 
     scores: dict[str, Any] = report["summaries"]
@@ -53,12 +53,12 @@ def test_the_demo_scores_everything_against_the_truth_and_its_recording_verifies
     assert scores["detection_score"]["ap50"] > 0.5
     assert scores["segmentation_score"]["miou"] > 0.4
     assert report["streams"]["robot1/cloud/cloud"]["messages"] == 16
-    assert json.loads(dataflow("verify", file, "--one-host", "--json", "-q"))["identical"] is True
+    assert json.loads(dataflow("verify", file, "--one-process", "--json", "-q"))["identical"] is True
 
 
 @needs_weights
 def test_the_demo_runs_from_the_simulator_in_any_world() -> None:
-    words = ["--set", "world=corridor", "--set", "seed=7", "--set", "duration=500ms", "--one-host", "--json", "-q"]
+    words = ["--set", "world=corridor", "--set", "seed=7", "--set", "duration=500ms", "--one-process", "--json", "-q"]
     report = json.loads(dataflow("run", DEMO, *words))
 
     assert report["operators"]["robot"]["firings"] == 50

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dataflow.messages.document import families, markdown
+from messages_page import families, markdown
 
 
 def test_the_page_is_what_the_declarations_say(repository: Path) -> None:
     page = (repository / "docs" / "messages.md").read_text(encoding="utf-8")
-    assert page == markdown(), "run: python -m dataflow.messages.document > docs/messages.md"
+    assert page == markdown(), "run: python tools/messages_page.py > docs/messages.md"
 
 
 def test_the_page_has_every_type_and_field() -> None:

@@ -7,14 +7,14 @@ import re
 
 import numpy as np
 import pytest
+from example_messages import example
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from messages_page import families
 
 import dataflow.messages
 from dataflow.messages import Message, MessageError
 from dataflow.messages.base import ArrayField, ScalarField
-from dataflow.messages.document import families
-from dataflow.messages.example import example
 
 TYPES = [cls for classes in families().values() for cls in classes]
 EVERY_TYPE = pytest.mark.parametrize("cls", TYPES, ids=lambda c: c.SCHEMA)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from example_messages import example
 
 from dataflow.messages import (
     Activity,
@@ -40,7 +41,6 @@ from dataflow.messages import (
     Transforms,
     WheelTicks,
 )
-from dataflow.messages.example import example
 
 UNIT = [0.0, 0.0, 0.0, 1.0]
 NAN = float("nan")

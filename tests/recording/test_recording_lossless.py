@@ -11,6 +11,7 @@ from typing import Any
 import jsonschema
 import numpy as np
 import pytest
+from example_messages import example
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -33,7 +34,6 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages import Path as PathMessage
-from dataflow.messages.example import example
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.codecs import codec_for
 from dataflow.recording.json_codec import MAX_SAFE_INTEGER

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rerun as rr
+from example_messages import example
 from rrd_rows import Row, at, rows
 
 from dataflow import messages
@@ -29,7 +30,6 @@ from dataflow.messages import (
     Tracks,
     Transforms,
 )
-from dataflow.messages.example import example
 from dataflow.view import SceneState, ViewOptions, visualize, visualizers
 from dataflow.view.layout import layout
 

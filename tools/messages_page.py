@@ -1,6 +1,6 @@
 """The reference page of the message types, written from their declarations.
 
-python -m dataflow.messages.document > docs/messages.md
+python tools/messages_page.py > docs/messages.md
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from dataflow.messages.base import ArrayField, Field, Message, message_types
 INTRODUCTION = """\
 # Messages
 
-<!-- Written by `python -m dataflow.messages.document > docs/messages.md`; change the declarations, not this page. -->
+<!-- Written by `python tools/messages_page.py > docs/messages.md`; change the declarations, not this page. -->
 
 A message is one immutable, typed value. All have `stamp`: event time, integer nanoseconds since the epoch. They are
 imported from `dataflow.messages` and made with keywords; what does not fit its declaration is refused with an error
@@ -37,7 +37,7 @@ def families() -> dict[ModuleType, list[type[Message]]]:
     """The built-in message classes by the module that declares them, both in alphabetical order."""
     found: dict[ModuleType, list[type[Message]]] = {}
     for _, cls in sorted(message_types().items()):
-        if cls.__module__.startswith(f"{__package__}."):
+        if cls.__module__.startswith("dataflow.messages."):
             found.setdefault(sys.modules[cls.__module__], []).append(cls)
     return dict(sorted(found.items(), key=lambda item: item[0].__name__))
 

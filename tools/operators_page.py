@@ -1,6 +1,6 @@
 """The reference page of the operators that come with this package, written from what they declare.
 
-python -m dataflow.graph.catalogue_page > docs/operators.md
+python tools/operators_page.py > docs/operators.md
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from dataflow.operator import Operator
 INTRODUCTION = """\
 # Operators
 
-<!-- Written by `python -m dataflow.graph.catalogue_page > docs/operators.md`; change the operators, not this page. -->
+<!-- Written by `python tools/operators_page.py > docs/operators.md`; change the operators, not this page. -->
 
 The operators that come with this package. `dataflow operators` lists them in a terminal, `dataflow operators NAME`
 describes one of them; both show the operators of other installed packages as well. How ports and firings work:

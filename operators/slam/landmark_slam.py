@@ -1,0 +1,239 @@
+"""SLAM with point landmarks as an operator."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import LandmarkSightings, Odometry, Transforms
+from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix, transform_points, yaw_of
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.geometry.extrinsics import transform_between
+from operators.slam.landmark_filter import Association, LandmarkFilter
+
+Array = NDArray[np.float64]
+
+
+class LandmarkSlam(Operator, merge=True):
+    """Localises a robot in the plane among point landmarks that it maps as it goes: EKF-SLAM on the invariant error.
+
+    The map frame is the first pose. Sightings, polar or Cartesian, are taken at their own stamp, between the odometry
+    messages around it. Motion noise is that of each message's twist covariance, taken as independent from message to
+    message; where there is none, that of a differential drive by the parameters. Landmarks without identity are
+    associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a known landmark
+    to be it and too near to be another is ignored and counted.
+
+    Method: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
+    """
+
+    odometry: In[Odometry] = In(doc="planar motion: increments between messages count, the pose itself does not")
+    sightings: In[LandmarkSightings] = In(doc="landmarks seen from the robot")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the robot's frame and that of the sightings"
+    )
+    pose: Out[Odometry] = Out(doc="the robot in the map frame, with covariance, at every odometry message")
+    correction: Out[Transforms] = Out(doc="the odometry frame in the map frame (REP 105), whenever sightings moved it")
+    landmarks: Out[LandmarkSightings] = Out(doc="the map: every landmark in the map frame, with covariance")
+
+    map_frame: str = Param("map", min_length=1, doc="name of the frame that the first pose defines")
+    association: Literal["known", "unknown"] = Param(
+        "known", doc="known uses the identities of sightings, and associates those that have none; unknown ignores them"
+    )
+    gate: float = Param(0.99, gt=0, lt=1, doc="share of true pairs that association lets through")
+    new_landmark: float = Param(
+        0.999999, gt=0, lt=1, doc="a sighting is of a new landmark beyond this quantile of every known one"
+    )
+    forward_noise: float = Param(0.02, gt=0, doc="standard deviation of 1 m of travel, along it", unit="m/√m")
+    side_noise: float = Param(0.005, gt=0, doc="and across it", unit="m/√m")
+    turn_noise: float = Param(0.02, gt=0, doc="standard deviation of the heading after 1 m of travel", unit="rad/√m")
+    spin_noise: float = Param(0.02, ge=0, doc="and after 1 rad of turning", unit="√rad")
+
+    def setup(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self._filter = LandmarkFilter(Association(self.gate, self.new_landmark))
+        self._last: Odometry | None = None
+        self._pending: list[tuple[int, NDArray[np.int64], Array, Array]] = []
+        self._ignored: Counter[str] = Counter()
+
+    def process(
+        self, odometry: Odometry | None, sightings: LandmarkSightings | None, extrinsics: Transforms | None = None
+    ) -> dict[str, Any] | None:
+        """Raises ValueError where no transform relates the sightings' frame to the robot's."""
+        base = odometry or self._last
+        if sightings is not None:
+            if base is None:
+                self._ignored["before odometry"] += sightings.count
+            else:
+                T_base_sensor = transform_between(extrinsics, sightings.frame, base.child_frame)
+                self._pending.append((sightings.stamp, *self._planar(sightings, T_base_sensor)))
+        if odometry is None:
+            return None
+        seen = self._advance(odometry)
+        T_map_base = _matrix(self._filter.position, self._filter.heading)
+        result: dict[str, Any] = {"pose": self._pose(odometry, T_map_base)}
+        if seen:
+            result["correction"] = Transforms.from_matrix(
+                T_map_base @ invert(_flat(odometry)),
+                stamp=odometry.stamp,
+                frame=self.map_frame,
+                child_frame=odometry.frame,
+            )
+            result["landmarks"] = LandmarkSightings(
+                stamp=odometry.stamp,
+                frame=self.map_frame,
+                ids=np.array(self._filter.ids, np.int64),
+                positions=self._filter.landmarks,
+                covariances=self._filter.landmark_covariances(),
+            )
+        return result
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: so does the map."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        last = self._last
+        return {
+            "filter": self._filter.snapshot(),
+            "last": None
+            if last is None
+            else [last.stamp, last.position, last.orientation, last.frame, last.child_frame],
+            "pending": [list(item) for item in self._pending],
+            "ignored": dict(self._ignored),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._filter.restore(state["filter"])
+        if state["last"] is not None:
+            stamp, position, orientation, frame, child_frame = state["last"]
+            self._last = Odometry(
+                stamp=stamp, position=position, orientation=orientation, frame=frame, child_frame=child_frame
+            )
+        self._pending = [(int(stamp), ids, p, C) for stamp, ids, p, C in state["pending"]]
+        self._ignored = Counter(state["ignored"])
+
+    def summary(self) -> Mapping[str, float | int]:
+        counts = self._filter.counts
+        ignored = {f"ignored, {reason}": number for reason, number in sorted(self._ignored.items())}
+        return {
+            "landmarks": len(self._filter.ids),
+            "sightings matched": counts.matched,
+            "sightings of new landmarks": counts.added,
+            "ignored, ambiguous": counts.ambiguous,
+        } | ignored
+
+    def _planar(self, sightings: LandmarkSightings, T_base_sensor: Array) -> tuple[NDArray[np.int64], Array, Array]:
+        """Identities, positions (N, 2) and covariances (N, 2, 2) in the robot's frame, of what is usable."""
+        points, spread = _cartesian(sightings)
+        yaw = math.atan2(T_base_sensor[1, 0], T_base_sensor[0, 0])
+        R = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
+        flat = transform_points(T_base_sensor, points)[:, :2]
+        usable = np.asarray(np.isfinite(flat).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
+        usable &= np.linalg.det(np.where(usable[:, None, None], spread, 0.0)) > 0
+        self._ignored["invalid"] += int((~usable).sum())
+        ids = sightings.ids if self.association == "known" else np.full(sightings.count, -1)
+        first = np.zeros(len(ids), bool)
+        first[np.unique(ids, return_index=True)[1]] = True
+        usable &= first | (ids < 0)  # one landmark is one sighting of a message
+        return ids[usable], flat[usable], R @ spread[usable] @ R.T
+
+    def _advance(self, odometry: Odometry) -> bool:
+        """Moves to an odometry message, with the sightings on the way; returns whether there were any."""
+        last, self._last = self._last, odometry
+        if last is None:
+            step, covariance, span = np.zeros(3), np.zeros((3, 3)), 1
+            begin = odometry.stamp
+        else:
+            begin, span = last.stamp, odometry.stamp - last.stamp
+            T = invert(_flat(last)) @ _flat(odometry)
+            step = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
+            covariance = self._noise(odometry, step, span * 1e-9)
+        due, self._pending = self._pending, []
+        done = 0.0
+        for stamp, ids, points, spread in due:
+            share = min(1.0, max(done, (stamp - begin) / span)) if last is not None else 0.0
+            self._move(step, covariance, done, share)
+            done = share
+            self._filter.see(ids.tolist(), points, spread)
+        self._move(step, covariance, done, 1.0)
+        return bool(due)
+
+    def _move(self, step: Array, covariance: Array, begin: float, end: float) -> None:
+        """Moves along a part of a step: on an arc, at constant speed."""
+        if end <= begin or not covariance.any():
+            return
+        T = invert(_arc(step, begin)) @ _arc(step, end)
+        self._filter.move(T[:2, 3], step[2] * (end - begin), covariance * (end - begin))
+
+    def _noise(self, odometry: Odometry, step: Array, seconds: float) -> Array:
+        """Covariance (3, 3) of a step (x, y, heading)."""
+        if odometry.twist_covariance is not None:
+            planar = [0, 1, 5]
+            return np.asarray(odometry.twist_covariance[np.ix_(planar, planar)] * seconds**2)
+        way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
+        heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
+        return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])
+
+    def _pose(self, odometry: Odometry, T_map_base: Array) -> Odometry:
+        covariance = np.diag([0.0, 0.0, 1e-9, 1e-9, 1e-9, 0.0])
+        planar = [0, 1, 5]
+        covariance[np.ix_(planar, planar)] = self._filter.pose_covariance()
+        return Odometry.from_matrix(
+            T_map_base,
+            stamp=odometry.stamp,
+            frame=self.map_frame,
+            child_frame=odometry.child_frame,
+            linear=odometry.linear,
+            angular=odometry.angular,
+            pose_covariance=covariance,
+        )
+
+
+def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
+    """Points (N, 3) in the sensor's frame and the covariances (N, 2, 2) of their x and y. Raises ValueError."""
+    if sightings.positions is not None:
+        flat = sightings.positions
+        points = np.column_stack([flat, np.zeros(len(flat))]) if flat.shape[1] == 2 else flat
+        if sightings.covariances is None:
+            raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
+        return points, sightings.covariances[:, :2, :2]
+    if sightings.ranges is None or sightings.bearings is None:
+        raise ValueError("sightings need positions, or ranges and bearings: one of the two does not say where it is")
+    if sightings.covariances is None:
+        raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
+    r, b = sightings.ranges, sightings.bearings
+    e = np.zeros_like(r) if sightings.elevations is None else sightings.elevations
+    level = r * np.cos(e)
+    points = np.column_stack([level * np.cos(b), level * np.sin(b), r * np.sin(e)])
+    J = np.empty((len(r), 2, 2))
+    J[:, 0, 0], J[:, 0, 1] = np.cos(e) * np.cos(b), -level * np.sin(b)
+    J[:, 1, 0], J[:, 1, 1] = np.cos(e) * np.sin(b), level * np.cos(b)
+    return points, J @ sightings.covariances[:, :2, :2] @ J.transpose(0, 2, 1)
+
+
+def _flat(odometry: Odometry) -> Array:
+    """The pose in the plane, as a rigid motion (4, 4)."""
+    return _matrix(odometry.position[:2], float(yaw_of(odometry.orientation)))
+
+
+def _matrix(position: Array, heading: float) -> Array:
+    return transform_matrix([position[0], position[1], 0.0], quaternion_from_yaw(heading))
+
+
+def _arc(step: Array, share: float) -> Array:
+    """The motion (4, 4) after a share of a step (x, y, turn) at constant velocity."""
+    turn = float(step[2])
+    half = turn / 2
+    chord = half / math.tan(half) if abs(turn) > 1e-6 else 1.0
+    vx, vy = chord * step[0] + half * step[1], chord * step[1] - half * step[0]
+    part = turn * share
+    a, b = (share, share * part / 2) if abs(turn) < 1e-6 else (math.sin(part) / turn, (1 - math.cos(part)) / turn)
+    return _matrix(np.array([a * vx - b * vy, b * vx + a * vy]), part)

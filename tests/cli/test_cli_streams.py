@@ -1,0 +1,154 @@
+"""Ctrl-C, closed and full outputs, folders that are gone: one line and an exit code, at any moment."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.text import Text
+
+from dataflow.cli import output
+from dataflow.cli.output import print_json, visible
+
+PACKAGE = Path(__file__).resolve().parents[2]
+START = [sys.executable, "-P", "-m", "dataflow.cli.start"]
+
+INTERRUPTED_IMPORT = """\
+import os, signal, sys
+
+wanted = sys.argv.pop(1)
+
+class Interrupts:
+    def find_spec(self, name, path=None, target=None):
+        if name == wanted:
+            os.kill(os.getpid(), signal.SIGINT)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+sys.meta_path.insert(0, Interrupts())
+from dataflow.cli.start import main
+main()
+"""
+
+
+def shell(command: str, *words: object, folder: Path | None = None) -> subprocess.CompletedProcess[str]:
+    """`command` as the shell reads it; "$@" there is `dataflow` with `words`."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGE), os.environ.get("PYTHONPATH", "")])}
+    call = ["sh", "-c", command, "sh", *START, *map(str, words)]
+    return subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=60)
+
+
+@pytest.mark.parametrize("module", ["typer", "dataflow.cli.execution", "dataflow.recording"])
+def test_ctrl_c_while_something_is_imported_is_no_error(small: Path, module: str) -> None:
+    told = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_IMPORT, module, "info", str(small)],
+        env={**os.environ, "PYTHONPATH": str(PACKAGE)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+    assert told.returncode == 130
+    assert "Traceback" not in told.stderr
+    assert told.stdout == ""
+
+
+def test_a_closed_output_is_refused(small: Path, tmp_path: Path) -> None:
+    recording = tmp_path / "made.mcap"
+    told = shell('exec "$@" >&-', "run", small, "--record", recording)
+
+    assert told.returncode == 2
+    assert told.stderr == "error: standard output is closed; > /dev/null discards it\n"
+    assert not recording.exists()
+
+
+def test_a_closed_error_output_does_not_keep_a_command_from_its_work(small: Path) -> None:
+    told = shell('exec "$@" 2>&- <&-', "check", small)
+
+    assert told.returncode == 0
+    assert told.stdout.startswith("ok ")
+    assert shell('exec "$@" 2>&-', "check", "nothing.yaml").returncode == 2
+
+
+@pytest.mark.parametrize("words", [("--version",), ("check", "{small}"), ("check", "{small}", "--json")])
+def test_a_full_disk_behind_the_output_is_one_line(small: Path, words: tuple[str, ...]) -> None:
+    told = shell('exec "$@" >/dev/full', *(word.format(small=small) for word in words))
+
+    assert told.returncode == 2
+    assert told.stderr == "error: standard output cannot be written: No space left on device\n"
+
+
+def test_a_reader_that_has_seen_enough_is_no_error(small: Path) -> None:
+    told = shell('"$@" | true', "operators")
+
+    assert told.stderr == ""
+
+
+def test_a_command_works_where_the_current_folder_is_gone(recorded, tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    told = shell('rmdir "$PWD"; exec "$@"', "info", recorded[0], folder=gone)
+    assert (told.returncode, told.stderr) == (0, "")
+
+    gone.mkdir()
+    told = shell('rmdir "$PWD"; exec "$@"', "info", "run.mcap", folder=gone)
+    assert told.returncode == 2
+    assert told.stderr.startswith("error: ")
+    assert "Traceback" not in told.stderr
+    assert "internal error" not in told.stderr
+
+
+ESCAPES = "\x1b[2J\x1b]0;owned\x07\x9b31m\u202e\udc80"
+
+
+def test_control_characters_never_reach_a_terminal(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    written = io.StringIO()
+    console = output._console(stderr=False)
+    monkeypatch.setattr(console, "file", written)
+    console.print(Text(f"a{ESCAPES}b"), soft_wrap=True)
+    table = output.table("stream")
+    table.add_row(Text(f"a{ESCAPES}b"))
+    console.print(table)
+    print_json({"name": ESCAPES})
+    told = written.getvalue() + capsys.readouterr().out
+
+    assert not any(ord(c) < 32 and c != "\n" for c in told)
+    assert not set(told) & {"\x9b", "\u202e", "\udc80"}
+    assert told.count("\\x1b[2J") >= 2
+
+
+@given(st.text())
+def test_what_can_be_seen_is_left_as_it_is(text: str) -> None:
+    seen = visible(text)
+
+    assert visible(seen) == seen
+    assert seen.encode().decode() == seen
+    if text.isprintable():
+        assert seen == text
+
+
+def test_names_in_a_recording_are_shown_without_their_escapes(dataflow, tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "escape.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="[bold]p\x1b[2J", library="\x1b]0;owned\x07")
+        schema = writer.register_schema("s\x1b[31m", "jsonschema", b"{}")
+        channel = writer.register_channel("/a\x1b[2J/[red]x", "json", schema)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.add_metadata("recording", {"namespace": "\x9b2J"})
+        writer.finish()
+    for words in (["info", path], ["info", path, "--metadata"], ["info", path, "--json"], ["diff", path, path]):
+        told = dataflow(*words)
+        for text in (told.stdout, told.stderr):
+            assert "\x1b" not in text
+            assert "\x9b" not in text
+    assert "/[red]x" in json.loads(dataflow("info", path, "--json").stdout)["streams"][0]["name"]
+    assert "\\x1b" in dataflow("info", path).stdout
