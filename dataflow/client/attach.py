@@ -7,7 +7,10 @@ import time
 from collections.abc import Iterator, Sequence
 
 from dataflow.graph.model import Graph
+from dataflow.messages.base import message_type
+from dataflow.messages.declaration import known_type
 from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
+from dataflow.transport.codec import TypeOf
 from dataflow.transport.registry import RunningGraph, running
 
 POLL = 0.1
@@ -41,6 +44,15 @@ def graph_of(found: RunningGraph) -> Graph:
     return Graph.from_json(found.graph)
 
 
+def types_of(graph: Graph) -> TypeOf:
+    """The classes that a tool reads a graph's messages as; the graph's own types by their declarations.
+
+    Nothing of the graph's code is imported: its modules may not even be there where the tool runs.
+    """
+    own = {schema: known_type(declaration) for schema, declaration in graph.types.items()}
+    return lambda schema: own.get(schema) or message_type(schema)
+
+
 def still_runs(found: RunningGraph) -> bool:
     """Whether that very run goes on."""
     return any(g.pid == found.pid and g.started == found.started for g in running())
@@ -52,7 +64,7 @@ def tap(found: RunningGraph, expressions: Sequence[str], window: TapWindow | Non
     absolute = [e[1:] if e.startswith("/") else f"{found.namespace}/{e}" for e in expressions]
     with Bus(NetworkConfig(connect=found.endpoints)) as bus:
         _until_connected(bus, found)
-        with TapClient(bus, found.namespace, absolute, window) as client:
+        with TapClient(bus, found.namespace, absolute, window, types=types_of(graph_of(found))) as client:
             yield client
 
 

@@ -111,6 +111,8 @@ class Host:
         for stream in self.config.subscribe:
             self.bus.subscribe(stream, self._receiver(stream))
         self.channel.send("joined")
+        for stream in self.config.subscribe:
+            self.graph.message_types(stream)  # its messages may be of a type that no operator here names
         for name in self.config.nodes:
             self._make(self.graph.nodes[name])
             self.bus.serve(runtime_key(self.graph.namespace, "param", name), self._parameter_asked(name))

@@ -18,7 +18,7 @@ import numpy as np
 
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
-from dataflow.messages.base import Message, message_type
+from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.network import network_config
@@ -317,8 +317,3 @@ def viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
 
 
 SINKS: Mapping[str, Callable[[SinkConfig, Graph], StreamSink]] = {"record": recorder, "view": viewer_file}
-
-
-def stream_types(graph: Graph, stream: str) -> tuple[type[Message], ...]:
-    """The message classes that a stream may carry."""
-    return tuple(message_type(schema) for schema in graph.streams[stream].types)

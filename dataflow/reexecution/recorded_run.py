@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, replace
-
-import pydantic
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from dataflow.graph import load_bundle
-from dataflow.graph.model import Bundle, Graph
+from dataflow.graph.model import Graph
+from dataflow.messages.base import message_type
+from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording, RecordingError
 from dataflow.recording.layout import ENDS, GRAPH
 
@@ -34,27 +34,36 @@ def recorded_graph(recording: Recording) -> Graph:
     return load_bundle(bundle)
 
 
-def wiring(recording: Recording) -> Graph | None:
-    """The resolved graph that a recording holds, without its files: nothing is imported and nothing can be run by it.
+def resolved_graph(recording: Recording) -> Graph | None:
+    """Returns the graph that made a recording as it was resolved then, for tools that look: imports no operator.
 
-    None where it holds none, or none that is sound (an older recording, or another program's).
+    None where the recording holds none, or none that is sound (another version's, or another program's).
     """
-    resolved = recording.metadata.get(GRAPH, {}).get("resolved")
-    if resolved is None:
-        return None
+    held = recording.metadata.get(GRAPH, {})
     try:
-        graph: Graph = pydantic.TypeAdapter(Graph).validate_json(resolved)
-    except pydantic.ValidationError:
+        graph = Graph.from_json(json.loads(held["resolved"]) | {"bundle": _bundle(json.loads(held["bundle"]))})
+    except (KeyError, TypeError, ValueError, AttributeError):
         return None
     makers = {stream.node for stream in graph.streams.values()}
     taken = {stream for node in graph.nodes.values() for streams in node.inputs.values() for stream in streams}
     return graph if makers <= graph.nodes.keys() and taken <= graph.streams.keys() else None
 
 
+def _bundle(packed: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in packed.items() if name != "format"}
+
+
 def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
-    """Gives what a recording must hold so that its graph can be loaded again, and be shown without its operators."""
-    resolved = json.dumps(asdict(replace(graph, sources_bundle=Bundle("", {}))))
-    return {GRAPH: {"name": graph.name, "bundle": graph.bundle(), "text": graph.text, "resolved": resolved}}
+    """What a recording must hold so that its graph can be loaded again, or looked at without its operators."""
+    resolved = {name: value for name, value in graph.to_json().items() if name != "bundle"}
+    return {
+        GRAPH: {
+            "name": graph.name,
+            "bundle": graph.bundle(),
+            "text": graph.text,
+            "resolved": json.dumps(resolved, ensure_ascii=False),
+        }
+    }
 
 
 def check_type(recording: Recording, graph: Graph, stream: str) -> None:
@@ -65,6 +74,16 @@ def check_type(recording: Recording, graph: Graph, stream: str) -> None:
         raise ReplayError(
             f"{recording.path}: stream {stream!r} holds {info.schema}, "
             f"the graph's {graph.streams[stream].node!r} emits {' | '.join(wanted)}"
+        )
+    if info.declaration is None:
+        return
+    schema = info.declaration.schema
+    expected = graph.types.get(schema) or Declaration.of(message_type(schema))
+    if faults := info.declaration.differences(expected, "the recording", expected.path):
+        raise ReplayError(
+            f"{recording.path}: stream {stream!r} holds {schema} as it was declared when it was recorded, and "
+            f"{expected.path} declares it differently: {'; '.join(faults)}. Restore the fields, or give the new type "
+            "another schema name: class ...(Message, schema=...)"
         )
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final
@@ -26,6 +26,8 @@ ALIGNMENT: Final = 64
 PRELUDE: Final = struct.Struct("<4sBBHI")  # magic, version, kind, head bytes, body bytes
 
 Buffer = bytes | bytearray | memoryview
+TypeOf = Callable[[str], type[Message]]
+"""The message class of a schema name; raises `MessageError` for an unknown one."""
 
 _INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
 _PADDING = bytes(ALIGNMENT)
@@ -182,8 +184,8 @@ def decode_head(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Head:
     return _head(_bytes_view(buffer), limits)[0]
 
 
-def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Envelope:
-    """The envelope in `buffer`, which must hold exactly one.
+def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS, types: TypeOf = message_type) -> Envelope:
+    """The envelope in `buffer`, which must hold exactly one. `types` gives the class of a schema name.
 
     The message's arrays are read-only views of `buffer`: nobody may write to it afterwards. Raises only `DecodeError`.
     """
@@ -197,7 +199,7 @@ def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Envelope:
             raise DecodeError(f"{_where(head)}: {len(view) - body_start} bytes after the head, expected none")
         message = None
     else:
-        message = _message(view, head, body_start, body_end, limits)
+        message = _message(view, head, body_start, body_end, limits, types)
     return Envelope(head.kind, head.stream, head.incarnation, head.seq, head.stamp, message, head.reason, head.wall)
 
 
@@ -256,14 +258,14 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
     return Head(Kind(kind), stream, incarnation, seq, stamp, wall, reason), body_start, body_bytes
 
 
-def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits) -> Message:
+def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits, types: TypeOf) -> Message:
     body = _Body(view[start:end], head, limits)
     body.array("body", 3)
     schema = body.value("schema")
     if type(schema) is not str:
         raise DecodeError(f"{_where(head)}: schema must be a string, got {_short(schema)}")
     try:
-        cls = message_type(schema)
+        cls = types(schema)
     except MessageError as error:
         raise DecodeError(f"{_where(head)}: {_short(error)}") from None
     body.array("header", len(cls.SCALARS))

@@ -21,8 +21,9 @@ from typing import Any, Final, Self
 import msgpack
 import zenoh
 
+from dataflow.messages.base import message_type
 from dataflow.transport.bus import Bus, undeclare
-from dataflow.transport.codec import DEFAULT_LIMITS, Envelope, Head, Limits, decode, decode_head, encode
+from dataflow.transport.codec import DEFAULT_LIMITS, Envelope, Head, Limits, TypeOf, decode, decode_head, encode
 from dataflow.transport.keys import runtime_key, stream_of_tap, tap_key
 
 SYNC_EVERY = 0.5
@@ -301,10 +302,11 @@ class TapServer:
 
 @dataclass(frozen=True, slots=True)
 class TapMessage:
-    """A copy of what a host published: the stream and the encoded envelope."""
+    """A copy of what a host published: the stream and the encoded envelope. `types`: the class of a schema name."""
 
     stream: str
     payload: bytes
+    types: TypeOf = message_type
 
     def head(self, limits: Limits = DEFAULT_LIMITS) -> Head:
         """The envelope's head alone; raises `DecodeError`."""
@@ -312,7 +314,7 @@ class TapMessage:
 
     def decode(self, limits: Limits = DEFAULT_LIMITS) -> Envelope:
         """The envelope; raises `DecodeError`."""
-        return decode(self.payload, limits)
+        return decode(self.payload, limits, self.types)
 
 
 @dataclass(slots=True)
@@ -341,8 +343,13 @@ class TapClient:
         window: TapWindow | None = None,
         *,
         statics_within: float = 1.0,
+        types: TypeOf = message_type,
     ) -> None:
-        """Raises `ValueError` for an expression that is none. Waits at most `statics_within` s for the statics."""
+        """Raises `ValueError` for an expression that is none. Waits at most `statics_within` s for the statics.
+
+        `types` gives the class of a schema name, which messages are decoded as.
+        """
+        self._types = types
         self.window = window or TapWindow()
         self.id = secrets.token_hex(8)
         try:
@@ -360,7 +367,7 @@ class TapClient:
         self._closed = False
         statics = bus.query_static(namespace, timeout=statics_within)
         self._statics = deque(
-            TapMessage(stream, payload) for stream, payload in sorted(statics.items()) if self._wants(stream)
+            TapMessage(stream, payload, types) for stream, payload in sorted(statics.items()) if self._wants(stream)
         )
         session = bus.session
         self._subscriber = session.declare_subscriber(
@@ -393,7 +400,7 @@ class TapClient:
             for key, ack in acks:
                 self._bus.session.put(key, ack, congestion_control=zenoh.CongestionControl.DROP, express=True)
             if stream:
-                return TapMessage(stream, payload)
+                return TapMessage(stream, payload, self._types)
 
     def close(self) -> None:
         """Ends the tap; further calls do nothing."""

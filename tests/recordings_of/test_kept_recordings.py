@@ -51,7 +51,7 @@ FILES = sorted(DIGESTS)
 def test_a_kept_recording_opens_and_its_streams_have_the_digests_they_had(file: str) -> None:
     with Recording(HERE / file) as recording:
         assert not recording.torn
-        assert recording.digests() == recording.written_digests() == DIGESTS[file]
+        assert recording.digests() == recording.metadata["digests"] == DIGESTS[file]
 
 
 def test_the_kept_live_recording_holds_what_live_runs_do() -> None:
