@@ -28,7 +28,7 @@ WITHHELD = -1
 
 
 class FiringRecordError(ValueError):
-    """A batch of firing records that cannot be read: says which operator and what is wrong."""
+    """A batch of firing records that cannot be written or read: says what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,8 +158,9 @@ def decode_batch(data: bytes) -> Batch:
         last = bool(batch["last"])
     except FiringRecordError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, msgpack.UnpackException) as error:
-        raise FiringRecordError(f"not a batch of firing records: {type(error).__name__}: {error}") from error
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, msgpack.UnpackException) as error:
+        what = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise FiringRecordError(f"not a batch of firing records ({what})") from error
     return Batch(operator, incarnation, last, records)
 
 

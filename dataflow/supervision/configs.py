@@ -14,16 +14,19 @@ Config = tuple[str, dict[str, Any]]
 def configurations(
     plan: RunPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str], secret: str
 ) -> dict[str, Config]:
-    """Returns every process's configuration by label; `endpoints` are those on which the processes listen, `secret` what
-    the run's messages are sealed with."""
+    """Returns every process's configuration by label.
+
+    `endpoints` are those on which the processes listen, `secret` what the run's messages are sealed with.
+    """
     first = next(iter(hosts))
-    return {
-        label: _sink(plan, host, common)
-        if host.sink is not None
-        else _host(plan, host, common, endpoints, label == first)
-        for label, host in hosts.items()
-        for common in [_common(plan, host, endpoints) | {"secret": secret}]
-    }
+    configs: dict[str, Config] = {}
+    for label, host in hosts.items():
+        common = _common(plan, host, endpoints) | {"secret": secret}
+        if host.sink is None:
+            configs[label] = _host(plan, host, common, endpoints, label == first)
+        else:
+            configs[label] = _sink(plan, host, common)
+    return configs
 
 
 def _common(plan: RunPlan, host: HostPlan, endpoints: Mapping[str, str]) -> dict[str, Any]:
@@ -31,7 +34,7 @@ def _common(plan: RunPlan, host: HostPlan, endpoints: Mapping[str, str]) -> dict
     return {"label": host.label, "graph": plan.graph.to_json(), "connect": connect, "live": plan.live}
 
 
-def _sink(host: HostPlan, plan: RunPlan, common: Mapping[str, Any]) -> Config:
+def _sink(plan: RunPlan, host: HostPlan, common: Mapping[str, Any]) -> Config:
     return "sink", {
         **common,
         "kind": host.sink,

@@ -18,7 +18,7 @@ from dataflow.client.attach import find_running
 from dataflow.client.processes import HostStatus
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
 from dataflow.supervision.supervisor import Supervisor

@@ -16,7 +16,7 @@ from tests_runtime_graphs import chain
 
 from dataflow.graph import Graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.supervisor import Supervisor

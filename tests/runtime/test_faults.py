@@ -14,7 +14,7 @@ from dataflow.graph import Graph, load_graph
 from dataflow.messages import Diagnostics
 from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision import heartbeats
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import run

@@ -22,7 +22,7 @@ from background_run import Background
 from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
 from dataflow.supervision.supervisor import Supervisor

@@ -11,7 +11,7 @@ from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import RUN
 from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.run import run
 from dataflow.sync import Entry
 from dataflow.verification.verify import verify
