@@ -8,8 +8,7 @@ import pytest
 from process_doubles import STREAM, RecordedChannel, end, frontier, message
 
 from dataflow.process.complaints import Complaints
-from dataflow.process.inlet import AnyOrder, Inlet, StreamDamaged
-from dataflow.process.stream_order import StreamOrder
+from dataflow.process.inlet import Inlet, StreamDamaged
 from dataflow.sync import FOREVER
 from dataflow.transport import Envelope, Kind, encode
 
@@ -17,7 +16,7 @@ from dataflow.transport import Envelope, Kind, encode
 class Inflow:
     """An inlet, and what came out of it."""
 
-    def __init__(self, *, live: bool = True, static: tuple[str, ...] = (), order: type = StreamOrder) -> None:
+    def __init__(self, *, live: bool = True, static: tuple[str, ...] = ()) -> None:
         self.delivered: list[tuple[Kind, int]] = []
         self.printed: list[str] = []
         self.channel = RecordedChannel()
@@ -28,7 +27,6 @@ class Inflow:
             lambda stream, envelope: self.delivered.append((envelope.kind, envelope.seq)),
             static=static,
             live=live,
-            order=order,
             complaints=Complaints(lambda: self.now, lambda line: self.printed.append(line) is None),
         )
 
@@ -117,14 +115,6 @@ def test_a_static_stream_is_taken_once_and_its_end_only_after_it() -> None:
     assert inflow.delivered == [(Kind.MESSAGE, 0), (Kind.END, 1)]
     assert (inflow.inlet.received, inflow.inlet.misplaced) == (3, 1)
     assert not inflow.inlet.statics_missing([STREAM])
-
-
-def test_a_reexecution_takes_everything_as_it_comes() -> None:
-    inflow = Inflow(live=False, order=AnyOrder)
-
-    inflow.take(message(5), message(0, incarnation=1), message(2))
-
-    assert [seq for _, seq in inflow.delivered] == [5, 0, 2]
 
 
 def test_a_probe_is_told_of_once_until_its_process_was_restarted() -> None:
