@@ -194,7 +194,7 @@ def breaking(folder: Path, use: str, how: str) -> Graph:
     file.write_text(
         "graph: errors\nnamespace: test\noperators:\n"
         "  left: {use: runtime_operators:Counter, params: {count: 40, period: 2000000}}\n"
-        f"  broken: {{use: {use}, params: {{how: {how}}}, inputs: {{x: left/fast}}, live: {{restart: {{max: 3}}}}}}\n"
+        f"  broken: {{use: {use}, params: {{how: {how}}}, inputs: {{x: left/fast}}, live: {{queue: block, restart: {{max: 3}}}}}}\n"
     )
     return load_graph(file, live=True)
 
