@@ -2,5 +2,7 @@
 
 from operators.cloud.cloud_builder import CloudBuilder
 from operators.cloud.cloud_filter import CloudFilter
+from operators.cloud.clusterer import Clusterer
+from operators.cloud.plane_segmenter import PlaneSegmenter
 
-__all__ = ["CloudBuilder", "CloudFilter"]
+__all__ = ["CloudBuilder", "CloudFilter", "Clusterer", "PlaneSegmenter"]
