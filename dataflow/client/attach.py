@@ -12,9 +12,12 @@ from dataflow.messages.declaration import known_type
 from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
 from dataflow.transport.codec import TypeOf
 from dataflow.transport.registry import RunningGraph, running
+from dataflow.transport.tap_client import held_statics
 
 POLL = 0.1
-CONNECT_WITHIN = 5.0
+AGAIN_AFTER = 0.005
+CONNECT_WITHIN = 1.0
+"""Seconds that a tool waits for processes that do not answer: they are starting again, stopped, or hang."""
 
 
 class NotRunning(LookupError):
@@ -69,10 +72,15 @@ def tap(found: RunningGraph, expressions: Sequence[str], window: TapWindow | Non
 
 
 def _until_connected(bus: Bus, found: RunningGraph) -> None:
-    """Waits (bounded) until every host is reached and answers for its static streams."""
-    expected = {s.name for s in graph_of(found).streams.values() if s.static}
+    """Waits (bounded) until every process is reached, and answers for the static streams that it holds."""
     deadline = time.monotonic() + CONNECT_WITHIN
     while len(bus.peers()) < len(found.endpoints) and time.monotonic() < deadline:
-        time.sleep(POLL / 5)
-    while not expected <= set(bus.query_static(found.namespace, timeout=1.0)) and time.monotonic() < deadline:
-        time.sleep(POLL)
+        time.sleep(AGAIN_AFTER)
+    held: list[set[str]] = []
+    while len(held) < len(bus.peers()) and (left := deadline - time.monotonic()) > 0:
+        held = held_statics(bus, found.namespace, left)
+    expected = set().union(*held)
+    while (left := deadline - time.monotonic()) > 0:
+        if expected <= set(bus.query_static(found.namespace, timeout=left)):
+            return
+        time.sleep(AGAIN_AFTER)

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
+from dataflow.firing.seeding import version_of
 from dataflow.graph import load_bundle
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, Network
 from dataflow.messages.base import message_type
 from dataflow.messages.declaration import Declaration
-from dataflow.recording import Recording
-from dataflow.recording.layout import ENDS, GRAPH
+from dataflow.recording import Recording, RecordingError
+from dataflow.recording.layout import ENDS, GRAPH, RUN
 
 
 class ReplayError(ValueError):
@@ -19,10 +21,31 @@ class ReplayError(ValueError):
 
 
 def recorded_graph(recording: Recording) -> Graph:
-    """The graph that made a recording. Raises `ReplayError` when it does not hold one."""
+    """Returns the graph that made a recording, without its network: a recording opens no port and calls nobody.
+
+    Its operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`.
+    """
+    return isolated(graph_as_recorded(recording))
+
+
+def isolated(graph: Graph) -> Graph:
+    """Returns a graph whose processes can only be reached from this machine, whatever its `network:` section says."""
+    return replace(graph, network=Network(shared_memory=graph.network.shared_memory))
+
+
+def graph_as_recorded(recording: Recording) -> Graph:
+    """Returns the graph that made a recording, as it is; its operators are imported. Raises as `recorded_graph`."""
     bundle = recording.metadata.get(GRAPH, {}).get("bundle")
     if bundle is None:
         raise ReplayError(f"{recording.path} does not hold the graph that made it: name one with --graph")
+    try:
+        packed = json.loads(bundle)
+    except (ValueError, RecursionError):
+        packed = None
+    if not isinstance(packed, dict) or not packed.keys() >= {"format", "file", "files"}:
+        raise ReplayError(
+            f"{recording.path}: what it holds in place of the graph that made it is no graph: name one with --graph"
+        )
     return load_bundle(bundle)
 
 
@@ -80,7 +103,22 @@ def check_type(recording: Recording, graph: Graph, stream: str) -> None:
 
 
 def final_stamps(recording: Recording, streams: Iterable[str]) -> dict[str, int]:
-    """The stamps that streams ended with in the recorded run, where the recording says so."""
+    """The stamps that streams ended with in the recorded run, where the recording says so.
+
+    Raises `RecordingError` where it cannot be read.
+    """
     ends = recording.metadata.get(ENDS, {})
-    known = {s: json.loads(ends[s]) for s in streams if s in ends}
-    return {s: end["final"] for s, end in known.items() if end["final"] is not None}
+    finals: dict[str, int] = {}
+    for stream in streams:
+        try:
+            final = json.loads(ends[stream])["final"] if stream in ends else None
+            if final is not None:
+                finals[stream] = int(final)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise RecordingError(f"{recording.path}: how stream {stream!r} ended cannot be read: {error!r}") from error
+    return finals
+
+
+def seeding_of(recording: Recording) -> int:
+    """Returns the version of the scheme by which the recorded run seeded its generators."""
+    return version_of(recording.metadata.get(RUN, {}))

@@ -51,3 +51,16 @@ def test_a_clock_that_jumped_back_leaves_no_stamps() -> None:
 
 def test_an_operator_that_said_nothing_yet_begins_its_first_new_incarnation() -> None:
     assert HeldRecords(("y",)).resumed() == {"incarnation": 1, "last": {}, "changed": {}}
+
+
+def test_what_is_held_is_bounded_in_bytes_and_the_last_snapshot_is_always_there() -> None:
+    held = HeldRecords(("y",), nbytes=10_000)
+    for k in range(100):
+        detail = {"state": bytes(4_000)}
+        held.add(encode_batch([FiringRecord("map", 0, 2 * k, "snapshot", k, detail=detail)]))
+        held.add(fire(2 * k + 1, k))
+        assert held.held == sum(map(len, held.batches)) <= 10_000
+
+    held.add(encode_batch([FiringRecord("map", 0, 200, "snapshot", 100, detail={"state": bytes(50_000)})]))
+    assert len(held.batches) == 1
+    assert held.resumed()["last"] == {"y": 99}
