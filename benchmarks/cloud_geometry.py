@@ -231,7 +231,7 @@ def run(world: str, seed: int, frames: int) -> Score:
         assert coded.colors is not None
         pixel = coded.colors.astype(np.int64) @ [65536, 256, 1]
         classes, instances = masks.classes.ravel()[pixel], masks.instances.ravel()[pixel]
-        segmenter.rng = np.random.default_rng(k)
+        segmenter.seed_rng(k)
         start = time.perf_counter()
         found = segmenter.process(cloud, pose)
         middle = time.perf_counter()
@@ -271,28 +271,30 @@ def _flying(score: Score, world: str, seed: int, frames: int) -> None:
         score_flying(score, depth, 0.0015, rng)
 
 
+def _row(name: str, score: Score) -> str:
+    pairs = [(f"{kind} {a}", f"{kind} {b}") for kind in KINDS for a, b in (("found", "true"), ("right", "said"))]
+    pairs += [(f"objects {group} matched", f"objects {group}") for group in ("any", "free")]
+    return f"| {name} | " + " | ".join(score.share(*pair) for pair in pairs) + " |"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="+", default=[21, 22])
     parser.add_argument("--worlds", nargs="+", default=["office", "corridor", "table_top"])
-    parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--frames", type=int, default=6)
     arguments = parser.parse_args()
-    total = Score()
-    scores = {}
+    columns = [f"{kind} {what}" for kind in KINDS for what in ("recall", "precision")]
+    print("| world | " + " | ".join(columns) + " | objects | of them free |\n" + "| --- " * 9 + "|")
+    total, scores = Score(), {}
     for world in arguments.worlds:
         for seed in arguments.seeds:
             score = scores[f"{world} {seed}"] = run(world, seed, arguments.frames)
+            print(_row(f"{world} {seed}", score), flush=True)
             total.counts.update(score.counts)
             for name, values in score.milliseconds.items():
                 total.milliseconds.setdefault(name, []).extend(values)
     scores["all"] = total
-    columns = [f"{kind} {what}" for kind in KINDS for what in ("recall", "precision")]
-    print("| world | " + " | ".join(columns) + " | objects | of them free |\n" + "| --- " * 9 + "|")
-    for name, score in scores.items():
-        cells = [score.share(*pair) for kind in KINDS
-                 for pair in ((f"{kind} found", f"{kind} true"), (f"{kind} right", f"{kind} said"))]  # fmt: skip
-        cells += [score.share(f"objects {group} matched", f"objects {group}") for group in ("any", "free")]
-        print(f"| {name} | " + " | ".join(cells) + " |")
+    print(_row("all", total))
     print("\n| world | flying pixels | lost | RMSE before | after | RMSE elsewhere before | after | lost elsewhere |")
     print("| --- " * 8 + "|")
     for name, score in scores.items():
