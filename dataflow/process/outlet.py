@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel
+from dataflow.process.recent import RecentFirings
 from dataflow.records.firing import FiringRecord, encode_batch
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Bus, Envelope, Kind, StreamPublisher, TapServer, encode
@@ -62,6 +63,7 @@ class Outlet:
         incarnations: Mapping[str, int],
     ) -> None:
         self.sent = 0
+        self.recent = RecentFirings()
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
         self._live, self._firings = live, firings
         self._links: Links | None = None
@@ -144,6 +146,7 @@ class Outlet:
         return Envelope(kind, stream, incarnation, seq, stamp, reason=reason)
 
     def record(self, record: FiringRecord) -> None:
+        self.recent.add(record)
         if self._live:  # ahead of its messages, to where it survives this process
             self._channel.send("record", operator=record.operator, data=encode_batch([record]))
         if self._firings:

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from process_doubles import RecordedChannel
 
+from dataflow.firing.work import Work
 from dataflow.process.progress import REPORT_EVERY, REPORT_IDLE, Progress
 
 
@@ -17,7 +18,7 @@ class Reporting:
     def __init__(self) -> None:
         ports = SimpleNamespace(emitted=0, states={})
         node = SimpleNamespace(name="last")
-        self.operator = SimpleNamespace(node=node, done=0, firings=0, drops={}, ports=ports, busy_ns=0)
+        self.operator = SimpleNamespace(node=node, done=0, firings=0, drops={}, ports=ports, work=Work())
         self.channel, self.now = RecordedChannel(), 0.0
         runners: Any = SimpleNamespace(operators=[self.operator], sources=[])
         feeding: Any = SimpleNamespace(feeds=[], logs=[])
