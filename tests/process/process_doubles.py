@@ -15,7 +15,7 @@ STREAM = "test/left/fast"
 def message(seq: int, stamp: int | None = None, incarnation: int = 0) -> Envelope:
     at = 1000 + 10 * seq if stamp is None else stamp
     data = FeatureVector(stamp=at, vectors=np.zeros((1, 1), np.float32), model="test")
-    return Envelope.of(data, STREAM, seq, incarnation)
+    return Envelope(Kind.MESSAGE, STREAM, incarnation, seq, at, data)
 
 
 def frontier(seq: int, stamp: int, incarnation: int = 0) -> Envelope:

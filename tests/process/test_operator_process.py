@@ -39,7 +39,7 @@ class OneProcess:
         graph = load_text(GRAPH.replace("OPERATOR", operator))
         self.inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self.channel = RecordedChannel()
-        config = ProcessConfig("last", graph.to_json(), ["last"], {}, [STREAM], [], [], live=live)
+        config = ProcessConfig("last", graph.to_json(), ["last"], {}, [STREAM], [], [], "secret", live=live)
         self.process = OperatorProcess(config, self.channel, self.inbox)  # type: ignore[arg-type]
         self.process.make()
         for runner in self.process.runners.all:
@@ -48,7 +48,7 @@ class OneProcess:
 
     def arrives(self, *stamps: int, first: int = 0) -> None:
         for seq, stamp in enumerate(stamps, first):
-            envelope = Envelope.of(value(stamp, seq), STREAM, seq)
+            envelope = Envelope(Kind.MESSAGE, STREAM, 0, seq, stamp, value(stamp, seq))
             self.inbox.put(("envelope", STREAM, encode(envelope)))
 
     def says(self, kind: Kind, seq: int, stamp: int, incarnation: int = 0) -> None:
@@ -145,8 +145,7 @@ def test_libraries_that_setup_imports_are_limited_to_the_threads_of_the_graph(mo
     def setup() -> None:
         monkeypatch.setitem(sys.modules, "cv2", SimpleNamespace(setNumThreads=limits.append))  # type: ignore[arg-type]
 
-    monkeypatch.setattr(runner, "setup", setup)
-    one.process.bus = SimpleNamespace(alive=lambda *names: None)  # type: ignore[assignment]
+    monkeypatch.setattr(runner.operator, "setup", setup)
 
     one.process.set_up()
 

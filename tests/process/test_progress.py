@@ -18,11 +18,13 @@ class Reporting:
     def __init__(self) -> None:
         ports = SimpleNamespace(emitted=0, states={})
         node = SimpleNamespace(name="last")
-        self.operator = SimpleNamespace(node=node, done=0, firings=0, drops={}, ports=ports, work=Work())
+        self.operator = SimpleNamespace(
+            node=node, done=0, firings=0, drops={}, timeouts={}, late={}, ports=ports, work=Work()
+        )
         self.channel, self.now = RecordedChannel(), 0.0
         runners: Any = SimpleNamespace(operators=[self.operator], sources=[])
         feeding: Any = SimpleNamespace(feeds=[], logs=[])
-        live: Any = SimpleNamespace(runners=[])
+        live: Any = SimpleNamespace(runners=[], behind=dict)
         channel: Any = self.channel
         self.progress = Progress(channel, runners, feeding, live, lambda: self.now)
 
