@@ -30,8 +30,8 @@ _STYLES = {
     "starting": "dim",
     "ended": "dim",
     "dropping": "yellow",
-    "timing out": "yellow",
-    "late input": "yellow",
+    "timeout": "yellow",
+    "late": "yellow",
     "silent": "bold red",
     "no answer": "bold red",
 }
@@ -40,7 +40,7 @@ _NOTHING = (0, 0, 0, 0, 0, 0)
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One operator: rates in Hz, `load` the CPU time of its calls and `busy` their wall time, as shares of the time
+    """One operator: rates in Hz, `load` the CPU time of its calls and `wall` their wall time, as shares of the time
     since the last update; `lag` event time (s) behind the foremost, `behind_clock` (s) of a source behind the clock."""
 
     operator: str
@@ -54,7 +54,7 @@ class Row:
     rate: float
     drop_rate: float
     load: float
-    busy: float
+    wall: float
     restarts: int
     lag: float | None
     behind_clock: float | None
@@ -114,7 +114,7 @@ def _row(health: Health, status: HostStatus | None, lags: Mapping[str, float | N
         health.rate,
         health.drop_rate,
         health.load,
-        health.busy,
+        health.wall,
         health.restarts,
         lags[name],
         behind,
@@ -181,7 +181,7 @@ def operators_table(rows: Sequence[Row], heading: Text) -> Table:
     made.add_column("Hz", justify="right", no_wrap=True)
     counted = [name for name in ("dropped", "timeouts", "late") if any(getattr(row, name) for row in rows)]
     restarted = ["restarts"] if any(row.restarts for row in rows) else []
-    for name in (*counted, "CPU", "busy", *restarted, "lag"):
+    for name in (*counted, "CPU", "wall", *restarted, "lag"):
         made.add_column(name, justify="right", no_wrap=True)
     for row in rows:
         made.add_row(
@@ -191,7 +191,7 @@ def operators_table(rows: Sequence[Row], heading: Text) -> Table:
             f"{row.rate:.1f}",
             *(_warning(getattr(row, name)) for name in counted),
             f"{row.load:.0%}",
-            f"{row.busy:.0%}",
+            f"{row.wall:.0%}",
             *(_warning(row.restarts) for _ in restarted),
             _lag(row),
         )
@@ -232,7 +232,7 @@ def _lag(row: Row) -> Text:
 
 # Lines
 
-_COLUMNS = (("state", 10), ("Hz", 7), ("dropped", 9), ("timeouts", 8), ("late", 7), ("CPU", 5), ("busy", 5))
+_COLUMNS = (("state", 10), ("Hz", 7), ("dropped", 9), ("timeouts", 8), ("late", 7), ("CPU", 5), ("wall", 5))
 
 
 def heading(sample: Sample) -> str:
@@ -250,7 +250,7 @@ def line(row: Row, sample: Sample, running: float) -> str:
         count(row.timeouts),
         count(row.late),
         f"{row.load:.0%}",
-        f"{row.busy:.0%}",
+        f"{row.wall:.0%}",
     )
     lag = row.lag if row.behind_clock is None else row.behind_clock
     padded = (

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.text import Text
 
 from dataflow.cli.arguments import Json, ModuleFolders, RecordingFile, existing, find_modules_in
-from dataflow.cli.output import count, fail, friendly_errors, milliseconds, out, print_json, table
+from dataflow.cli.output import count, fail, friendly_errors, out, print_json, table
 
 
 def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json = False) -> None:
@@ -33,20 +33,27 @@ def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json 
     if json:
         print_json([path.as_json() for path in found])
         return
-    made = table("from", "to", "count", "p50", "p99", "max", "costs most", "work", "wait", right=_NUMBERS)
+    made = table("from", "to", *_NUMBERS[:4], "costs most", *_NUMBERS[4:], right=_NUMBERS)
+    made.padding = (0, 0, 0, 0)
+    for name in (0, 1, 6):
+        made.columns[name].min_width = 8
     for path in found:
         share = next(s for s in path.shares if s.operator == path.costliest)
-        numbers = (milliseconds(path.p50), milliseconds(path.p99), milliseconds(path.largest))
+        numbers = (_ms(path.p50), _ms(path.p99), _ms(path.largest))
         made.add_row(
             Text(path.source),
             Text(path.sink),
             count(path.count),
             *numbers,
             Text(path.costliest),
-            milliseconds(share.work),
-            milliseconds(share.wait),
+            _ms(share.work),
+            _ms(share.wait),
         )
     out.print(made)
 
 
-_NUMBERS = ("count", "p50", "p99", "max", "work", "wait")
+_NUMBERS = ("count", "p50 ms", "p99 ms", "max ms", "work ms", "wait ms")
+
+
+def _ms(nanoseconds: float) -> str:
+    return f"{nanoseconds * 1e-6:,.2f}"

@@ -106,7 +106,7 @@ class RunDisplay:
         table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
         table.add_column("operator", overflow="fold")
         table.add_column("process", style="dim", overflow="fold")
-        for name in ("firings", "Hz", "out", "dropped", "CPU", "busy", "lag"):
+        for name in ("firings", "Hz", "out", "dropped", "CPU", "wall", "lag"):
             table.add_column(name, justify="right", no_wrap=True)
         front = max((c.done for c in status.operators.values() if c.done not in (NEVER, FOREVER)), default=None)
         elapsed = now - self.began if self.began is not None else 0.0

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from dataflow.cli.output import count, figure, plural, seconds, size, table
 from dataflow.supervision.report import RunReport
+from dataflow.sync import TICK
 
 _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
@@ -54,7 +55,8 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
 
 
 def _operators(report: RunReport) -> Table:
-    """A row for each operator; Hz is firings per second of event time. What is nothing of all has no column."""
+    """A row for each operator; Hz is firings per second of event time, CPU that of its calls, wall s their
+    wall time. What is nothing of all has no column."""
     timeouts, late = _total(report.waits, "timeout"), _total(report.waits, "late")
     dropped = {name: counts.dropped for name, counts in report.operators.items()}
     counted = {
@@ -62,8 +64,10 @@ def _operators(report: RunReport) -> Table:
         for heading, numbers in (("dropped", dropped), ("timeouts", timeouts), ("late", late))
         if any(numbers.values())
     }
-    numbers = ("firings", "out", "Hz", *counted, "CPU", "per firing", "busy")
+    numbers = ("firings", "out", "Hz", *counted, "CPU s", "ms each", "wall s")
     made = table("operator", *numbers, right=numbers)
+    made.padding = (0, 0, 0, 0 if counted else 1)  # one that has all columns fits 80
+    made.columns[0].min_width = 12
     span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
     for name, counts in report.operators.items():
         made.add_row(
@@ -72,9 +76,9 @@ def _operators(report: RunReport) -> Table:
             count(counts.emitted) if counts.emitted else "",
             f"{(counts.firings - 1) / span:.1f}" if counts.firings > 1 and span > 0 else "",
             *(Text(count(n) if (n := of.get(name, 0)) else "", style="yellow") for of in counted.values()),
-            f"{counts.cpu_ns * 1e-9:.2f} s",
-            f"{counts.cpu_ns * 1e-6 / counts.firings:.2f} ms" if counts.firings else "",
-            f"{counts.wall_ns * 1e-9:.2f} s",
+            f"{counts.cpu_ns * 1e-9:,.2f}",
+            f"{counts.cpu_ns * 1e-6 / counts.firings:,.2f}" if counts.firings else "",
+            f"{counts.wall_ns * 1e-9:,.2f}",
         )
     return made
 
@@ -100,7 +104,7 @@ def _figures(summary: Mapping[str, Any]) -> Table:
 
 _MEANS = {
     "overflow": "the queue was full",
-    "late": "came after its firing was decided",
+    "late": "came after its firing",
     "past": "its stamp lay before one that was sent",
     "repeated": "had been sent before the restart",
     "missed": "lost on its way to the process",
@@ -120,14 +124,20 @@ def _losses(report: RunReport) -> Table:
     for operator in dict.fromkeys((*report.operators, *report.drops, *report.waits)):
         drops = report.drops.get(operator, ())
         for input_name, reason, number in drops:
-            _add(made, operator, input_name, f"dropped: {reason}", number, _MEANS.get(reason, ""))
+            _add(made, operator, input_name, f"dropped: {reason}", number, _meaning(input_name, reason))
         dropped_late = {input_name: n for input_name, reason, n in drops if reason == "late"}
         for input_name, what, number in report.waits.get(operator, ()):
             if what == "timeout":
                 _add(made, operator, input_name, what, number, "wait given up, nothing dropped")
             elif kept := number - dropped_late.get(input_name, 0):
-                _add(made, operator, input_name, what, kept, "came after its firing, kept for later ones")
+                _add(made, operator, input_name, what, kept, "after its firing, for later ones")
     return made
+
+
+def _meaning(input_name: str, reason: str) -> str:
+    if input_name == TICK:
+        return "came due while it was at work"
+    return _MEANS.get(reason, "")
 
 
 def _add(made: Table, operator: str, input_name: str, what: str, number: int, meaning: str) -> None:

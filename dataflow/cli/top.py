@@ -32,11 +32,11 @@ def top(
 ) -> None:
     """Show the status of every operator of a running graph, and the latency of every path through it.
 
-    States: running; dropping (messages reached no firing); timing out (it fired without an input that it had waited
-    for, which drops nothing); late input (messages came after the firing that they were for); silent (nothing for a
+    States: running; dropping (messages reached no firing); timeout (it fired without an input that it had waited
+    for, which drops nothing); late (messages came after the firing that they were for); silent (nothing for a
     while); starting; ended; no answer (its process is being restarted, or hangs).
 
-    Hz, CPU and busy are since the last update: CPU is the CPU time of an operator's calls, busy their wall time, with
+    Hz, CPU and wall are since the last update: CPU is the CPU time of an operator's calls, wall their wall time, with
     what they wait for. dropped, timeouts and late count since the process began. lag is, of a source, how far it is
     behind the clock; of any other operator, how far its event time is behind the foremost one's.
 

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-State = Literal["starting", "running", "dropping", "timing out", "late input", "silent", "restarting", "ended"]
+State = Literal["starting", "running", "dropping", "timeout", "late", "silent", "restarting", "ended"]
 
 LEVELS: Mapping[State, int] = {
     "starting": 0,
     "running": 0,
     "ended": 0,
     "dropping": 1,
-    "timing out": 1,
-    "late input": 1,
+    "timeout": 1,
+    "late": 1,
     "restarting": 2,
     "silent": 3,
 }
@@ -27,7 +27,7 @@ SILENT_AFTER = 1.0
 @dataclass(frozen=True, slots=True)
 class Health:
     """One operator at one moment: rates in Hz; `load` the CPU time of its calls as a share of the time that has passed,
-    `busy` their wall time, with whatever they waited for."""
+    `wall` their wall time, with whatever they waited for."""
 
     operator: str
     state: State
@@ -37,7 +37,7 @@ class Health:
     rate: float
     drop_rate: float
     load: float
-    busy: float
+    wall: float
     restarts: int = 0
     note: str = ""
     drops: Mapping[tuple[str, str], int] = field(default_factory=dict)
@@ -59,7 +59,7 @@ class Health:
                 "rate_hz": f"{self.rate:.2f}",
                 "drop_rate_hz": f"{self.drop_rate:.2f}",
                 "load": f"{self.load:.3f}",
-                "busy": f"{self.busy:.3f}",
+                "wall": f"{self.wall:.3f}",
                 "restarts": str(self.restarts),
             }
             | {
@@ -144,7 +144,7 @@ class HealthMonitor:
                 rate=(firings - past.firings) / span if span else 0.0,
                 drop_rate=max(0, dropped - past.dropped) / span if span else 0.0,
                 load=_share(cpu_ns - past.cpu_ns, span),
-                busy=_share(wall_ns - past.wall_ns, span),
+                wall=_share(wall_ns - past.wall_ns, span),
                 restarts=(restarts or {}).get(name, 0),
                 note=note,
                 drops=dict((drops or {}).get(name, {})),
@@ -159,9 +159,9 @@ def _activity(past: _Past, now: _Past, span: float) -> tuple[State, str]:
     if (lost := now.dropped - past.dropped) > 0:
         return "dropping", f"{lost} dropped in {span:.1f} s"
     if (given_up := now.timeouts - past.timeouts) > 0:
-        return "timing out", f"{given_up} waits for an input given up in {span:.1f} s"
+        return "timeout", f"{given_up} waits for an input given up in {span:.1f} s"
     if (late := now.late - past.late) > 0:
-        return "late input", f"{late} messages in {span:.1f} s came after their firing"
+        return "late", f"{late} messages in {span:.1f} s came after their firing"
     return "running", ""
 
 

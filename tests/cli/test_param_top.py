@@ -13,6 +13,7 @@ from typing import Any
 
 import psutil
 import pytest
+from rich.console import Console
 
 from dataflow.cli.board import Board, Sample, heading, line, shown
 from dataflow.client.attach import find_running
@@ -140,7 +141,7 @@ def test_top_tells_rates_drops_load_and_hosts(dataflow) -> None:
     assert rows["tuned"]["state"] == rows["left"]["state"] == "running"
     assert 20 < rows["left"]["rate"] < 150  # 100 Hz, where the machine can
     assert rows["slow"]["state"] == "dropping"
-    assert rows["slow"]["busy"] > 0.5
+    assert rows["slow"]["wall"] > 0.5
     assert rows["slow"]["load"] < 0.5  # it sleeps
     assert rows["slow"]["drop_rate"] > 5
     assert rows["tuned"]["restarts"] == 0
@@ -243,7 +244,7 @@ def test_the_board_follows_operators_from_answer_to_answer() -> None:
 
     camera, detector, planner = sample.rows
     assert (camera.rate, camera.lag, camera.state, camera.host) == (15.0, 0.0, "running", "eyes")
-    assert (detector.rate, detector.load, detector.busy, detector.drop_rate) == (2.5, 0.5, 0.75, 3.0)
+    assert (detector.rate, detector.load, detector.wall, detector.drop_rate) == (2.5, 0.5, 0.75, 3.0)
     assert (detector.lag, detector.state) == (2.0, "dropping")
     assert (planner.state, planner.host, planner.lag) == ("no answer", "", None)
 
@@ -267,9 +268,9 @@ def test_timeouts_and_late_messages_are_no_drops() -> None:
     sample = board.update([status("brain", fusion=(20, 20, 0, 0, 2 * 10**9, 0), waits=waits)], 2.0)
 
     (fusion,) = sample.rows
-    assert (fusion.state, fusion.dropped, fusion.timeouts, fusion.late) == ("timing out", 0, 3, 3)
+    assert (fusion.state, fusion.dropped, fusion.timeouts, fusion.late) == ("timeout", 0, 3, 3)
     headings = next(text for text in printed(sample, 80) if text.startswith("operator")).split()
-    assert headings == ["operator", "process", "state", "Hz", "timeouts", "late", "CPU", "busy", "lag"]
+    assert headings == ["operator", "process", "state", "Hz", "timeouts", "late", "CPU", "wall", "lag"]
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def test_rates_and_load_are_those_since_the_last_update() -> None:
     assert health.state == "running"
     assert health.rate == pytest.approx(20.0)
     assert health.load == pytest.approx(0.5)
-    assert health.busy == 1.0
+    assert health.wall == 1.0
     assert health.drop_rate == 0.0
     assert health.level == Level.OK
 
@@ -56,7 +56,7 @@ def test_an_operator_that_drops_says_how_many() -> None:
 def test_a_timeout_is_no_drop_and_has_a_word_of_its_own() -> None:
     health = while_waiting({("image", "timeout"): 2}, {("image", "timeout"): 5})
 
-    assert (health.state, health.dropped, health.drop_rate) == ("timing out", 0, 0.0)
+    assert (health.state, health.dropped, health.drop_rate) == ("timeout", 0, 0.0)
     assert health.note == "3 waits for an input given up in 2.0 s"
     assert health.level == Level.WARN
 
@@ -64,7 +64,7 @@ def test_a_timeout_is_no_drop_and_has_a_word_of_its_own() -> None:
 def test_messages_that_came_late_have_a_word_of_their_own() -> None:
     health = while_waiting({}, {("image", "late"): 4})
 
-    assert (health.state, health.note) == ("late input", "4 messages in 2.0 s came after their firing")
+    assert (health.state, health.note) == ("late", "4 messages in 2.0 s came after their firing")
     assert health.drop_rate == 0.0
 
 
