@@ -63,9 +63,11 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """The graph at one moment: its operators, what there is to say of them, the latencies of its paths."""
+    """The graph at one moment: its operators, the sources behind the clock with who holds each up, the notes of
+    operators, the latencies of its paths."""
 
     rows: Sequence[Row]
+    behind: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     paths: Sequence[PathLatency] = ()
 
@@ -96,7 +98,7 @@ class Board:
         lags = _lags(counts)
         rows = [_row(health, told.get(health.operator), lags, health.operator in answered) for health in healths]
         paths = batch_latencies(self.graph, (batch for status in statuses for batch in status.firings))
-        return Sample(rows, [*_late_sources(rows, told), *_notes(rows)], paths)
+        return Sample(rows, _late_sources(rows, told), _notes(rows), paths)
 
 
 def _row(health: Health, status: HostStatus | None, lags: Mapping[str, float | None], answered: bool) -> Row:
@@ -129,16 +131,16 @@ def _lags(counts: Mapping[str, Sequence[int]]) -> dict[str, float | None]:
     return {name: (front - reached[name]) * 1e-9 if name in reached else None for name in counts}
 
 
-def _late_sources(rows: Sequence[Row], told: Mapping[str, HostStatus]) -> list[str]:
+def _late_sources(rows: Sequence[Row], told: Mapping[str, HostStatus]) -> dict[str, str]:
     """Who is behind the clock, and who holds it up."""
-    said = []
+    said = {}
     for row in rows:
         if row.behind_clock is None or row.behind_clock <= LATE or row.state == "ended":
             continue
         status = told[row.operator]
         others = [name for name in status.restarts if name != row.operator]
         why = held_up_by(others, *status.behind[row.operator], row.load)
-        said.append(f"source {row.operator!r} is {seconds(row.behind_clock)} behind the clock: {why}")
+        said[row.operator] = f"source {row.operator!r} is {seconds(row.behind_clock)} behind the clock: {why}"
     return said
 
 
@@ -149,7 +151,7 @@ def _notes(rows: Sequence[Row]) -> list[str]:
 def as_json(sample: Sample) -> dict[str, Any]:
     return {
         "operators": [asdict(row) for row in sample.rows],
-        "notes": list(sample.notes),
+        "notes": [*sample.behind.values(), *sample.notes],
         "latencies": [path.as_json() for path in sample.paths],
     }
 
@@ -160,7 +162,7 @@ def as_json(sample: Sample) -> dict[str, Any]:
 def shown(sample: Sample, found: RunningGraph) -> RenderableType:
     """The operators, the notes, and the slowest paths."""
     parts: list[RenderableType] = [operators_table(sample.rows, title(found.name, found.started))]
-    parts += [Text(note, style="yellow") for note in sample.notes]
+    parts += [Text(note, style="yellow") for note in (*sample.behind.values(), *sample.notes)]
     if sample.paths:
         parts += [Text(), paths_table(sample.paths)]
     return Group(*parts)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -113,12 +113,16 @@ def _follow(found: RunningGraph, hosts: Hosts, every: float) -> None:
 
 
 def _print_lines(found: RunningGraph, hosts: Hosts, every: float) -> None:
-    """Prints a heading once, then a line for each operator at every update."""
+    """Prints a heading once, then a line for each operator at every update; a note when a source falls behind."""
     from dataflow.cli.board import heading, line
 
     printed: Sequence[str] = ()
+    behind: Mapping[str, str] = {}
     for sample in _samples(found, hosts, every, latencies=False):
         if not printed:
             out.print(Text(heading(sample)), soft_wrap=True)
         printed = [line(row, sample, time.time() - found.started) for row in sample.rows]
         out.print(Text("\n".join(printed)), soft_wrap=True)
+        for note in (note for source, note in sample.behind.items() if source not in behind):
+            err.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)
+        behind = sample.behind

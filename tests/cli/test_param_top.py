@@ -290,7 +290,7 @@ def test_a_source_behind_the_clock_is_named_with_who_holds_it_up(
 
     sample = board.update([status("all", behind={"camera": (read, sent)}, **counts)], 2.0)
 
-    (note,) = sample.notes
+    note = sample.behind["camera"]
     assert note.startswith(f"source 'camera' is 15.1 s behind the clock: {told}")
     camera, detector = sample.rows
     assert (camera.behind_clock, detector.behind_clock) == (15.1, None)
