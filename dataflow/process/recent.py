@@ -15,7 +15,10 @@ OVER = 10.0
 
 
 class RecentFirings:
-    """A firing costs an append to a queue of bounded length; all else is done only when somebody asks."""
+    """A firing costs an append to a queue of bounded length; all else is done only when somebody asks.
+
+    Drops and details, which may be large, are not kept.
+    """
 
     def __init__(self) -> None:
         self._kept: dict[str, deque[FiringRecord]] = {}
@@ -26,16 +29,17 @@ class RecentFirings:
             kept = self._kept.get(record.operator)
             if kept is None:
                 kept = self._kept[record.operator] = deque(maxlen=KEPT)
-            kept.append(record)
+            bare = replace(record, drops=(), detail={}) if record.drops or record.detail else record
+            kept.append(bare)
 
     def batches(self, now: int | None = None) -> list[bytes]:
-        """Returns the firings of the last seconds, in batches, without drops and details; from any thread.
+        """Returns the firings of the last seconds, in batches; from any thread.
 
         `now`: wall time in ns.
         """
         since = (time.time_ns() if now is None else now) - round(OVER * 1e9)
         return [
-            encode_batch([replace(record, drops=(), detail={}) for record in part])
+            encode_batch(part)
             for kept in list(self._kept.values())
             for part in consecutive(record for record in kept.copy() if record.wall_start >= since)
         ]
