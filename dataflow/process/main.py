@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,8 +38,14 @@ def _listen(channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None
         os._exit(SUPERVISOR_GONE)
 
 
-def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> Any:
-    """The process that the supervisor asks for: "host" runs operators, "sink" takes whole streams."""
+def _make(
+    kind: str,
+    config: dict[str, Any],
+    channel: Channel,
+    inbox: queue.SimpleQueue[tuple[Any, ...]],
+    handed: Sequence[int],
+) -> Any:
+    """Makes the process that the supervisor asks for: "host" runs operators, "sink" takes whole streams."""
     if kind == "sink":
         from dataflow.process.sink import SinkConfig, SinkProcess
 
@@ -47,7 +54,7 @@ def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: queue.Simp
     from dataflow.process.config import ProcessConfig
     from dataflow.process.operator_process import OperatorProcess
 
-    return OperatorProcess(ProcessConfig(**config), channel, inbox)
+    return OperatorProcess(ProcessConfig(**config), channel, inbox, box=handed[0] if handed else None)
 
 
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
@@ -98,8 +105,14 @@ def _await_leave(inbox: queue.SimpleQueue[tuple[Any, ...]]) -> str:
     return "the supervisor did not answer"
 
 
-def main(descriptor: int) -> int:
-    """Runs one process to its end; returns the exit code."""
+def main(descriptor: int, handed: Sequence[int]) -> int:
+    """Runs one process to its end; returns the exit code.
+
+    `descriptor` is its end of the control channel, `handed` what it inherits besides: in a live run the memory for its
+    firing records.
+    """
+    for each in handed:
+        os.set_inheritable(each, False)  # operators' own processes get none of it
     channel = Channel(descriptor)
     inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
     try:
@@ -110,7 +123,7 @@ def main(descriptor: int) -> int:
     threading.Thread(target=_listen, args=(channel, inbox), name="control", daemon=True).start()
     code, process, phase = 0, None, "starting"
     try:
-        process = _make(kind, config, channel, inbox)
+        process = _make(kind, config, channel, inbox, handed)
         process.open()
         phase = "running"
         process.run()

@@ -30,7 +30,7 @@ from dataflow.process.pace import Pace
 from dataflow.process.planned_faults import do_fault
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
-from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, statics_of
+from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
 from dataflow.transport import Bus, Envelope, TapServer
@@ -47,7 +47,14 @@ BACKLOG = (16, 8)
 class OperatorProcess:
     """Runs its operators until they end, it is told to leave, or something fails."""
 
-    def __init__(self, config: ProcessConfig, channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None:
+    def __init__(
+        self,
+        config: ProcessConfig,
+        channel: Channel,
+        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        box: int | None = None,
+    ) -> None:
+        """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
         self.config, self.channel, self.inbox = config, channel, inbox
         self.graph = Graph.from_json(config.graph)
         self.static = statics_of(self.graph)
@@ -70,6 +77,7 @@ class OperatorProcess:
             namespace=self.graph.namespace,
             static=self.static,
             live=config.live,
+            box=None if box is None else open_box(box, config, self.graph),
             firings=config.firings,
             incarnations=incarnations_of(
                 config.resume or {}, {name: node.outputs for name, node in self.graph.nodes.items()}
@@ -347,6 +355,8 @@ class OperatorProcess:
                 self._stopping = True
                 self.feeding.finish("interrupted")
                 self.live.finish("interrupted")
+            case "lacks":
+                self.outlet.send_again(fields["operator"])
             case "leave":
                 self._left = True
             case "lost":

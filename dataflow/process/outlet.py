@@ -11,7 +11,8 @@ from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel
 from dataflow.process.recent import RecentFirings
-from dataflow.records.firing import FiringRecord, encode_batch
+from dataflow.records.black_box import BlackBox
+from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Bus, Envelope, Kind, StreamPublisher, TapServer, encode
 
@@ -47,8 +48,9 @@ class Outlet:
     """The emitter of all operators of a process: to local aligners by reference, to other processes and taps as
     envelopes.
 
-    `live`: firing records also go to the supervisor, and so does the news that a stream has ended. `firings`: whether a
-    recorder takes the firing records. `incarnations`: by stream, the ones that begin above 0.
+    `live`: the supervisor is told that a stream has ended. `box`: what keeps the latest firing records should this
+    process die. `firings`: whether a recorder takes the firing records. `incarnations`: by stream, the ones that begin
+    above 0.
     """
 
     def __init__(
@@ -59,13 +61,14 @@ class Outlet:
         namespace: str,
         static: frozenset[str],
         live: bool,
+        box: BlackBox | None,
         firings: bool,
         incarnations: Mapping[str, int],
     ) -> None:
         self.sent = 0
         self.recent = RecentFirings()
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
-        self._live, self._firings = live, firings
+        self._live, self._box, self._firings = live, box, firings
         self._links: Links | None = None
         self._held: list[tuple[str, Envelope | bytes]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
@@ -147,8 +150,8 @@ class Outlet:
 
     def record(self, record: FiringRecord) -> None:
         self.recent.add(record)
-        if self._live:  # ahead of its messages, to where it survives this process
-            self._channel.send("record", operator=record.operator, data=encode_batch([record]))
+        if self._box is not None:  # ahead of its messages, to where it survives this process
+            self._box.add(record)
         if self._firings:
             log = self._logs.setdefault(record.operator, [])
             if log and log[-1].incarnation != record.incarnation:
@@ -172,6 +175,14 @@ class Outlet:
         self._flushed = time.monotonic()
         for operator in self._logs:
             self.flush(operator)
+
+    def send_again(self, operator: str) -> None:
+        """Sends what is kept of an operator's firing records: the recorder lacks some, and leaves out what it has."""
+        if self._box is None or not self._firings:
+            return
+        for part in consecutive(self._box.kept(operator)):
+            for first in range(0, len(part), BATCH_RECORDS):
+                self._send(firings_key(self._namespace, operator), encode_batch(part[first : first + BATCH_RECORDS]))
 
     def put_raw(self, stream: str, payload: bytes) -> None:
         """Publishes bytes that are no envelope: a planned fault."""

@@ -17,6 +17,7 @@ from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.recording import Recording
+from dataflow.records.black_box import BlackBox, Reached
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Envelope, Kind
 
@@ -114,6 +115,16 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
         start=replay["start"],
         end=replay["end"],
     )
+
+
+def open_box(descriptor: int, config: ProcessConfig, graph: Graph) -> BlackBox:
+    """Opens what keeps the firing records of this process; they go on from where the one before it had got to."""
+    ports = {name: tuple(graph.nodes[name].outputs) for name in config.nodes}
+    before = {name: config.resumed(name) for name in config.nodes}
+    reached = {
+        name: Reached(r.incarnation - 1, dict(r.last), dict(r.changed)) for name, r in before.items() if r.incarnation
+    }
+    return BlackBox(descriptor, ports, reached)
 
 
 def statics_of(graph: Graph) -> frozenset[str]:

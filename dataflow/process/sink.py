@@ -88,7 +88,9 @@ class SinkProcess:
         self.graph = Graph.from_json(config.graph)
         self.make_sink = make_sink
         self.frontiers = dict.fromkeys(config.streams, NEVER)
-        self.firings_open = {firings_key(self.graph.namespace, o): o for o in config.firings}
+        self._operator_of = {firings_key(self.graph.namespace, o): o for o in config.firings}
+        self.firings_open = set(self._operator_of)
+        """Keys on which an operator's last firing records have not come yet."""
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
         self.inlet = Inlet(config.label, channel, self._deliver, static=static, live=config.live)
@@ -111,7 +113,7 @@ class SinkProcess:
     def open(self) -> None:
         config = self.config
         self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
-        for key in (*self.frontiers, *self.firings_open):
+        for key in (*self.frontiers, *self._operator_of):
             self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
@@ -151,7 +153,7 @@ class SinkProcess:
                 self._control(kind, fields)
 
     def _receive(self, key: str, payload: Any) -> None:
-        if key not in self.firings_open or bytes(payload[: len(MAGIC)]) == MAGIC:
+        if key not in self._operator_of or bytes(payload[: len(MAGIC)]) == MAGIC:
             self.inlet.take(key, payload)
             return
         try:
@@ -159,12 +161,12 @@ class SinkProcess:
         except FiringRecordError as error:
             self.inlet.refuse_malformed(key, error)
             return
-        if not batch.records or batch.operator != self.firings_open[key]:
+        if not batch.records or batch.operator != self._operator_of[key]:
             self.inlet.refuse(key, f"{len(batch.records)} firing records of {batch.operator!r}")
             return
         self.batches += 1
         if self._take_records(batch):
-            self.firings_open.pop(key)
+            self.firings_open.discard(key)
 
     def _deliver(self, key: str, envelope: Envelope) -> None:
         assert self.sink is not None
@@ -187,8 +189,8 @@ class SinkProcess:
     def _take_records(self, batch: Batch) -> bool:
         """Stores a batch of firing records, those of it that are not stored yet; True for an operator's last batch.
 
-        Records come twice when their operator's process has died or the run has failed, and when some were lost on
-        their way: once from the operator and once from the supervisor, which is asked for what is lacking.
+        Records come twice when their operator's process has died, and when some were lost on their way: then that
+        process sends what it has kept of them again, or, if it is dead, the supervisor what it has left.
         """
         assert self.sink is not None
         last = batch.records[-1]
@@ -253,7 +255,7 @@ class SinkProcess:
             case "leave":
                 self._outcome = fields["outcome"]
                 self._left = True
-                if self._outcome != "complete":
+                if self._outcome != "complete" or any(self._lacking.values()):
                     self._drain()
             case "lost":
                 self._drain()

@@ -16,6 +16,8 @@ from dataflow.supervision.supervised import Supervised
 
 LEAVE_TIMEOUT = 10.0
 LEAVE_AT_ONCE = 1.0
+DIE_WITHIN = 1.0
+"""Seconds that one that was killed may take to die: what it left is for the recorder, before that is told to leave."""
 CLOSE_TIMEOUT = 60.0
 """Seconds for `close()` of every operator, at the orderly end of a run; a shorter `stall_timeout` shortens it."""
 SHORTEST = 5.0
@@ -38,11 +40,11 @@ class Closing:
     """Lets all processes leave. `failure` is why the run ends early: what fails later is a consequence and noted."""
 
     def __init__(
-        self, run: RunState, *, outcome: str, failure: RunFailed | None, at_once: bool, handed_over: Callable[[], None]
+        self, run: RunState, *, outcome: str, failure: RunFailed | None, at_once: bool, hand_over: Callable[[], None]
     ) -> None:
         self.run, self.outcome, self.failure = run, outcome, failure
         self._at_once = at_once
-        self._handed_over = handed_over
+        self._hand_over = hand_over
         run.enter(Phase.CLOSING)
         self._stage = self._begin(sinks=False)
 
@@ -72,8 +74,10 @@ class Closing:
         late = self.run.steady > self._stage.deadline
         if leaving and late:
             self._give_up_on(leaving)
-        if not self._stage.sinks and (not leaving or late):
-            self._handed_over()
+        given_up = self.run.steady > self._stage.deadline + DIE_WITHIN
+        if not self._stage.sinks and (not leaving or given_up):
+            if self.failure is not None:
+                self._hand_over()
             self._stage = self._begin(sinks=True)
 
     def _leaving(self, *, sinks: bool) -> list[Supervised]:

@@ -11,12 +11,12 @@ from dataflow.supervision.cover import LiveCover, LosslessCover
 from dataflow.supervision.diagnostics import DiagnosticsPart
 from dataflow.supervision.drain import DrainLimit
 from dataflow.supervision.heartbeats import Heartbeats
-from dataflow.supervision.held_records import HeldRecordsPart
 from dataflow.supervision.lateness import Lateness
 from dataflow.supervision.part import Part
 from dataflow.supervision.plan import HostPlan, RunPlan
 from dataflow.supervision.planned_faults import PlannedFaults
 from dataflow.supervision.quiescence import LOST_AFTER, Quiescence
+from dataflow.supervision.remains import RemainsPart
 from dataflow.supervision.restarts import LiveRestarts, RestartPolicy
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.stall import LiveStallWatch, StallWatch
@@ -46,11 +46,11 @@ def _live(run: RunState) -> Core:
             else:
                 part.back(process)
 
-    held = HeldRecordsPart(run)
+    remains = RemainsPart(run)
     cover = LiveCover(run)
-    restarts = LiveRestarts(run, held, tell)
+    restarts = LiveRestarts(run, remains, tell)
     quiescence = Quiescence(run, lost_after=LOST_AFTER)
-    parts += [Counts(run), held, cover, Lateness(run), restarts, Heartbeats(run, cover, restarts)]
+    parts += [Counts(run), remains, cover, Lateness(run), restarts, Heartbeats(run, cover, restarts)]
     if run.plan.faults is not None:
         parts.append(PlannedFaults(run, run.plan.faults))
     parts += [DiagnosticsPart(run), quiescence, LiveStallWatch(run, quiescence), DrainLimit(run)]

@@ -23,6 +23,7 @@ from dataflow.supervision.events import (
     Moment,
     NotReading,
     Printed,
+    Remained,
     Said,
     StopAsked,
     Tick,
@@ -83,6 +84,9 @@ class Core:
                 self.run.processes[label].hung_up = self.run.steady
             case LeftBehind(label, processes):
                 self.run.note(f"host {label!r} left processes behind, which were killed: {', '.join(processes)}")
+            case Remained(label, remains):
+                for part in self._parts:
+                    part.remained(self.run.processes[label], remains)
             case Died(label, code):
                 self._died(self.run.processes[label], code)
 
@@ -214,7 +218,7 @@ class Core:
             outcome="interrupted" if self._interrupted else "complete",
             failure=failure,
             at_once=self._stops > 1,
-            handed_over=self._restarts.hand_over_all if failure is not None else lambda: None,
+            hand_over=self._restarts.hand_over_all,
         )
 
     def _over(self, closing: Closing) -> None:

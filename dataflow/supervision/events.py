@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dataflow.records.black_box import Remains
+
 
 @dataclass(frozen=True, slots=True)
 class Moment:
@@ -81,6 +83,14 @@ class LeftBehind:
 
 
 @dataclass(frozen=True, slots=True)
+class Remained:
+    """A process has ended, and these are the firing records that it left. Comes just before its `Died`."""
+
+    label: str
+    remains: Remains
+
+
+@dataclass(frozen=True, slots=True)
 class Died:
     """A process has ended. `code`: exit code, negative for a signal; None: unknown. Its last event."""
 
@@ -88,4 +98,4 @@ class Died:
     code: int | None
 
 
-Event = Begin | Tick | StopAsked | Aborted | Said | Printed | NotReading | HungUp | LeftBehind | Died
+Event = Begin | Tick | StopAsked | Aborted | Said | Printed | NotReading | HungUp | LeftBehind | Remained | Died

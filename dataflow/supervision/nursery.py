@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -134,12 +135,15 @@ class Nursery:
     def fileno(self) -> int:
         return self._socket.fileno()
 
-    def spawn(self) -> Child:
-        """Asks for a process, which waits for its configuration on its channel. Raises `NurseryFailed`."""
+    def spawn(self, handed: Sequence[int] = ()) -> Child:
+        """Asks for a process, which waits for its configuration on its channel and inherits the descriptors `handed`.
+
+        Raises `NurseryFailed`.
+        """
         channel = QueuedChannel()
         reading, writing = os.pipe()
         try:
-            socket.send_fds(self._socket, [b"s"], [channel.theirs, writing])
+            socket.send_fds(self._socket, [b"s"], [channel.theirs, writing, *handed])
         except OSError as error:
             channel.close()
             os.close(reading)

@@ -19,7 +19,7 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,8 @@ import psutil  # type: ignore[import-untyped]
 LEAVE_WITHIN = 12.0
 """Seconds that hosts get after the supervisor is gone."""
 DIE_WITHIN = 1.0
+MOST_DESCRIPTORS = 253
+"""As many as one message on a Unix socket carries."""
 PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
 
 _PR_SET_CHILD_SUBREAPER = 36
@@ -41,7 +43,7 @@ def _adopt_orphans() -> None:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
 
 
-def _fork_host(descriptor: int, words: int, inherited: Iterable[int]) -> int:
+def _fork_host(descriptor: int, words: int, handed: Sequence[int], inherited: Iterable[int]) -> int:
     pid = os.fork()
     if pid:
         return pid
@@ -56,7 +58,7 @@ def _fork_host(descriptor: int, words: int, inherited: Iterable[int]) -> int:
         sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
         from dataflow.process.main import main
 
-        code = main(descriptor)
+        code = main(descriptor, handed)
         sys.stdout.flush()
         sys.stderr.flush()
     finally:
@@ -72,13 +74,13 @@ def serve(connection: socket.socket) -> None:
             if pidfd != connection.fileno():
                 _ended(connection, children, pidfd)
         if connection.fileno() in readable:
-            request, descriptors, _, _ = socket.recv_fds(connection, 1, 2)
+            request, descriptors, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
             if not request:
                 break
-            descriptor, words = descriptors
-            pid = _fork_host(descriptor, words, [connection.fileno(), *children])
-            os.close(descriptor)
-            os.close(words)
+            descriptor, words, *handed = descriptors
+            pid = _fork_host(descriptor, words, handed, [connection.fileno(), *children])
+            for given in descriptors:
+                os.close(given)
             pidfd = os.pidfd_open(pid)
             children[pidfd] = pid
             _tell(connection, "spawned", pid, None, [pidfd])

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dataflow.records.black_box import Remains
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.supervised import Supervised
 
@@ -20,6 +21,9 @@ class Part:
 
     def not_reading(self, process: Supervised, seconds: float, *, overflowed: bool) -> None:
         """A process has not read its control channel for a while."""
+
+    def remained(self, process: Supervised, remains: Remains) -> None:
+        """A process has ended, and left these firing records."""
 
     def released(self) -> None:
         """The sources were released."""

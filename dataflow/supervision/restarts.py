@@ -13,9 +13,9 @@ from typing import Any
 from dataflow.firing.restarts import Restarts
 from dataflow.graph.model import Restart
 from dataflow.supervision.barrier import expect_probes, tell_consumers
-from dataflow.supervision.held_records import HeldRecordsPart
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.part import Part
+from dataflow.supervision.remains import RemainsPart
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run_state import Phase, RunState
 from dataflow.supervision.supervised import Supervised
@@ -45,10 +45,10 @@ class RestartPolicy(Part):
 class LiveRestarts(RestartPolicy):
     """Restarts by the operators' policies."""
 
-    def __init__(self, run: RunState, held: HeldRecordsPart, tell: Callable[[str, Supervised], None]) -> None:
+    def __init__(self, run: RunState, remains: RemainsPart, tell: Callable[[str, Supervised], None]) -> None:
         """`tell` passes "away" and "back" on to all parts."""
         super().__init__(run)
-        self._held = held
+        self._remains = remains
         self._tell = tell
         self._attempts: dict[str, Restarts] = {}
         self._ended_streams: dict[str, str] = {}
@@ -82,7 +82,7 @@ class LiveRestarts(RestartPolicy):
         for name in process.nodes:
             run.status.restarts[name] = run.status.restarts.get(name, 0) + 1
         if run.release is not None:
-            self._held.hand_over(process.nodes)
+            self._remains.hand_over(process.nodes)
         tell_consumers(run, process, absent=True)
         self._tell("away", process)
         run.event(
@@ -109,11 +109,11 @@ class LiveRestarts(RestartPolicy):
         process.take(Step.RESTART, self.run.steady)
         process.renew()
         if self.run.release is None:  # nobody has heard of the one before
-            self._held.forget(process.nodes)
+            self._remains.forget(process.nodes)
             self.run.spawn(process)
         else:
             restarts = self.run.status.restarts
-            resume = {n: self._held.resumed(n) | {"restarts": restarts.get(n, 0)} for n in process.nodes}
+            resume = {n: self._remains.resumed(n) | {"restarts": restarts.get(n, 0)} for n in process.nodes}
             self.run.spawn(process, resume=resume)
 
     # Back
@@ -183,4 +183,4 @@ class LiveRestarts(RestartPolicy):
                 run.event("clock_jump", f"the clock of {name!r} jumped back to {stamp}", operator=name, stamp=stamp)
 
     def hand_over_all(self) -> None:
-        self._held.hand_over(self.run.graph.nodes)
+        self._remains.hand_over(self.run.graph.nodes)

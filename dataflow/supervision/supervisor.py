@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 from dataflow.firing.threads import environment
 from dataflow.process.channel import ChannelClosed
+from dataflow.records.black_box import make_black_box, read_black_box
 from dataflow.supervision import commands, events
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
@@ -49,6 +50,8 @@ class Supervisor:
         self.core = core_of(plan, self._hosts, configurations(plan, self._hosts, self._endpoints, new_secret()))
         self._on_output = on_output or _print
         self._children: dict[str, Child] = {}
+        self._boxes: dict[str, int] = {}
+        """The black boxes of operator processes in a live run: descriptors, by label."""
         self._taken_at: dict[str, float] = {}  # label → when the process last took what was queued for it
         self._announced = contextlib.ExitStack()
         self._over: commands.Over | None = None
@@ -167,7 +170,20 @@ class Supervisor:
             self._heard(label, line)
         del self._children[label]
         self._taken_at.pop(label, None)
+        self._read_box(label)
         self._feed(events.Died(label, code))
+
+    def _read_box(self, label: str) -> None:
+        """A process that can be taken the place of has ended: reads the firing records that it left."""
+        box = self._boxes.pop(label, None)
+        if box is None:
+            return
+        try:
+            nodes = self.plan.graph.nodes
+            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._hosts[label].nodes})
+        finally:
+            os.close(box)
+        self._feed(events.Remained(label, remains))
 
     def _read_channel(self, label: str) -> None:
         child = self._children.get(label)
@@ -242,7 +258,8 @@ class Supervisor:
 
     def _spawn(self, label: str) -> None:
         try:
-            child = self._nursery.spawn()
+            box = self._make_box(label)
+            child = self._nursery.spawn(box)
         except (NurseryFailed, OSError) as failure:
             self._feed(events.Aborted(str(failure)))
             return
@@ -250,6 +267,13 @@ class Supervisor:
         self._selector.register(child.channel, selectors.EVENT_READ, (label, "channel"))
         assert child.words is not None
         self._selector.register(child.words, selectors.EVENT_READ, (label, "words"))
+
+    def _make_box(self, label: str) -> tuple[int, ...]:
+        """Makes what a process writes its firing records to, where another one may take its place."""
+        if not self.plan.live or self._hosts[label].sink is not None:
+            return ()
+        self._boxes[label] = make_black_box()
+        return (self._boxes[label],)
 
     def _flush(self) -> None:
         """Sends what processes take; who takes nothing is looked at again when it does."""
@@ -289,6 +313,9 @@ class Supervisor:
             self._unregister(child)
             child.close()
         self._children.clear()
+        for box in self._boxes.values():
+            os.close(box)
+        self._boxes.clear()
 
     def _close_pipe(self) -> None:
         os.close(self._woken)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import queue
 import sys
 import threading
@@ -16,9 +17,12 @@ from process_operators import value
 
 from dataflow.firing.failure import OperatorFailure
 from dataflow.graph import load_text
+from dataflow.names import firings_key
 from dataflow.process import operator_process
 from dataflow.process.config import ProcessConfig
 from dataflow.process.operator_process import OperatorProcess
+from dataflow.records.black_box import make_black_box, read_black_box
+from dataflow.records.firing import decode_batch
 from dataflow.sync import FOREVER
 from dataflow.transport import Envelope, Kind, encode
 
@@ -35,12 +39,14 @@ operators:
 class OneProcess:
     """The process of the operator `last`, without a network: what arrives is put into its inbox."""
 
-    def __init__(self, operator: str = "Twice", *, live: bool = False) -> None:
+    def __init__(self, operator: str = "Twice", *, live: bool = False, box: int | None = None) -> None:
         graph = load_text(GRAPH.replace("OPERATOR", operator))
         self.inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self.channel = RecordedChannel()
-        config = ProcessConfig("last", graph.to_json(), ["last"], {}, [STREAM], [], [], "secret", live=live)
-        self.process = OperatorProcess(config, self.channel, self.inbox)  # type: ignore[arg-type]
+        config = ProcessConfig(
+            "last", graph.to_json(), ["last"], {}, [STREAM], [], [], "secret", live=live, firings=True
+        )
+        self.process = OperatorProcess(config, self.channel, self.inbox, box)  # type: ignore[arg-type]
         self.process.make()
         for runner in self.process.runners.all:
             runner.setup()
@@ -160,3 +166,24 @@ def test_an_operator_that_cannot_be_made_is_named(monkeypatch: pytest.MonkeyPatc
 
     with pytest.raises(OperatorFailure, match="'last' failed in construction: ImportError: no such library"):
         OneProcess()
+
+
+def test_records_that_were_lost_on_their_way_are_sent_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    memory = make_black_box()
+    one = OneProcess(live=True, box=memory)
+    sent: list[Any] = []
+    key = firings_key("test", "last")
+    monkeypatch.setattr(one.process.outlet, "_send", lambda at, data: sent.append(data) if at == key else None)
+    one.arrives(10, 20)
+    one.process._take(0.0)
+    one.process._work()
+    one.process.outlet.flush_all()
+    first = [r for data in sent for r in decode_batch(data).records]
+    assert [r.index for r in first] == [0, 1, 2]  # setup() and two firings
+    sent.clear()
+
+    one.process._control("lacks", {"operator": "last"})
+
+    assert [r for data in sent for r in decode_batch(data).records] == first
+    assert read_black_box(memory, {"last": ("y",)}).reached["last"].last
+    os.close(memory)

@@ -74,6 +74,18 @@ def test_records_that_did_not_come_are_asked_for(
     assert sorted(recorder.stored.places) == sorted([*before, *lacking, *after])
 
 
+def test_records_that_come_again_after_the_last_ones_are_taken() -> None:
+    recorder = Recorder()
+    recorder.process._receive(KEY, batch((0, 0)))
+    finish = encode_batch([FiringRecord("last", 0, 2, "finish", 2)], last=True)
+    recorder.process._receive(KEY, finish)
+    for again in (batch((0, 0), (0, 1)), finish):
+        recorder.process._receive(KEY, again)
+
+    assert sorted(recorder.stored.places) == [(0, 0), (0, 1), (0, 2)]
+    assert recorder.process.inlet.malformed == 0
+
+
 def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys: pytest.CaptureFixture[str]) -> None:
     recorder = Recorder()
 

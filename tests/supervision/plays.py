@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.graph import load_text
+from dataflow.records.black_box import Reached, Remains
+from dataflow.records.firing import FiringRecord, encode_batch
 from dataflow.supervision.commands import Command, Over, Send, Signal, Spawn
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
-from dataflow.supervision.events import Begin, Died, Event, Moment, Said, StopAsked, Tick
+from dataflow.supervision.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
 from dataflow.supervision.plan import RunPlan, host_plans
 
 WALL = 1_700_000_000.0
@@ -46,6 +48,8 @@ class Play:
         self.state: Mapping[str, Any] | None = None
         """What processes answer when they are asked how they are; None: they are too busy to answer."""
         self.alive: set[str] = set()
+        self.kept: dict[str, list[bytes]] = {}
+        self.reached: dict[str, Reached] = {}
         self._answers: deque[Event] = deque()
 
     # The clock
@@ -95,8 +99,22 @@ class Play:
                 self.over = command
 
     def dies(self, label: str, code: int) -> None:
+        self._answers.extend(self._ends(label, code))
+
+    def _ends(self, label: str, code: int) -> list[Event]:
+        """A process ends; in a live run, what it has kept of its firing records is read."""
         self.alive.discard(label)
-        self._answers.append(Died(label, code))
+        nodes = self.hosts[label].nodes
+        remains = Remains({n: self.kept.pop(n, []) for n in nodes}, {n: self.reached.get(n, Reached()) for n in nodes})
+        return [*([Remained(label, remains)] if self.plan.live and nodes else []), Died(label, code)]
+
+    def keeps(self, *records: FiringRecord) -> None:
+        """Operators write these into the black boxes of their processes."""
+        for record in records:
+            self.kept.setdefault(record.operator, []).append(encode_batch([record]))
+            self.reached.setdefault(record.operator, Reached()).take(
+                record, tuple(self.plan.graph.nodes[record.operator].outputs)
+            )
 
     def _answer(self, label: str, kind: str, fields: Mapping[str, Any]) -> list[Event]:
         match kind:
@@ -114,8 +132,7 @@ class Play:
             case "poll" if self.state is not None:
                 return [Said(label, "state", IDLE | self.state | {"round": fields["round"]})]
             case "leave":
-                self.alive.discard(label)
-                return [Said(label, "closed", {"facts": {}}), Died(label, 0)]
+                return [Said(label, "closed", {"facts": {}}), *self._ends(label, 0)]
         return []
 
     def failed(self, label: str, when: str) -> Said:

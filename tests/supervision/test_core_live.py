@@ -8,7 +8,7 @@ import pytest
 from plays import LEFT, Play, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
-from dataflow.records.firing import Emission, FiringRecord, encode_batch
+from dataflow.records.firing import Emission, FiringRecord
 from dataflow.supervision.commands import Send, Signal
 from dataflow.supervision.events import Begin, Died, NotReading, Said, Tick
 from dataflow.sync import FOREVER
@@ -23,14 +23,13 @@ def robot(*operators: str, **options: object) -> Play:
     return Play(LEFT, SMOOTH, AFTER, *operators, live=True, **options)
 
 
-def record(operator: str, index: int, stamp: int) -> Said:
-    made = FiringRecord(operator, 0, index, "fire", stamp, outputs=(Emission(index, stamp, bytes(16)),))
-    return Said(operator, "record", {"operator": operator, "data": encode_batch([made])})
+def record(operator: str, index: int, stamp: int) -> FiringRecord:
+    return FiringRecord(operator, 0, index, "fire", stamp, outputs=(Emission(index, stamp, bytes(16)),))
 
 
 def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
     play = robot(record="run.mcap").starts()
-    play.tell(record("smooth", 0, 5), record("smooth", 1, 7))
+    play.keeps(record("smooth", 0, 5), record("smooth", 1, 7))
 
     play.dies("smooth", -9)
     told = play.tell()
@@ -301,13 +300,53 @@ def test_ctrl_c_while_a_process_is_away_ends_the_run() -> None:
 
 def test_records_of_a_failed_run_reach_the_recorder_when_the_others_have_left() -> None:
     play = robot(record="run.mcap").starts()
-    play.tell(record("after", 0, 5))
-    play.tell(Died("left", 1))
+    play.keeps(record("after", 0, 5))
+    play.dies("left", 1)
+    play.tell()
     play.wait(1.0)
 
     told = [c.kind for c in play.commands if isinstance(c, Send) and c.label == "@recorder"]
     assert [kind for kind in told if kind in ("records", "leave")] == ["records", "leave"]
     assert play.over is not None
+
+
+def test_records_that_were_lost_on_their_way_come_again_from_the_process_that_made_them() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5))
+    told = play.tell(Said("@recorder", "lacks", {"operator": "smooth"}))
+
+    assert [(c.label, c.kind) for c in told if isinstance(c, Send)] == [("smooth", "lacks")]
+
+
+def test_records_that_were_lost_on_their_way_come_from_what_a_dead_process_left() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5))
+    play.dies("smooth", -9)
+    play.tell()
+    told = play.tell(Said("@recorder", "lacks", {"operator": "smooth"}))
+
+    assert [label for label, _ in sent(told, "records")] == ["@recorder"]
+
+
+def test_records_that_are_lacking_of_a_process_that_leaves_come_when_it_has_ended() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5))
+    play.deaf.add("smooth")
+    play.tell(play.ended("left"), play.ended("smooth"), play.ended("after"), play.ended("@recorder"))
+    play.wait(0.2)
+    assert not sent(play.tell(Said("@recorder", "lacks", {"operator": "smooth"})), "records")
+    play.dies("smooth", 0)
+
+    assert [label for label, _ in sent(play.tell(), "records")] == ["@recorder"]
+
+
+def test_a_process_that_died_again_at_once_does_not_use_an_incarnation_twice() -> None:
+    play = robot().starts()
+    play.keeps(FiringRecord("smooth", 3, 0, "fire", 5, outputs=(Emission(0, 5, bytes(16)),)))
+    play.dies("smooth", -9)
+
+    ((_, config),) = sent(play.wait(0.3), "host")
+    assert config["resume"]["smooth"]["incarnation"] == 4
 
 
 def test_news_of_processes_that_ended_crosses_other_news_without_harm() -> None:
