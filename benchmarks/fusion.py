@@ -15,6 +15,7 @@ import argparse
 import math
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -33,18 +34,24 @@ def fed(operator, samples, fixes):  # type: ignore[no-untyped-def]
             yield given["odometry"]
 
 
-def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
-    """RMSE outside of outages (m), the error at every outage's end, and what became of the fixes."""
-    from dataflow.messages import Pose
-    from operators.fusion import EkfFusion
-    from operators.fusion.sensors import SensorSettings
+@cache
+def recorded(folder: Path):  # type: ignore[no-untyped-def]
+    """The inertial samples and the true poses."""
     from operators.sources import EurocImu
 
     source = EurocImu(path=str(folder))
     source.setup()
     steps = list(source.stream())
-    samples = [m["imu"] for m in steps if "imu" in m]
-    truth = [m["ground_truth"] for m in steps if "ground_truth" in m]
+    return [m["imu"] for m in steps if "imu" in m], [m["ground_truth"] for m in steps if "ground_truth" in m]
+
+
+def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
+    """RMSE outside of outages (m), the error at every outage's end, and what became of the fixes."""
+    from dataflow.messages import Pose
+    from operators.fusion import EkfFusion
+    from operators.fusion.sensors import SensorSettings
+
+    samples, truth = recorded(folder)
     stamps = np.array([t.stamp for t in truth])
     rng = np.random.default_rng(seed)
     fixes = []
@@ -165,7 +172,10 @@ def main() -> None:
     for seed in range(first, stop):
         if arguments.what == "euroc":
             rmse, ends, text = euroc(arguments.folder, seed)
-            print(f"seed {seed}: RMSE {rmse * 100:.2f} cm; outages' ends {np.round(ends, 2).tolist()} m; {text}")
+            print(
+                f"seed {seed}: RMSE {rmse * 100:.2f} cm; outages' ends {np.round(ends, 2).tolist()} m; {text}",
+                flush=True,
+            )
             squares.append(rmse**2)
         else:
             ends, nees, errors = simulator(seed)

@@ -47,13 +47,21 @@ def rests(samples: Sequence[Sample], prior: Prior) -> bool:
     return steady and mean < 5 * prior.gyro_bias and abs(float(np.linalg.norm(accel.mean(axis=0))) - 9.81) < 0.5
 
 
-def first_node(samples: Sequence[Sample], prior: Prior, gravity: float, *, at_rest: bool) -> Node:
-    """Returns the estimate at the last of the samples, with one hypothesis for each heading in question."""
+def first_node(
+    samples: Sequence[Sample], prior: Prior, gravity: float, *, at_rest: bool, T_body_base: Array | None = None
+) -> Node:
+    """Returns the estimate at the last of the samples, with one hypothesis for each heading in question.
+
+    `T_body_base` (4, 4): the frame whose position and heading the prior knows; the body itself if none.
+    """
+    base = np.eye(4) if T_body_base is None else T_body_base
     gyro = np.mean([s.gyro for s in samples], axis=0)
     accel = np.mean([s.accel for s in samples], axis=0)
     count = len(samples)
     up = accel / np.linalg.norm(accel)
     level = _levelling(up)
+    forward = level @ base[:3, 0]
+    level = _turn(-math.atan2(forward[1], forward[0])) @ level  # now the base heads along x
     known = prior.heading is not None
     centre = prior.heading if prior.heading is not None else 0.0
     headings = [centre] if known else [centre + 2 * math.pi * k / prior.headings for k in range(prior.headings)]
@@ -71,7 +79,7 @@ def first_node(samples: Sequence[Sample], prior: Prior, gravity: float, *, at_re
         P[ROTATION, ROTATION] = tilt * 0.1**2 + np.outer(R[2], R[2]) * spread**2
         P[GYRO_BIAS, GYRO_BIAS] = np.eye(3) * prior.gyro_bias**2
         P[ACCEL_BIAS, ACCEL_BIAS] = np.eye(3) * prior.accel_bias**2
-        state = State(np.array(prior.position), np.zeros(3), R, np.zeros(3), np.zeros(3), P)
+        state = State(np.array(prior.position) - R @ base[:3, 3], np.zeros(3), R, np.zeros(3), np.zeros(3), P)
         force = RestingForce(accel, down)
         sigma2 = noise.accel**2 / period / count if at_rest else prior.moving_accel**2
         state = updated(state, *force.innovation(state, gyro), np.eye(3) * sigma2)

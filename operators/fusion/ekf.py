@@ -47,7 +47,7 @@ class EkfFusion(Operator):
     corrects it, at the time when it was measured: what comes late, up to `window`, is put in its place and the rest is
     done again.
 
-    Settings of a stream stand under its name without namespace (`robot/fix`). A chi-square gate refuses what does not
+    Settings of a stream stand under the end of its name (`robot/fix`). A chi-square gate refuses what does not
     fit; measurements that fit only because the filter knows little wait for a second one that agrees, and refused ones
     that agree with each other show the filter to be wrong, which makes room for them. Detections of a radar and ranges
     may be of something else, so the filter never yields to those.
@@ -71,10 +71,14 @@ class EkfFusion(Operator):
     odometry: Out[Odometry] = Out(doc="the base in the world frame, with velocity and covariance; with every sample")
     status: Out[Diagnostics] = Out(doc="what became of each sensor's measurements; every second")
 
-    sensors: dict[str, SensorSettings] = Param({}, doc="settings by stream, such as robot/fix")
+    sensors: dict[str, SensorSettings] = Param(
+        {}, doc="settings by stream, such as robot/fix; the others have defaults"
+    )
     motion: Literal["inertial", "constant_velocity"] = Param("inertial", doc="what moves the state")
     start: Literal["unknown", "origin"] = Param("unknown", doc="what is known of the first position and heading")
-    heading: float | None = Param(None, doc="first heading, where it is known though the position is not", unit="rad")
+    heading: float | None = Param(
+        None, doc="first heading of the base, if known though the position is not", unit="rad"
+    )
     heading_sigma: float = Param(0.1, gt=0, doc="its standard deviation", unit="rad")
     world_frame: str = Param("world", min_length=1, doc="frame of the estimate and of absolute poses; z up")
     base_frame: str = Param("base_link", min_length=1, doc="frame that is posed")
@@ -122,7 +126,7 @@ class EkfFusion(Operator):
     ) -> dict[str, Any] | None:
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
         self._extrinsics = extrinsics
-        named = {name.partition("/")[2]: message for name, message in measurements.items()}
+        named = {self._name(stream): message for stream, message in measurements.items()}
         felt = False
         for name, message in named.items():
             settings = self._settings(name)
@@ -183,6 +187,13 @@ class EkfFusion(Operator):
                 figures[f"{name}, unconfirmed"] = health.unconfirmed
         ignored = self._ignored + (self._filter.ignored if self._filter is not None else Counter())
         return figures | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}
+
+    def _name(self, stream: str) -> str:
+        """The name in `sensors` that a stream's name ends with, else its name without the namespace."""
+        for name in self.sensors:
+            if stream == name or stream.endswith(f"/{name}"):
+                return name
+        return stream.partition("/")[2]
 
     def _settings(self, name: str) -> SensorSettings:
         return self.sensors.get(name) or SensorSettings()
@@ -252,7 +263,9 @@ class EkfFusion(Operator):
         prior = self._prior()
         resting = rests(self._samples, prior)
         if resting or waited >= self.patience:
-            self._filter = LateFilter(self._config(), first_node(self._samples, prior, self.gravity, at_rest=resting))
+            place = self._place(self.base_frame)
+            node = first_node(self._samples, prior, self.gravity, at_rest=resting, T_body_base=place)
+            self._filter = LateFilter(self._config(), node)
             self._ignored["begun in motion"] += int(not resting)
             self._samples = []
         return self._filter is not None

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from operators.fusion.error_state import POSITION, VELOCITY, State
+from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY, State
 
 Array = NDArray[np.float64]
 Verdict = Literal["used", "widened", "refused", "unconfirmed"]
@@ -94,7 +94,8 @@ def _agree(config: GateConfig, before: Doubt, now: Doubt, state: State, H: Array
     if seconds > config.memory or len(before.residual) != len(now.residual):
         return False
     velocity = state.covariance[VELOCITY, VELOCITY] + config.drift**2 * np.eye(3)
-    drift = H[:, POSITION] @ velocity @ H[:, POSITION].T * seconds**2
+    turning = state.covariance[GYRO_BIAS, GYRO_BIAS]
+    drift = H[:, POSITION] @ velocity @ H[:, POSITION].T + H[:, ROTATION] @ turning @ H[:, ROTATION].T
     apart = now.residual - before.residual
-    off = float(apart @ np.linalg.solve(before.noise + now.noise + drift, apart))
+    off = float(apart @ np.linalg.solve(before.noise + now.noise + drift * seconds**2, apart))
     return off <= threshold(config.share, len(apart))
