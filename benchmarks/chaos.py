@@ -23,7 +23,7 @@ from ruamel.yaml import YAML
 from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 
@@ -50,7 +50,7 @@ def one(seed: int, placement: str, duration: str, folder: Path) -> tuple[bool, i
     with Recording(path) as recording:
         drops = sum(len(r.drops) for name in graph.nodes for r in recorded_firings(recording, name))
     path.unlink()
-    timeouts = sum(n for found in report.drops.values() for _, why, n in found if why == "timeout")
+    timeouts = sum(n for found in report.waits.values() for _, what, n in found if what == "timeout")
     planned = sum(note.startswith("planned fault") for note in report.notes)
     restarts = sum(report.restarts.values())
     busy = [c.busy_ns * 1e-9 for name, c in verified.work.items()]

@@ -113,7 +113,7 @@ class Producer:
         """Publishes the next image; when that began (monotonic ns)."""
         image = images[self.seq % IMAGES]
         start = time.monotonic_ns()
-        self.publisher.put(Envelope.of(image, STREAM, self.seq))
+        self.publisher.put(Envelope(Kind.MESSAGE, STREAM, 0, self.seq, image.stamp, image))
         self.seq += 1
         return start
 

@@ -80,6 +80,8 @@ class Operator:
     """What `process()` gives depends on its inputs alone, so re-execution may begin anywhere."""
     external: ClassVar[bool] = False
     """Touches the world (an actuator, a network service): always recorded, never re-executed."""
+    __generator: np.random.Generator | None = None
+    __seed: int = 0
 
     def __init_subclass__(
         cls,
@@ -114,7 +116,17 @@ class Operator:
         for name in type(self.params).model_fields:
             setattr(self, name, getattr(self.params, name))
         self.files: dict[str, str] = {}
-        self.rng: np.random.Generator = np.random.default_rng(0)
+
+    @property
+    def rng(self) -> np.random.Generator:
+        """The operator's own random generator: seeded anew before every call, made when it is first asked for."""
+        if self.__generator is None:
+            self.__generator = np.random.Generator(np.random.PCG64(self.__seed))
+        return self.__generator
+
+    def seed_rng(self, seed: int) -> None:
+        """Gives `rng` a new seed; the runtime does so before every call."""
+        self.__generator, self.__seed = None, seed
 
     def setup(self) -> None:
         """Loads models and other resources. Runs once, on the thread that later runs `process()`."""

@@ -97,7 +97,7 @@ def play(
         statics = frozenset(stream for name in static for stream in wired.get(name, ()))
         runner = OperatorRunner(node, collector, static=statics, seed=seed, paranoid=paranoid, operator=operator)
         _play_operator(runner, {s: m for given in wired.values() for s, m in given.items()})
-        collector.played.drops = dict(runner.aligner.drops)
+        collector.played.drops = dict(runner.drops)
     finally:
         operator.close()
     return collector.played

@@ -30,6 +30,8 @@ that names the type and the field.
   converted where nothing but floating-point precision can be lost. NaN and -0.0 are kept bit by bit.
 - Two messages are equal when their digests are: schema, stamp and every field, bit by bit.
 - Optional fields are None unless given.
+
+What these do not say, [a type of your own](own-messages.md) does.
 """
 
 

@@ -1,14 +1,59 @@
-"""Faults of sources: what is done to their steps on the way out."""
+"""Faults on purpose: of sources, whose steps are changed on the way out, and of operators, before they fire."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from dataflow.chaos.plan import SECOND
 from dataflow.messages.base import Message
+from dataflow.sync import Firing
 
 Step = Mapping[str, Message]
+
+HANG = 3600.0
+"""Seconds that a planned hang lasts, unless somebody ends it."""
+
+
+class InjectedFault(RuntimeError):
+    """A failure that was asked for, to see what follows from it."""
+
+
+class OperatorFaults:
+    """Faults of one operator: a firing that fails, hangs or begins late, memory that is not given back."""
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+    ) -> None:
+        self._clock, self._sleep = clock, sleep
+        self._fail = False
+        self._pause, self._until = 0.0, 0.0
+        self._leaked: list[bytearray] = []
+
+    def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
+        """`raise` fails the next firing in place of the operator, `hang` never ends it, `slow` begins every firing late
+        for a while, `leak` takes memory."""
+        match kind:
+            case "raise":
+                self._fail = True
+            case "hang":
+                self._pause, self._until = HANG, now + HANG
+            case "slow":
+                self._pause, self._until = fields["by"], now + fields["span"]
+            case "leak":
+                noise = os.urandom(1 << 20)
+                self._leaked += [bytearray(noise) for _ in range(fields["megabytes"])]  # others get a turn in between
+
+    def before(self, firing: Firing) -> InjectedFault | None:
+        """What happens before a firing: a pause, and the error with which it is to fail, if any."""
+        if self._pause and self._clock() < self._until:
+            self._sleep(self._pause)
+        if not self._fail or firing.kind == "finish":
+            return None
+        self._fail = False
+        return InjectedFault("planned")
 
 
 class SourceFaults:

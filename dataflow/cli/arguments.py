@@ -18,6 +18,14 @@ FLAG = " "
 """The metavar of an option without a value: nothing is shown."""
 
 Json = Annotated[bool, typer.Option("--json", metavar=FLAG, help="Print JSON instead of tables.")]
+Network = Annotated[
+    bool,
+    typer.Option(
+        "--network",
+        metavar=FLAG,
+        help="Obey the `network:` section of the graph inside the recording: open its ports, connect where it says.",
+    ),
+]
 Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),

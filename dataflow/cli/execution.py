@@ -16,6 +16,7 @@ from dataflow.cli.arguments import (
     End,
     GraphFile,
     ModuleFolders,
+    Network,
     RecordingFile,
     Settings,
     Start,
@@ -211,6 +212,7 @@ def replay(
     rate: Rate = None,
     timeout: Timeout = 120.0,
     paranoid: Paranoid = False,
+    network: Network = False,
     quiet: Quiet = False,
     one_process: OneProcess = False,
     process_each: ProcessEach = False,
@@ -259,7 +261,7 @@ def replay(
     began = time.monotonic()
     from dataflow.graph import load_graph
     from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import recorded_graph
+    from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
     from dataflow.supervision.replay import plan_replay
     from dataflow.supervision.run import replay as replay_recording
 
@@ -272,7 +274,10 @@ def replay(
         find_modules_in(path)
         with Recording(recording) as opened:
             if graph is None:
-                loaded = recorded_graph(opened)
+                recorded = graph_as_recorded(opened)
+                loaded = recorded if network else isolated(recorded)
+                if loaded.network != recorded.network:
+                    say_network_ignored(recording)
             else:
                 loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
             if complete is not None:
@@ -305,6 +310,14 @@ def replay(
             json=json,
             quiet=quiet,
         )
+
+
+def say_network_ignored(recording: Path) -> None:
+    """Reports that the graph inside a recording would have opened ports or connected somewhere, and did not."""
+    say(
+        f"[yellow]not obeyed:[/] the `network:` section of the graph inside {escape(str(recording))}; this run stays "
+        "on this machine (--network obeys it)"
+    )
 
 
 def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:

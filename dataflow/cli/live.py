@@ -129,6 +129,7 @@ def _listed(found: RunningGraph) -> dict[str, Any]:
         "name": found.name,
         "namespace": found.namespace,
         "pid": found.pid,
+        "endpoints": list(found.endpoints),
         "started": found.started,
         "operators": list(graph.nodes),
         "streams": {s.name: list(s.types) for s in graph.streams.values()},

@@ -101,6 +101,8 @@ def _facts(described: Description) -> Table:
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
         row("torn", "no proper end: its writer died" + (lost if described.lost_bytes else ""), "yellow")
+    for note in described.damage:
+        row("damaged", note, "yellow")
     if described.start is not None and described.end is not None:
         row("from", format_stamp(described.start))
         row("to", format_stamp(described.end))
@@ -128,6 +130,7 @@ def _streams(described: Description, namespace: str) -> Table:
         notes += [f"{s.incarnations} incarnations"] if s.incarnations > 1 else []
         notes += [f"unsupported encoding ({s.encoding})"] if not s.readable else []
         notes += ["declared differently now"] if s.declared_otherwise else []
+        notes += ["type read from the recording"] if s.generic else []
         kind = s.type if s.readable else f"{s.schema} ({s.encoding})" if foreign else s.schema
         rate = "" if s.rate is None or s.static else f"{s.rate:.2f}"
         row = (_relative(s.name, namespace), kind, count(s.count), rate, size(s.bytes), ", ".join(notes))

@@ -41,7 +41,10 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
         console.print(Columns(blocks, padding=(0, 3)))
     if any(report.drops.values()):
         console.print(Text("dropped", style="bold yellow"))
-        console.print(Padding(_drops(report), (0, 0, 1, 2), expand=False))
+        console.print(Padding(_reasons(report.drops), (0, 0, 1, 2), expand=False))
+    if any(report.waits.values()):
+        console.print(Text("waits given up (timeout), messages after their firing (late)", style="bold yellow"))
+        console.print(Padding(_reasons(report.waits), (0, 0, 1, 2), expand=False))
     for operator, times in report.restarts.items():
         console.print(Text(f"{operator} was restarted {plural(times, 'time')}", style="yellow"))
     for note in report.notes:
@@ -83,13 +86,14 @@ def _figures(summary: Mapping[str, Any]) -> Table:
     return grid
 
 
-def _drops(report: RunReport) -> Table:
+def _reasons(found: Mapping[str, tuple[tuple[str, str, int], ...]]) -> Table:
+    """One line for each operator's input and reason."""
     grid = Table.grid(padding=(0, 2))
     grid.add_column()
     grid.add_column(justify="right", no_wrap=True)
     grid.add_column(overflow="fold")
-    for operator, drops in report.drops.items():
-        for input_name, reason, number in drops:
+    for operator, rows in found.items():
+        for input_name, reason, number in rows:
             where = f"{operator}.{input_name}" if input_name else operator
             grid.add_row(Text(where), count(number), Text(reason))
     return grid
@@ -119,6 +123,10 @@ def report_json(report: RunReport) -> dict[str, Any]:
         "drops": {
             operator: [{"input": i, "reason": why, "count": n} for i, why, n in drops]
             for operator, drops in report.drops.items()
+        },
+        "waits": {
+            operator: [{"input": i, "what": what, "count": n} for i, what, n in waits]
+            for operator, waits in report.waits.items()
         },
         "restarts": dict(report.restarts),
         "summaries": {operator: dict(summary) for operator, summary in report.summaries.items()},

@@ -115,7 +115,7 @@ def top(
 ) -> None:
     """Show the status of every operator of a running graph: state, rates, drops, load, restarts and lag.
 
-    States: running, dropping (messages are lost to its queues and waits), silent (nothing for a while), starting,
+    States: running, dropping (messages reached no firing), silent (nothing for a while), starting,
     ended, no answer (its process is being restarted, or hangs). Rates and load are since the last update; lag is how
     far an operator's event time is behind the foremost one's. Ends with the graph, or at Ctrl-C.
 

@@ -1,20 +1,21 @@
-"""What verification found, in words: one recording in full, many in a table."""
+"""Prints what verification found: one recording in full, many in a table."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from rich.console import Console
 from rich.text import Text
 
 from dataflow.cli.output import count, plural, seconds, size, table
 from dataflow.recording.diff import FieldDifference
-from dataflow.reexecution.recorded import Difference, Verification
+from dataflow.records.comparison import Difference, Verification
 from dataflow.sync.stamps import format_stamp
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.complete import Completion
 from dataflow.verification.gate import Checked, Judged
-from dataflow.verification.verify import VerifyReport
+from dataflow.verification.report import StandIn, VerifyReport
+from dataflow.verification.stored import StoredStream
 
 STYLES = {
     "identical": "green",
@@ -24,6 +25,8 @@ STYLES = {
     "culprit": "bold red",
     "different": "bold red",
     "not as accepted": "bold red",
+    "changed": "bold red",
+    "nothing verified": "bold red",
     "could not run": "bold red",
     "downstream": "yellow",
     "unverifiable": "yellow",
@@ -38,13 +41,16 @@ def print_one(console: Console, checked: Checked) -> None:
     assert report is not None
     numbers = ("firings", "repeated", "outputs", "differing")
     verdicts = table("operator", *numbers, "verdict", right=numbers)
-    for v, judged in zip(report.operators, checked.judged, strict=True):
-        cells = (count(n) for n in (v.firings, v.verified, v.outputs, v.differing))
-        verdicts.add_row(Text(v.operator), *cells, Text(judged.verdict, style=STYLES[judged.verdict]))
-    console.print(verdicts)
+    by_name = {v.operator: v for v in report.operators}
     for judged in checked.judged:
-        for line in explain(checked, judged):
-            console.print(Text(line), soft_wrap=True)
+        v = by_name.get(judged.operator)
+        cells = [] if v is None else [count(n) for n in (v.firings, v.verified, v.outputs, v.differing)]
+        row = cells or [""] * len(numbers)  # a source is not repeated
+        verdicts.add_row(Text(judged.operator), *row, Text(judged.verdict, style=STYLES[judged.verdict]))
+    console.print(verdicts)
+    told = [line for judged in checked.judged for line in explain(checked, judged)]
+    for line in dict.fromkeys([*told, *_notes(report)]):
+        console.print(Text(line), soft_wrap=True)
     if said := _cut(report):
         console.print(Text(said, style="yellow"), soft_wrap=True)
     if not report.identical:
@@ -64,7 +70,7 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
             Text(checked.verdict, style=STYLES[checked.verdict]),
             "" if report is None else count(report.messages),
             f"{report.span / report.wall:.1f}" if report is not None and report.wall and report.span else "",
-            Text(", ".join(checked.culprits)),
+            Text(", ".join((*checked.culprits, *checked.changed))),
         )
     console.print(summary)
     for checked in all_checked:
@@ -99,10 +105,11 @@ def reservations(checked: Checked) -> Iterator[str]:
         yield said
     for v in checked.report.operators:
         yield from _left_out(v)
+    yield from _notes(checked.report)
 
 
 def print_completion(console: Console, made: Completion) -> None:
-    """What was computed and stored; or which operator came out otherwise, and where."""
+    """Prints what was computed and stored; or which operator differs, and where."""
     for v in made.operators:
         if v.first is not None:
             lines = [
@@ -136,10 +143,14 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
     """What there is to say about one operator besides its verdict."""
     report = checked.report
     assert report is not None
-    v = next(v for v in report.operators if v.operator == judged.operator)
+    yield from _changed(s for s in report.stored if s.maker == judged.operator)
+    v = next((v for v in report.operators if v.operator == judged.operator), None)
+    if v is None:
+        yield from _stand_in(next(s for s in report.stand_ins if s.operator == judged.operator))
+        return
     compared = report.comparisons.get(v.operator)
     if judged.verdict == "accepted":
-        yield f"{v.operator}: other than recorded, as the baseline accepts"
+        yield f"{v.operator}: differs from the recording as the baseline accepts"
     elif judged.verdict == "not as accepted":
         yield f"{v.operator}: as recorded, but the baseline accepts another outcome (--accept takes this one)"
     elif judged.verdict == "within tolerance":
@@ -147,18 +158,18 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         yield _tolerated(compared, report.tolerance)
     elif v.first is not None:
         yield from _difference(v, v.first, compared)
-        if compared is not None and report.tolerance is not None and not compared.note:
+        if compared is not None and report.tolerance is not None:
             counts = f"{count(compared.equal)} identical, {count(compared.within)} within {report.tolerance:g}"
-            more = f", {count(compared.otherwise)} missing, uncalled for or in error" if compared.otherwise else ""
+            more = f", {count(compared.unpaired)} missing, uncalled for or in error" if compared.unpaired else ""
             yield f"{v.operator}: given the recorded inputs, {counts}, {count(compared.beyond)} beyond it{more}"
     repeats = report.repeats(v.operator)
     if repeats is False and judged.verdict != "within tolerance":
         yield (
-            f"{v.operator}: run a second time, it came out otherwise again: it does not repeat "
+            f"{v.operator}: run a second time, it differed in another way: it does not repeat "
             "(it may read the clock, draw numbers that are not self.rng's, or use several threads)"
         )
     elif repeats and judged.verdict == "culprit":
-        yield f"{v.operator}: run a second time, it came out the same: its code, its libraries or the machine changed"
+        yield f"{v.operator}: run a second time, it differed alike: its code, its libraries or the machine changed"
     if report.start is not None and v.began == "start":
         yield f"{v.operator}: keeps state and the recording has no snapshot of it there: repeated from its beginning"
     yield from _left_out(v)
@@ -171,6 +182,45 @@ def _cut(report: VerifyReport) -> str:
     if report.torn:
         return "the recording has no proper end: verified is what its writer had stored when it died"
     return "the run did not end in order: verified is what was recorded until then" if report.cut else ""
+
+
+def _changed(streams: Iterable[StoredStream]) -> Iterator[str]:
+    """The stored messages that are not what their firing records say."""
+    for s in streams:
+        if s.first_changed is not None:
+            more = f" ({plural(s.changed, 'message')} of that stream)" if s.changed > 1 else ""
+            yield f"{s.stream} {_number(s.first_changed)} is not what was recorded{more}: the file was changed"
+
+
+def _stand_in(s: StandIn) -> Iterator[str]:
+    """What is not in order in the books of a source, and what its streams lack."""
+    if s.lost_records:
+        yield f"{s.operator}: {plural(s.lost_records, 'firing')} after a gap in its firing records: records are lost"
+    if s.unaccounted:
+        told = ", after the cut" if s.cut else ": records are lost, or messages were added"
+        yield f"{s.operator}: {plural(s.unaccounted, 'message')} that no firing record accounts for{told}"
+    elif s.unfinished:
+        yield f"{s.operator}: its firing records end before the run did: records are lost"
+
+
+def _notes(report: VerifyReport) -> Iterator[str]:
+    """What is to be known of the streams that were not made again."""
+    for stand_in in report.stand_ins:
+        yield from _stand_in(stand_in)
+        if stand_in.missing:
+            lost = [s for s in report.stored if s.maker == stand_in.operator and s.first_missing is not None]
+            first = f", the first {lost[0].stream} {_number(lost[0].first_missing)}" if lost else ""
+            made = f"{plural(stand_in.missing, 'message')} that it made, not in the recording"
+            yield f"{stand_in.operator}: {made} (never sent, or lost{first})"
+    for stream in report.unchecked:
+        yield f"{stream}: not compared with its records: messages of its type are not read as they were written"
+
+
+def _number(place: tuple[int, int] | None) -> str:
+    if place is None:
+        return ""
+    incarnation, number = place
+    return f"#{number}" if not incarnation else f"#{number} of incarnation {incarnation}"
 
 
 def _left_out(v: Verification) -> Iterator[str]:
@@ -208,8 +258,6 @@ def _difference(v: Verification, first: Difference, compared: OutputComparison |
     yield f"  here      {first.got}"
     if compared is None:
         return
-    if compared.note:
-        yield f"  {compared.note}"
     for output in compared.first:
         if (output.index, output.incarnation) != (first.index, first.incarnation):
             yield f"  compared in firing {output.index} ({output.kind}) at {format_stamp(output.firing)}:"
@@ -245,11 +293,14 @@ def _conclusion(checked: Checked, report: VerifyReport) -> str:
     what = f"{plural(report.messages, 'message')} of {plural(report.streams, 'stream')}"
     if report.wall and report.span:
         pace += f", {report.span / report.wall:.1f} × real time"
+    pace += f" ({seconds(checked.wall)} in all)"
     match checked.verdict:
         case "identical" | "identical up to the cut":
             return f": {what}{pace}"
         case "within tolerance":
             return f" of {report.tolerance:g}, not identical: {what}{pace}"
-        case "different" if checked.culprits:
-            return f": look at {', '.join(checked.culprits)}{pace}"
+        case "nothing verified":
+            return f": the recording ends before any operator was called{pace}"
+        case "different" if checked.culprits or checked.changed:
+            return f": look at {', '.join((*checked.culprits, *checked.changed))}{pace}"
     return pace

@@ -18,7 +18,7 @@ from dataflow.cli.arguments import (
     find_modules_in,
     output_file,
 )
-from dataflow.cli.execution import OneProcess, ProcessEach, Quiet
+from dataflow.cli.execution import Quiet
 from dataflow.cli.output import (
     COULD_NOT_RUN,
     DIFFERENT,
@@ -35,9 +35,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dataflow.verification.gate import Baseline, Checked
-    from dataflow.verification.verify import VerifyReport
+    from dataflow.verification.report import VerifyReport
 
 _GATE = "Regression gate"
+MOST_JOBS = 1024
 
 
 def verify(
@@ -92,22 +93,36 @@ def verify(
             "--junit", metavar="FILE.xml", rich_help_panel=_GATE, help="Write the results as JUnit XML (replaced)."
         ),
     ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            "--jobs",
+            "-j",
+            metavar="N",
+            help="Worker processes. Default: one for each core, fewer where little is to do.",
+        ),
+    ] = None,
     quiet: Quiet = False,
-    one_process: OneProcess = False,
-    process_each: ProcessEach = False,
+    one_process: Annotated[
+        bool, typer.Option("--one-process", metavar=FLAG, help="Deprecated: means --jobs 1.")
+    ] = False,
+    process_each: Annotated[
+        bool, typer.Option("--process-each", metavar=FLAG, help="Deprecated: has no effect.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Re-execute recorded runs by their firing records, and compare every output.
 
-    Outputs are compared digest by digest. Where they differ, the culprit (same inputs, other output) is told from what
-    only follows from it, and run once more: to say which field differs, and whether it differs alike each time.
+    Every operator is fed from the recording, in worker processes that use no network. Its outputs, and the stored
+    messages, are compared with the recorded digests. A culprit (same inputs, other output) is shown with the field that
+    differs, and run once more, to see whether it differs alike each time.
 
     Of a folder, every .mcap in it is verified, at any depth; one that cannot be read does not keep the others from it.
 
     Exit codes:
 
       0    identical, or within --tolerance, or as --baseline accepts
-      1    different, or not wholly verifiable
+      1    different, not wholly verifiable, or nothing verified
       2    could not run (of several recordings: at least one)
       130  interrupted with Ctrl-C
 
@@ -127,6 +142,11 @@ def verify(
     with friendly_errors():
         if one_process and process_each:
             raise fail("--one-process and --process-each exclude each other")
+        if jobs is not None and (one_process or not 1 <= jobs <= MOST_JOBS):
+            raise fail(f"--jobs {jobs}: expected 1 to {MOST_JOBS}, without --one-process")
+        if one_process or process_each:
+            instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
+            say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
         if first is not None and only is not None:
             raise fail("--from and --only exclude each other")
         if graph is None and settings:
@@ -134,8 +154,8 @@ def verify(
         if tolerance is not None and not 0 <= tolerance < float("inf"):
             raise fail(f"--tolerance {tolerance:g}: expected a finite number, 0 or more")
         check_offset("--start", start)
-        if start is not None and (tolerance is not None or one_process or process_each or baseline is not None):
-            raise fail("--start goes with --from, --only, --graph and --json only")
+        if start is not None and baseline is not None:
+            raise fail("--start and --baseline exclude each other: a baseline is of whole recordings")
         if accept and baseline is None:
             raise fail("--accept writes a baseline: name the file with --baseline FILE.json")
         if accept and (first is not None or only is not None):
@@ -159,7 +179,7 @@ def verify(
             "only": only,
             "tolerance": tolerance,
             "start": start,
-            "placement": "one_host" if one_process else "host_each" if process_each else "graph",
+            "jobs": 1 if one_process else jobs,
         }
         single = len(recordings) == 1 and not recordings[0].is_dir()
         checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)
@@ -233,7 +253,7 @@ def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, who
         news += [f"{one.name}: {name}" for name in changed]
         for name in refused:
             say(
-                f"[yellow]not accepted:[/] {escape(one.name)}: {name} (not wholly verifiable, or other each time: "
+                f"[yellow]not accepted:[/] {escape(one.name)}: {name} (not wholly verifiable, or different each time: "
                 "it could not be recognised again)"
             )
     known.save()
@@ -243,7 +263,7 @@ def _mind_baseline(known: Baseline, checked: list[Checked], *, accept: bool, who
 def _exit_code(checked: list[Checked], accepted: Baseline | None) -> int:
     if any(c.report is None for c in checked):
         return COULD_NOT_RUN
-    if accepted is None:
+    if accepted is None or any(c.report is not None and (c.report.empty or c.report.changed) for c in checked):
         return 0 if all(c.passed for c in checked) else DIFFERENT
     left = [
         j

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from dataflow.cli.output import DIFFERENT, err, fail, friendly_errors, out, plur
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.recording import Recording
     from dataflow.view import ViewerSink
 
 READY_WITHIN = 20.0
@@ -54,6 +56,10 @@ def view(
     graph: GraphName = None,
     wait: Wait = 0.0,
     overwrite: Overwrite = False,
+    modules: Annotated[
+        list[str] | None,
+        typer.Option("--import", metavar="MODULE", help="Import a module with visualisers first. May be repeated."),
+    ] = None,
     until_end: Annotated[bool, typer.Option("--until-end", hidden=True)] = False,
 ) -> None:
     """Show a recording, or attach to a running graph.
@@ -68,6 +74,7 @@ def view(
       dataflow view --graph rgbd_perception --to serve
     """
     with friendly_errors():
+        _import(modules or ())
         if recording is not None:
             if graph is not None or wait:
                 raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
@@ -76,6 +83,14 @@ def view(
             if start is not None or end is not None:
                 raise fail("--start and --end are about a recording; name one")
             _view_running(_sink(to, overwrite), streams, graph, wait, until_end=until_end)
+
+
+def _import(modules: Iterable[str]) -> None:
+    for name in modules:
+        try:
+            importlib.import_module(name)
+        except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
+            raise fail(f"--import {name}: {type(error).__name__}: {error}") from error
 
 
 def _sink(to: str, overwrite: bool) -> ViewerSink:
@@ -106,7 +121,7 @@ def _view_recording(
 
     from dataflow.recording import Recording
     from dataflow.recording.layout import RECORDING
-    from dataflow.reexecution.recorded_run import wiring
+    from dataflow.reexecution.recorded_run import resolved_graph
     from dataflow.view import Serve, from_recording
 
     with Recording(path) as opened:
@@ -117,9 +132,11 @@ def _view_recording(
         chosen = chosen_streams(streams, readable, namespace)
         if not any(opened.streams[name].count for name in chosen):
             raise fail(f"{path} holds no message of {', '.join(chosen)}")
-        graph = wiring(opened)
+        graph = resolved_graph(opened)
         if graph is not None:
             graph = _showing(graph, streams and chosen)
+        if generic := sorted({_type_name(opened, name) for name in chosen if opened.streams[name].generic}):
+            say(f"[dim]drawn by the recording's own declaration, without its module: {', '.join(generic)}[/]")
         whole = span(opened, chosen)
         begin, finish = window(whole, start, end, path)
         first, last = whole or (0, 0)
@@ -145,6 +162,11 @@ def _view_recording(
                 _until_interrupted()
             complete = sink.close(timeout=60.0)
     _report(sink, complete)
+
+
+def _type_name(opened: Recording, stream: str) -> str:
+    found = opened.streams[stream].message_type
+    return "" if found is None else found.SCHEMA
 
 
 def _showing(graph: Graph, wanted: list[str] | None) -> Graph:
@@ -178,16 +200,23 @@ class _Announcer:
 def _view_running(
     sink: ViewerSink, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool
 ) -> None:
-    from dataflow.client.attach import graph_of, still_runs, tap
-    from dataflow.messages import message_type
+    from dataflow.client.attach import graph_of, still_runs, tap, types_of
+    from dataflow.messages import Message, MessageError
     from dataflow.view import Serve
 
     found = running_graph(name, wait)
     running = graph_of(found)
     chosen = chosen_streams(streams, running.streams, running.namespace)
     shown = _showing(running, streams and chosen)
+    for stream in chosen:
+        try:
+            running.message_types(stream)  # with the module come the visualisers of its types
+        except MessageError as error:
+            say(f"[yellow]{escape(str(error))}; drawn by its fields[/]")
+    types = types_of(running)
+    first = {name: running.streams[name].types[0] for name in chosen}
     with sink:
-        sink.open({name: message_type(running.streams[name].types[0]) for name in chosen}, shown)
+        sink.open({name: Message if schema == "Message" else types(schema) for name, schema in first.items()}, shown)
         _Announcer(sink).announce()
         say(f"following {escape(running.name)} (process {found.pid})")
         with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:

@@ -7,11 +7,17 @@ import time
 from collections.abc import Iterator, Sequence
 
 from dataflow.graph.model import Graph
+from dataflow.messages.base import message_type
+from dataflow.messages.declaration import known_type
 from dataflow.transport import Bus, NetworkConfig, TapClient, TapWindow
+from dataflow.transport.codec import TypeOf
 from dataflow.transport.registry import RunningGraph, running
+from dataflow.transport.tap_client import held_statics
 
 POLL = 0.1
-CONNECT_WITHIN = 5.0
+AGAIN_AFTER = 0.005
+CONNECT_WITHIN = 1.0
+"""Seconds that a tool waits for processes that do not answer: they are starting again, stopped, or hang."""
 
 
 class NotRunning(LookupError):
@@ -41,6 +47,15 @@ def graph_of(found: RunningGraph) -> Graph:
     return Graph.from_json(found.graph)
 
 
+def types_of(graph: Graph) -> TypeOf:
+    """The classes that a tool reads a graph's messages as; the graph's own types by their declarations.
+
+    Nothing of the graph's code is imported: its modules may not even be there where the tool runs.
+    """
+    own = {schema: known_type(declaration) for schema, declaration in graph.types.items()}
+    return lambda schema: own.get(schema) or message_type(schema)
+
+
 def still_runs(found: RunningGraph) -> bool:
     """Whether that very run goes on."""
     return any(g.pid == found.pid and g.started == found.started for g in running())
@@ -52,15 +67,20 @@ def tap(found: RunningGraph, expressions: Sequence[str], window: TapWindow | Non
     absolute = [e[1:] if e.startswith("/") else f"{found.namespace}/{e}" for e in expressions]
     with Bus(NetworkConfig(connect=found.endpoints)) as bus:
         _until_connected(bus, found)
-        with TapClient(bus, found.namespace, absolute, window) as client:
+        with TapClient(bus, found.namespace, absolute, window, types=types_of(graph_of(found))) as client:
             yield client
 
 
 def _until_connected(bus: Bus, found: RunningGraph) -> None:
-    """Waits (bounded) until every host is reached and answers for its static streams."""
-    expected = {s.name for s in graph_of(found).streams.values() if s.static}
+    """Waits (bounded) until every process is reached, and answers for the static streams that it holds."""
     deadline = time.monotonic() + CONNECT_WITHIN
     while len(bus.peers()) < len(found.endpoints) and time.monotonic() < deadline:
-        time.sleep(POLL / 5)
-    while not expected <= set(bus.query_static(found.namespace, timeout=1.0)) and time.monotonic() < deadline:
-        time.sleep(POLL)
+        time.sleep(AGAIN_AFTER)
+    held: list[set[str]] = []
+    while len(held) < len(bus.peers()) and (left := deadline - time.monotonic()) > 0:
+        held = held_statics(bus, found.namespace, left)
+    expected = set().union(*held)
+    while (left := deadline - time.monotonic()) > 0:
+        if expected <= set(bus.query_static(found.namespace, timeout=left)):
+            return
+        time.sleep(AGAIN_AFTER)

@@ -12,8 +12,8 @@ from typing import Any
 import msgpack
 
 from dataflow.transport import Bus, NetworkConfig
-from dataflow.transport.bus import BusError
 from dataflow.transport.keys import runtime_key
+from dataflow.transport.publisher import BusError
 from dataflow.transport.registry import RunningGraph
 
 AGAIN_AFTER = 0.05

@@ -6,7 +6,8 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
-from dataflow.firing.runner import Emitter, Recorder
+from dataflow.firing.log import FiringLog
+from dataflow.firing.ports import Emitter
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import Emission
@@ -48,7 +49,7 @@ class LogFeed:
     ) -> None:
         self.recording, self.emitter, self._promises = recording, emitter, promises
         self._ports = ports
-        self._records = {node: Recorder(node, emitter) for node in sorted(set(streams.values()))}
+        self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
         self._streams = {
             name: _LoggedStream(name, node, self._final(name, finals, end))

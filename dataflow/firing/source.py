@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from dataflow.firing.runner import Emitter, OperatorFailure, OutputPorts, Recorder, change_parameter, set_up
+from dataflow.firing.calls import Calls
+from dataflow.firing.failure import OperatorFailure, readable
+from dataflow.firing.log import FiringLog
+from dataflow.firing.ports import Emitter, OutputPorts
+from dataflow.firing.seeding import change_seed, seed_generators
+from dataflow.firing.shared_generators import SharedGenerators, Tripwire
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import OutputError, Source, outputs_of
@@ -28,24 +34,34 @@ class SourceRunner:
         assert isinstance(self.operator, Source)
         self.source: Source = self.operator
         self.ports = OutputPorts(node, self.operator.spec, emitter, lossy=live)
+        self._live, self._pulled, self._tripwire = live, 0, Tripwire()
         self.refused: Counter[str] = Counter()
         """Steps of a live run that were not sent, by reason: `overflow`, `past`, `repeated`."""
         self._recorded: Counter[str] = Counter()
         self._backwards: list[int] = []
         self._resumed = False
-        self.records = Recorder(node.name, emitter)
+        self._changed: dict[str, Any] = {}
+        self.records = FiringLog(node.name, emitter)
         self.firings = 0
         self.ended = False
         self.busy_ns = 0
         self.last = NEVER
+        self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
         self._next: dict[str, Message] | None = None
 
     def setup(self) -> None:
-        set_up(self.operator, self.ports, self.records, self.node, self.seed)
+        started = time.time_ns()
+        statics = Calls(self.node, self.operator, self.seed).setup()
+        self.records.add_setup(self.operator, started, self.ports.prepare(statics, NEVER))
+        self.ports.publish()
+        self.ports.end_statics()
+        self._begin_stream()
+
+    def _begin_stream(self) -> None:
         try:
             self._steps = iter(self.source.stream())
-        except Exception as error:
+        except BaseException as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
 
     def look_ahead(self) -> int | None:
@@ -65,13 +81,25 @@ class SourceRunner:
         if step is not None:
             return step
         started = time.thread_time_ns()
+        self._tripwire.set()
         try:
-            return self.pull()
+            step = self.pull()
+            self._tripwire.check(self.node.name)
+            return step
+        except SharedGenerators as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
         finally:
             self.busy_ns += time.thread_time_ns() - started
 
     def pull(self) -> dict[str, Message] | None:
-        """Reads the source's next non-empty step; for live sources called on the reader's own thread."""
+        """Reads the source's next non-empty step; for live sources called on the reader's own thread.
+
+        Where it runs on the thread of the operators, which leave the global generators as they please, these are seeded
+        first: what a step draws does not depend on what else is in the process.
+        """
+        self._pulled += 1
+        if not self._live:
+            seed_generators(change_seed(self.seed, self.node.name, "step", self.records.incarnation, self._pulled))
         try:
             for step in self._steps:
                 messages = outputs_of(self.operator, step)
@@ -82,9 +110,10 @@ class SourceRunner:
                             f"{self.node.name} yielded stamps {sorted(stamps)} together; "
                             "one step of stream() has one stamp"
                         )
+                    (self._read,) = stamps
                     return messages
-        except (Exception, SystemExit, KeyboardInterrupt) as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+        except BaseException as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
         return None
 
     def admit(self) -> tuple[int, int]:
@@ -145,23 +174,61 @@ class SourceRunner:
 
     def _begin_after_jump(self, stamp: int) -> None:
         incarnation = self.records.incarnation + 1
-        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
         self.ports.begin(incarnation, stamps_go_back=True)
         self.records.add("reset", stamp, time.time_ns(), detail={"last": self.last})
         self.last = NEVER
 
     def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
         """Takes the place of a source whose process died; to be called before `setup()`."""
-        self.records = Recorder(self.node.name, self.ports.emitter, incarnation)
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
         self.ports.resume(incarnation, last)
         self.last = max(last.values(), default=NEVER)
         self._resumed = not self.source.live
+        self._change(changed)
+
+    def start_again(self) -> None:
+        """Puts a fresh source in the place of one that failed, with the parameters as they were last set; its streams
+        begin a new incarnation. Raises `OperatorFailure` when that fails too."""
+        old = self.operator
+        self._steps, self._next = iter(()), None
+        self._backwards.clear()
+        incarnation = self.records.incarnation + 1
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation)
+        self._resumed = not self.source.live
+        try:
+            old.close()
+        except Exception as error:  # the first failure is known
+            print(f"{self.node.name}: close() after a failure: {readable(error)}", file=sys.stderr)
+        try:
+            self.operator = self.node.make()
+            assert isinstance(self.operator, Source)
+            self.source = self.operator
+            self._change(self._changed)
+        except Exception as error:
+            raise OperatorFailure(self.node.name, "construction", error) from error
+        started = time.time_ns()
+        Calls(self.node, self.operator, self.seed).setup()  # its static streams go on as they are
+        self.records.add_setup(self.operator, started, (None,) * len(self.ports.states))
+        self._begin_stream()
+
+    def _change(self, changed: Mapping[str, Any]) -> None:
+        self._changed = dict(changed)
         for name, value in changed.items():
             self.operator.set_parameter(name, value)
 
     def set_parameter(self, name: str, value: Any) -> Any:
-        """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`."""
-        return change_parameter(self.operator, self.records, name, value, max(self.last, NEVER + 1))
+        """Changes a parameter; recorded. Returns the value as validated. Raises `ParameterError`.
+
+        No generator is seeded: `stream()` goes on with what it has drawn, and no source is re-executed.
+        """
+        started = time.time_ns()
+        self.operator.set_parameter(name, value)
+        self._changed[name] = value
+        plain = self.operator.params.model_dump(mode="json")[name]
+        self.records.add("param", max(self.last, NEVER + 1), started, detail={"name": name, "value": plain})
+        return plain
 
     def finish(self, reason: str = "end of source") -> None:
         """Ends the streams; the source is done."""
@@ -178,7 +245,7 @@ class SourceRunner:
         if close is not None:
             try:
                 close()
-            except Exception as error:
+            except BaseException as error:
                 raise OperatorFailure(self.node.name, "the end of stream()", error) from error
 
 

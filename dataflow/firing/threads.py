@@ -30,8 +30,21 @@ def environment(threads: int) -> dict[str, str]:
     }
 
 
+_limit: int | None = None
+
+
 def limit_threads(threads: int) -> None:
     """Limits the libraries that are loaded and have a switch of their own. Called after the operators' imports."""
+    global _limit
+    _limit = threads
+    limit_threads_again()
+
+
+def limit_threads_again() -> None:
+    """Limits the libraries that were loaded since, as `setup()` of an operator may do. Nothing if there is no limit."""
+    threads = _limit
+    if threads is None:
+        return
     modules: dict[str, Any] = sys.modules
     if (cv2 := modules.get("cv2")) is not None:
         cv2.setNumThreads(threads)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import re
-from collections.abc import Iterable
-
-import zenoh
+from collections.abc import Callable, Iterable, Sequence
 
 _NAME = re.compile(r"[^\W\d][\w-]*")
+_REPEATED = re.compile(r"(\$\*){2,}")
+_WITHIN = re.compile(r"\$\*|.", re.DOTALL)
 
 
 def name_fault(name: str) -> str | None:
@@ -42,8 +43,18 @@ def key_fault(key: str) -> str | None:
 
 
 def canonical(key: str) -> str:
-    """The canonical spelling of a key expression that has no fault (`**/*` becomes `*/**`)."""
-    return str(zenoh.KeyExpr.autocanonize(key))
+    """Returns the canonical spelling of a key expression that has no fault (`**/*` becomes `*/**`)."""
+    chunks: list[str] = []
+    for chunk in key.split("/"):
+        chunk = _REPEATED.sub("$*", chunk)
+        chunk = "*" if chunk == "$*" else chunk
+        if chunks[-1:] != ["**"]:
+            chunks.append(chunk)
+        elif chunk == "*":
+            chunks.insert(-1, chunk)
+        elif chunk != "**":
+            chunks.append(chunk)
+    return "/".join(chunks)
 
 
 def has_wildcard(key: str) -> bool:
@@ -51,18 +62,58 @@ def has_wildcard(key: str) -> bool:
 
 
 def matching(key: str, names: Iterable[str]) -> list[str]:
-    """Those of `names` (plain keys) that the canonical expression `key` matches, sorted."""
+    """Returns those of `names` (plain keys) that the canonical expression `key` matches, sorted."""
     if not has_wildcard(key):
         return [name for name in names if name == key][:1]
-    pattern = _expression(key)
-    return sorted(name for name in names if pattern.intersects(_expression(name)))
+    return sorted(name for name in names if intersect(key, name))
 
 
 def may_reach(key: str, prefix: str) -> bool:
-    """True when the expression could match something below `prefix`."""
-    return bool(_expression(key).intersects(_expression(f"{prefix}/**")))
+    """Returns whether the expression could match something below `prefix`."""
+    return intersect(key, f"{prefix}/**")
 
 
 @functools.lru_cache(maxsize=4096)
-def _expression(key: str) -> zenoh.KeyExpr:
-    return zenoh.KeyExpr(key)
+def intersect(left: str, right: str) -> bool:
+    """Returns whether some key matches both expressions, as Zenoh decides it.
+
+    A part `**` stands for any number of parts, `*` for one, `$*` for any characters within a part. None of them matches
+    a part that begins with `@`.
+    """
+    return _meet(left.split("/"), right.split("/"), "**", _chunks_meet, lambda chunk: not chunk.startswith("@"))
+
+
+def _chunks_meet(left: str, right: str) -> bool:
+    if left == right:
+        return True
+    if left.startswith("@") or right.startswith("@"):
+        return False
+    if "*" in (left, right):
+        return True
+    return _meet(_WITHIN.findall(left), _WITHIN.findall(right), "$*", str.__eq__, lambda _: True)
+
+
+def _meet(
+    left: Sequence[str],
+    right: Sequence[str],
+    many: str,
+    meet: Callable[[str, str], bool],
+    passes: Callable[[str], bool],
+) -> bool:
+    """Returns whether two patterns have a word in common; `many` stands for any number of elements that pass."""
+    # able[j]: the elements of `left` so far and the first j of `right` have a word in common
+    able = [True, *itertools.accumulate((r == many for r in right), lambda a, b: a and b)]
+    for element in left:
+        if element == many:
+            after = [able[0]]
+            for j, r in enumerate(right, start=1):
+                after.append(able[j] or ((r == many or passes(r)) and after[j - 1]))
+        else:
+            after = [False]
+            for j, r in enumerate(right, start=1):
+                if r == many:
+                    after.append(after[j - 1] or (passes(element) and able[j]))
+                else:
+                    after.append(able[j - 1] and meet(element, r))
+        able = after
+    return able[-1]

@@ -13,6 +13,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from dataflow.messages.base import Message, MessageError, import_type, message_type
+from dataflow.messages.declaration import Declaration
 from dataflow.operator import InputPort, Operator, OperatorSpec, OutputPort
 
 QueuePolicy = Literal["newest", "oldest", "block"]
@@ -219,6 +221,8 @@ class Graph:
     network: Network = Network()
     aliases: Mapping[str, str] = field(default_factory=dict)
     """Exported outputs of nested graphs: alias key → stream name."""
+    types: Mapping[str, Declaration] = field(default_factory=dict)
+    """Message types that are not of `dataflow.messages`: schema name → declaration, with the module to import."""
 
     @property
     def text(self) -> str:
@@ -241,6 +245,7 @@ class Graph:
             "nodes": [asdict(node) for node in self.nodes.values()],
             "streams": [asdict(stream) for stream in self.streams.values()],
             "aliases": dict(self.aliases),
+            "types": [declaration.to_json() for declaration in self.types.values()],
             "record": asdict(self.record),
             "view": asdict(self.view),
             "network": asdict(self.network),
@@ -253,6 +258,7 @@ class Graph:
         network, bundle = data["network"], data["bundle"]
         nodes = [_node_from_json(values) for values in data["nodes"]]
         streams = [Stream(**{**values, "types": tuple(values["types"])}) for values in data["streams"]]
+        types = [Declaration.from_json(values) for values in data["types"]]
         return cls(
             name=data["name"],
             namespace=data["namespace"],
@@ -261,6 +267,7 @@ class Graph:
             nodes={node.name: node for node in nodes},
             streams={stream.name: stream for stream in streams},
             aliases=dict(data["aliases"]),
+            types={declaration.schema: declaration for declaration in types},
             record=Record(**{**data["record"], "streams": tuple(data["record"]["streams"])}),
             view=View(tuple(data["view"]["hide"])),
             network=Network(
@@ -273,6 +280,21 @@ class Graph:
         """The node and output port that make `stream`; raises KeyError for an unknown stream."""
         made = self.streams[stream]
         return self.nodes[made.node], made.port
+
+    def message_types(self, stream: str) -> tuple[type[Message], ...]:
+        """The classes that `stream` carries. Imports the modules that declare them; raises `MessageError`."""
+        return tuple(self._message_type(schema) for schema in self.streams[stream].types)
+
+    def _message_type(self, schema: str) -> type[Message]:
+        if schema == "Message":  # of a port that carries any type
+            return Message
+        declared = self.types.get(schema)
+        if declared is None:
+            return message_type(schema)
+        found = import_type(declared.path, schema)
+        if faults := declared.differences(Declaration.of(found), "the graph", "the module"):
+            raise MessageError(f"{declared.path} has changed since the graph was loaded: {'; '.join(faults)}")
+        return found
 
     def consumers(self, stream: str) -> tuple[tuple[Node, str], ...]:
         """(node, input port) of everything that takes `stream`, in graph order."""

@@ -1,11 +1,9 @@
-"""The `network:` section of a graph: where hosts listen and connect, tried on Zenoh's own configuration."""
+"""The `network:` section of a graph: where processes listen and connect, tried on Zenoh's own configuration."""
 
 from __future__ import annotations
 
 import json
 import re
-
-import zenoh
 
 from dataflow.graph.document import Table, Tree, plain
 from dataflow.graph.fields import Fields
@@ -13,6 +11,7 @@ from dataflow.graph.model import Network
 from dataflow.graph.problems import did_you_mean
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream|vsock|serial|unixpipe)/[^\s#?]+([?#][^\s]*)?")
+_WITH_PORT = ("tcp", "udp", "tls", "quic", "ws")
 _ZENOH_MESSAGE = re.compile(r'msg: "(.*?)"[,)]', re.DOTALL)
 
 
@@ -35,11 +34,28 @@ def read_network(tree: Tree | None, fields: Fields) -> Network:
 
 def _endpoints(tree: Tree | None, what: str, fields: Fields) -> tuple[str, ...]:
     words = fields.texts(tree, what)
+    hint = "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447"
     for leaf in words:
         if not _ENDPOINT.fullmatch(leaf.value):
-            hint = "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447"
             fields.problems.add(leaf.place, f"{what}: {leaf.value!r} is no Zenoh endpoint", hint)
+        elif fault := _address_fault(leaf.value):
+            fields.problems.add(leaf.place, f"{what}: {leaf.value!r} {fault}", hint)
     return tuple(leaf.value for leaf in words)
+
+
+def _address_fault(endpoint: str) -> str | None:
+    """Says why an endpoint of a protocol with ports cannot be opened; names are not looked up."""
+    protocol, _, rest = endpoint.partition("/")
+    if protocol not in _WITH_PORT:
+        return None
+    host, colon, port = re.split(r"[?#]", rest)[0].rpartition(":")
+    if not colon or not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
+        return "has no port from 0 to 65535"
+    if not host:
+        return "has no host"
+    if ":" in host and not (host.startswith("[") and host.endswith("]")):
+        return "has an IPv6 address without [ ]"
+    return None
 
 
 def _zenoh_part(table: Table, key: str, path: str, fields: Fields) -> dict[str, object]:
@@ -47,6 +63,8 @@ def _zenoh_part(table: Table, key: str, path: str, fields: Fields) -> dict[str, 
     part = fields.table(table.get(key), key)
     if part is None:
         return {}
+    import zenoh  # a graph without such a section loads without the network library
+
     values: dict[str, object] = plain(part)
     try:
         zenoh.Config().insert_json5(path, json.dumps(values))

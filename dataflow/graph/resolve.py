@@ -21,7 +21,8 @@ from dataflow.graph.model import (
 from dataflow.graph.network import read_network
 from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
-from dataflow.messages.base import Message
+from dataflow.messages.base import Message, is_built_in
+from dataflow.messages.declaration import Declaration
 from dataflow.operator import InputPort, Source, is_source
 from dataflow.sync.demand import Edge as DemandEdge
 from dataflow.sync.demand import stuck_cycle
@@ -51,6 +52,7 @@ class Resolver:
         self.fields = Fields(problems)
         self.streams: dict[str, Stream] = {}
         self.types: dict[str, tuple[type[Message], ...]] = {}
+        self.own_types: dict[str, Declaration] = {}
         self.aliases: dict[str, str] = {}
 
     def resolve(self, bundle: Bundle) -> Graph:
@@ -61,6 +63,7 @@ class Resolver:
                 schemas = tuple(t.SCHEMA or "Message" for t in port.types)
                 self.streams[name] = Stream(name, draft.name, port.name, schemas, port.static, port.lag)
                 self.types[name] = port.types
+                self.own_types |= {t.SCHEMA: Declaration.of(t) for t in port.types if not is_built_in(t)}
         self.settle_aliases()
         self.check_graph_inputs()
         wired = [self.wire(draft) for draft in drafts]
@@ -83,6 +86,7 @@ class Resolver:
             view=self.view(root.get("view")),
             network=read_network(root.get("network"), self.fields),
             aliases=self.aliases,
+            types=self.own_types,
         )
 
     # -- streams -------------------------------------------------------------------------------------------------

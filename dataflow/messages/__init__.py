@@ -13,10 +13,12 @@ from dataflow.messages.ranging import LaserScan, RadarScan
 from dataflow.messages.scene import Activity, FeatureVector, SceneGraph
 from dataflow.messages.segmentation import SegmentationMap
 from dataflow.messages.tracking import LandmarkSightings, Tracks, TrackState
+from dataflow.messages.values import Alarm, Number, Switch, Text
 from dataflow.messages.wheels import JointState, WheelTicks
 
 __all__ = [
     "Activity",
+    "Alarm",
     "Boxes3D",
     "CameraInfo",
     "Clusters",
@@ -37,6 +39,7 @@ __all__ = [
     "Message",
     "MessageError",
     "NavSatFix",
+    "Number",
     "OccupancyGrid",
     "Odometry",
     "ParticleSet",
@@ -47,6 +50,8 @@ __all__ = [
     "RadarScan",
     "SceneGraph",
     "SegmentationMap",
+    "Switch",
+    "Text",
     "TrackState",
     "Tracks",
     "Transforms",

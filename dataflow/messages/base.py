@@ -7,116 +7,53 @@ have equal digests wherever and however they were made.
 
 from __future__ import annotations
 
-import re
+import importlib
 import struct
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, Self, dataclass_transform
+from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 import numpy.typing as npt
 import xxhash
 
-ScalarKind = Literal["bool", "int", "float", "str", "strs"]
-Scalar = bool | int | float | str | tuple[str, ...]
+from dataflow.messages.fields import (
+    INT64_MAX,
+    INT64_MIN,
+    MISSING,
+    SYMBOL,
+    TAKEN,
+    ArrayField,
+    Field,
+    MessageError,
+    Scalar,
+    ScalarField,
+    ScalarKind,
+    array,
+    array_value,
+    check_shape,
+    scalar,
+    scalar_value,
+)
 
-_MISSING: Any = object()
-_INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
-_PYTHON_NAME = {"bool": "bool", "int": "int", "float": "float", "str": "str", "strs": "sequence of str"}
-SYMBOL = re.compile(r"[A-Z][A-Za-z]*")
-
-
-class MessageError(ValueError):
-    """A message that cannot be: names the type, the field, what was given and what would be right."""
-
-
-@dataclass(frozen=True, slots=True)
-class ScalarField:
-    """A header field: one Python scalar, or a tuple of strings (`strs`)."""
-
-    name: str
-    kind: ScalarKind
-    doc: str
-    optional: bool
-    default: Any
-    choices: tuple[str, ...]
-
-    @property
-    def required(self) -> bool:
-        return self.default is _MISSING and not self.optional
-
-
-@dataclass(frozen=True, slots=True)
-class ArrayField:
-    """An array field.
-
-    `shapes` holds the accepted shapes, each a tuple of fixed extents (int) and symbols (str); equal symbols within one
-    message mean equal extents (`"N 3"` and `"N"` are parallel). `dtypes[0]` is the canonical one that lists are
-    converted to.
-    """
-
-    name: str
-    dtypes: tuple[np.dtype[Any], ...]
-    shapes: tuple[tuple[int | str, ...], ...]
-    doc: str
-    unit: str
-    optional: bool
-
-    @property
-    def required(self) -> bool:
-        return not self.optional
-
-    def shape_text(self) -> str:
-        return " or ".join("(" + ", ".join(map(str, s)) + ("," if len(s) == 1 else "") + ")" for s in self.shapes)
-
-    def dtype_text(self) -> str:
-        return " or ".join(d.name for d in self.dtypes)
-
-
-Field = ScalarField | ArrayField
-
-
-def scalar(
-    kind: ScalarKind,
-    doc: str,
-    *,
-    default: Any = _MISSING,
-    optional: bool = False,
-    choices: Sequence[str] = (),
-) -> Any:
-    """Declares a header field of a message. `default=None` makes it optional: it may be None."""
-    optional = optional or default is None
-    if default is not _MISSING and default is not None:
-        given, default = default, _canonical_scalar(kind, default)
-        if default is None or (choices and default not in choices):
-            raise MessageError(f"default {given!r} is not a {_PYTHON_NAME[kind]}{f' of {choices}' if choices else ''}")
-    return ScalarField("", kind, doc, optional, default, tuple(choices))
-
-
-def array(
-    dtype: str,
-    shape: str,
-    doc: str,
-    *,
-    unit: str = "",
-    default: None = _MISSING,
-    optional: bool = False,
-) -> Any:
-    """Declares an array field. `dtype` and `shape` list alternatives with `|`: `array("uint8", "H W 3|H W", ...)`.
-
-    `default=None` makes it optional: it may be None.
-
-    Symbols begin with a capital letter; `N` in two fields of one message means the same extent.
-    """
-    shapes = tuple(
-        tuple(int(word) if word.isdigit() else word for word in alternative.split()) for alternative in shape.split("|")
-    )
-    for extent in (e for s in shapes for e in s if isinstance(e, str)):
-        if not SYMBOL.fullmatch(extent):
-            raise MessageError(f"array shape {shape!r}: {extent!r} is neither a number nor a capitalised symbol")
-    dtypes = tuple(np.dtype(d.strip()).newbyteorder("<") for d in dtype.split("|"))
-    return ArrayField("", dtypes, shapes, doc, unit, optional or default is None)
-
+__all__ = [
+    "SYMBOL",
+    "ArrayField",
+    "Field",
+    "Message",
+    "MessageError",
+    "Scalar",
+    "ScalarField",
+    "ScalarKind",
+    "array",
+    "import_type",
+    "is_built_in",
+    "message_type",
+    "message_types",
+    "registered_type",
+    "scalar",
+    "type_path",
+]
 
 _registry: dict[str, type[Message]] = {}
 
@@ -128,11 +65,47 @@ def message_types() -> Mapping[str, type[Message]]:
     return dict(_registry)
 
 
+def registered_type(schema: str) -> type[Message] | None:
+    """The class of a schema name, or None where this process has imported none that declares it."""
+    return _registry.get(schema) or message_types().get(schema)
+
+
 def message_type(schema: str) -> type[Message]:
     """The class of a schema name such as `"DepthImage"`; raises `MessageError` for an unknown one."""
-    found = _registry.get(schema) or message_types().get(schema)
+    found = registered_type(schema)
     if found is None:
         raise MessageError(f"unknown message schema {schema!r}; known: {', '.join(sorted(_registry))}")
+    return found
+
+
+def type_path(message: type[Message]) -> str:
+    """The import path of a message class: `"my_robot.types:Brightness"`."""
+    return f"{message.__module__}:{message.__qualname__}"
+
+
+def is_built_in(message: type[Message]) -> bool:
+    """Whether the class is one of `dataflow.messages`, which every process knows."""
+    return message is Message or message.__module__.startswith("dataflow.messages.")
+
+
+def import_type(path: str, schema: str) -> type[Message]:
+    """The message class of a schema, after importing the module of its `type_path`. Raises `MessageError`."""
+    found = _registry.get(schema)
+    if found is not None and type_path(found) == path:
+        return found
+    module = path.partition(":")[0]
+    try:
+        importlib.import_module(module)
+    except (Exception, SystemExit) as error:  # a module may fail in any way when it runs
+        raise MessageError(
+            f"message type {schema!r} is declared by {path!r}, which cannot be imported: "
+            f"{type(error).__name__}: {error}"
+        ) from error
+    found = _registry.get(schema)
+    if found is None:
+        raise MessageError(f"module {module!r} declares no message type {schema!r} ({path!r}) when it is imported")
+    if type_path(found) != path:
+        raise MessageError(f"message schema {schema!r} is declared by {_place(found)} here, expected {path!r}")
     return found
 
 
@@ -161,8 +134,10 @@ class Message(_Declared):
         own = []
         for name, value in list(vars(cls).items()):
             if isinstance(value, (ScalarField, ArrayField)):
-                if name == "stamp" or hasattr(Message, name):
+                if name in TAKEN or hasattr(Message, name):
                     raise MessageError(f"{cls.__name__}.{name}: every message has {name!r} already; use another name")
+                if name.startswith("_"):
+                    raise MessageError(f"{cls.__name__}.{name}: the name of a field begins with a letter")
                 own.append(type(value)(name, *(getattr(value, s) for s in value.__slots__[1:])))
                 delattr(cls, name)
         cls.FIELDS = (*cls.FIELDS, *own)
@@ -170,9 +145,16 @@ class Message(_Declared):
         cls.ARRAYS = tuple(f for f in cls.FIELDS if isinstance(f, ArrayField))
         cls._names = frozenset(f.name for f in cls.FIELDS)
         cls.SCHEMA = schema or cls.__name__
+        cls._register()
+
+    @classmethod
+    def _register(cls) -> None:
         known = _registry.get(cls.SCHEMA)
-        if known is not None and (known.__module__, known.__qualname__) != (cls.__module__, cls.__qualname__):
-            raise MessageError(f"message schema {cls.SCHEMA!r} is declared twice: by {known!r} and by {cls!r}")
+        if known is not None and type_path(known) != type_path(cls):
+            raise MessageError(
+                f"message schema {cls.SCHEMA!r} is declared twice: by {_place(known)} and by {_place(cls)}; "
+                f"rename one, or give it another schema name: class {cls.__name__}(Message, schema=...)"
+            )
         _registry[cls.SCHEMA] = cls
 
     def __init__(self, *, stamp: int, **values: Any) -> None:
@@ -186,10 +168,10 @@ class Message(_Declared):
                 f"its fields: stamp, {', '.join(f.name for f in cls.FIELDS)}"
             )
         for spec in cls.SCALARS:
-            state[spec.name] = _scalar(cls.SCHEMA, spec, values.get(spec.name, _MISSING))
+            state[spec.name] = scalar_value(cls.SCHEMA, spec, values.get(spec.name, MISSING))
         extents: dict[str, tuple[int, str]] = {}
         for aspec in cls.ARRAYS:
-            state[aspec.name] = _array(cls.SCHEMA, aspec, values.get(aspec.name), extents)
+            state[aspec.name] = array_value(cls.SCHEMA, aspec, values.get(aspec.name), extents)
         self.validate()
 
     def validate(self) -> None:
@@ -215,7 +197,7 @@ class Message(_Declared):
         for spec, value in zip(cls.SCALARS, header, strict=True):
             if value is None and not spec.optional:
                 raise MessageError(f"{cls.SCHEMA}.{spec.name} is required, got None")
-            state[spec.name] = _scalar(cls.SCHEMA, spec, value)
+            state[spec.name] = scalar_value(cls.SCHEMA, spec, value)
         extents: dict[str, tuple[int, str]] = {}
         for aspec, data in zip(cls.ARRAYS, arrays, strict=True):
             if data is not None and (
@@ -225,7 +207,7 @@ class Message(_Declared):
                     f"{cls.SCHEMA}.{aspec.name}: a decoded array must be frozen, C-contiguous {aspec.dtype_text()}, "
                     f"got {data.dtype}"
                 )
-            _check_shape(cls.SCHEMA, aspec, data, extents)
+            check_shape(cls.SCHEMA, aspec, data, extents)
             state[aspec.name] = data
         self.validate()
         return self
@@ -318,122 +300,15 @@ def _stamp(schema: str, stamp: Any) -> int:
     if isinstance(stamp, (bool, float, str)) or not hasattr(stamp, "__index__"):
         raise MessageError(f"{schema}.stamp must be an integer (nanoseconds since the epoch), got {stamp!r}")
     value = int(stamp)
-    if not _INT64_MIN < value < _INT64_MAX:
+    if not INT64_MIN < value < INT64_MAX:
         raise MessageError(f"{schema}.stamp {value} is outside the 64-bit range of nanoseconds")
     return value
 
 
-def _scalar(schema: str, spec: ScalarField, value: Any) -> Scalar | None:
-    if value is _MISSING:
-        if spec.required:
-            raise MessageError(f"{schema}.{spec.name} is required ({_PYTHON_NAME[spec.kind]}: {spec.doc})")
-        return None if spec.default is _MISSING else spec.default
-    if value is None:
-        if spec.optional:
-            return None
-        raise MessageError(f"{schema}.{spec.name} must be a {_PYTHON_NAME[spec.kind]}, got None")
-    converted = _canonical_scalar(spec.kind, value)
-    if converted is None:
-        raise MessageError(
-            f"{schema}.{spec.name} must be a {_PYTHON_NAME[spec.kind]} ({spec.doc}), got {value!r} "
-            f"({type(value).__name__})"
-        )
-    if spec.choices and converted not in spec.choices:
-        raise MessageError(f"{schema}.{spec.name} must be one of {', '.join(spec.choices)}, got {value!r}")
-    return converted
-
-
-def _canonical_scalar(kind: ScalarKind, value: Any) -> Scalar | None:
-    """`value` as the declared Python type, or None when it is of another kind."""
-    match kind:
-        case "bool":
-            return bool(value) if isinstance(value, (bool, np.bool_)) else None
-        case "int":
-            if isinstance(value, (int, np.integer)) and not isinstance(value, bool):
-                whole = int(value)
-                return whole if _INT64_MIN <= whole <= _INT64_MAX else None
-            return None
-        case "float":
-            if isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool):
-                return float(value)
-            return None
-        case "str":
-            return str(value) if isinstance(value, str) and _is_utf8(value) else None
-        case "strs":
-            if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
-                return None
-            words = tuple(str(v) for v in value if isinstance(v, str) and _is_utf8(v))
-            return words if len(words) == len(value) else None
-
-
-def _is_utf8(text: str) -> bool:
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
-
-
-def _array(schema: str, spec: ArrayField, value: Any, extents: dict[str, tuple[int, str]]) -> npt.NDArray[Any] | None:
-    if value is None:
-        if spec.required:
-            raise MessageError(
-                f"{schema}.{spec.name} is required ({spec.dtype_text()} array of shape {spec.shape_text()}: {spec.doc})"
-            )
-        return None
-    data = value if isinstance(value, np.ndarray) else _from_sequence(schema, spec, value)
-    dtype = next((d for d in spec.dtypes if d == data.dtype), None)
-    if dtype is None:
-        dtype = next((d for d in spec.dtypes if np.can_cast(data.dtype, d, "same_kind")), None)
-    if dtype is None:
-        raise MessageError(f"{schema}.{spec.name} must be {spec.dtype_text()}, got an array of {data.dtype}")
-    frozen: npt.NDArray[Any] = np.array(data, dtype=dtype, order="C", copy=True)
-    if dtype.kind in "iu" and data.dtype != dtype and not np.array_equal(frozen, data):
-        raise MessageError(
-            f"{schema}.{spec.name} must be {spec.dtype_text()}, got {data.dtype} with values that do not fit: "
-            f"{data.min()} to {data.max()}"
-        )
-    frozen.flags.writeable = False
-    _check_shape(schema, spec, frozen, extents)
-    return frozen
-
-
-def _from_sequence(schema: str, spec: ArrayField, value: Any) -> npt.NDArray[Any]:
-    try:
-        data = np.asarray(value)
-        if data.size == 0 or spec.dtypes[0].kind in "fb" or data.dtype.kind in "iub":
-            data = np.asarray(value, dtype=spec.dtypes[0])
-    except (TypeError, ValueError, OverflowError) as error:
-        raise MessageError(
-            f"{schema}.{spec.name} must be a {spec.dtype_text()} array of shape {spec.shape_text()}: {error}"
-        ) from None
-    if data.size == 0 and data.ndim == 1:  # [] for "N 3" means (0, 3)
-        columns = next((s[1] for s in spec.shapes if len(s) == 2 and isinstance(s[1], int)), None)
-        data = data if columns is None else data.reshape(0, columns)
-    return data
-
-
-def _check_shape(
-    schema: str, spec: ArrayField, data: npt.NDArray[Any] | None, extents: dict[str, tuple[int, str]]
-) -> None:
-    if data is None:
-        if spec.required:
-            raise MessageError(f"{schema}.{spec.name} is required")
-        return
-    for shape in spec.shapes:
-        if len(shape) == data.ndim and all(
-            want == have for want, have in zip(shape, data.shape, strict=True) if isinstance(want, int)
-        ):
-            break
-    else:
-        raise MessageError(f"{schema}.{spec.name} must have shape {spec.shape_text()}, got {data.shape}")
-    for want, have in zip(shape, data.shape, strict=True):
-        if isinstance(want, str):
-            known, owner = extents.setdefault(want, (have, spec.name))
-            if known != have:
-                raise MessageError(
-                    f"{schema}.{spec.name} has {want}={have}, but {owner} has {want}={known}: they must be parallel"
-                )
+def _place(message: type[Message]) -> str:
+    """The import path of a class and the file it stands in, for people."""
+    file = getattr(sys.modules.get(message.__module__), "__file__", None)
+    return type_path(message) + (f" ({file})" if file else "")
 
 
 def _canonical_head(message: Message) -> Iterator[bytes]:

@@ -1,4 +1,4 @@
-"""What the supervisor tells a host to be, in plain values."""
+"""What the supervisor tells an operator process to be, in plain values."""
 
 from __future__ import annotations
 
@@ -6,21 +6,29 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dataflow.firing.admission import LiveRunner
-from dataflow.firing.source import SourceRunner
+
+@dataclass(frozen=True, slots=True)
+class Resumed:
+    """Where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp of
+    each port, the parameters that were changed, and how often it has been restarted."""
+
+    incarnation: int = 0
+    last: Mapping[str, int] = field(default_factory=dict)
+    changed: Mapping[str, Any] = field(default_factory=dict)
+    restarts: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class HostConfig:
-    """What the supervisor tells a host to be. Travels as plain values.
+class ProcessConfig:
+    """What the supervisor tells an operator process to be. Travels as plain values.
 
-    `publish` maps the local streams that other hosts take (firing records included) to how many take them; `subscribe`
-    are the remote ones taken here. `replay` names a recording and the streams that stand in for sources. `window` is
-    (messages, bytes). `firings`: whether a recorder takes the firing records. `verify` names a recording by whose
-    firing records the operators are driven. `live`: sources do not wait for the graph, and operators not for their
-    inputs. `resume` is given to a host that takes the place of one that died: for each operator, where it had got to
-    (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the operators'
-    states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
+    `publish` maps the local streams that other processes take (firing records included) to how many take them;
+    `subscribe` are the remote ones taken here. `secret` is the run's: only messages that were sealed with it count.
+    `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`:
+    whether a recorder takes the firing records. `live`: sources do not wait for the graph, and operators not for their
+    inputs. `resume` is given to a process that takes the place of one that died: for each operator, where it had got
+    to (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the
+    operators' states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
     label: str
@@ -30,28 +38,17 @@ class HostConfig:
     subscribe: list[str]
     listen: list[str]
     connect: list[str]
+    secret: str
     replay: dict[str, Any] | None = None
     window: tuple[int, int] = (256, 64 << 20)
     rate: float | None = None
     paranoid: bool = False
     firings: bool = False
-    verify: str | None = None
     live: bool = False
     resume: dict[str, Any] | None = None
     snapshots: int | None = None
     warm: dict[str, Any] | None = None
 
-
-@dataclass(frozen=True, slots=True)
-class Resumed:
-    """Where an operator had got to when its process died: the next incarnation, the last stamp of each port, the
-    parameters that were changed, and how often it has been started again."""
-
-    incarnation: int = 0
-    last: Mapping[str, int] = field(default_factory=dict)
-    changed: Mapping[str, Any] = field(default_factory=dict)
-    restarts: int = 0
-
-    def apply(self, runner: SourceRunner | LiveRunner) -> None:
-        if self.incarnation:
-            runner.resume(self.incarnation, self.last, self.changed)
+    def resumed(self, operator: str) -> Resumed:
+        """Where an operator had got to in the process before this one."""
+        return Resumed(**(self.resume or {}).get(operator, {}))

@@ -1,4 +1,4 @@
-"""What every host process does from its first to its last moment. Forked by the nursery."""
+"""Leads a process of a running graph from its first to its last moment. Forked by the nursery."""
 
 from __future__ import annotations
 
@@ -8,13 +8,22 @@ import sys
 import threading
 import time
 import traceback
-from typing import Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from dataflow.firing.failure import MOST_OF_A_TRACEBACK, cut
 from dataflow.process.channel import Channel, ChannelClosed
+
+if TYPE_CHECKING:
+    from dataflow.graph.model import Graph
+    from dataflow.process.sink import SinkConfig, StreamSink
 
 LEAVE_WITHIN = 8.0
 SUPERVISOR_GONE = 3
 FAILED = 1
+SWITCH_INTERVAL = 0.0005
+"""Seconds that a thread may compute in Python before another gets its turn: Zenoh's threads must not wait long."""
 
 
 def _listen(channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None:
@@ -29,34 +38,56 @@ def _listen(channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None
         os._exit(SUPERVISOR_GONE)
 
 
-def _make(kind: str, config: dict[str, Any], channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> Any:
+def _make(
+    kind: str,
+    config: dict[str, Any],
+    channel: Channel,
+    inbox: queue.SimpleQueue[tuple[Any, ...]],
+    handed: Sequence[int],
+) -> Any:
+    """Makes the process that the supervisor asks for: "host" runs operators, "sink" takes whole streams."""
     if kind == "sink":
-        from dataflow.process.sink import SINKS, SinkConfig, SinkHost
+        from dataflow.process.sink import SinkConfig, SinkProcess
 
         sink = SinkConfig(**config)
-        return SinkHost(sink, channel, inbox, SINKS[sink.kind])
-    from dataflow.process.config import HostConfig
-    from dataflow.process.host import Host
+        return SinkProcess(sink, channel, inbox, _recorder if sink.kind == "record" else _viewer_file)
+    from dataflow.process.config import ProcessConfig
+    from dataflow.process.operator_process import OperatorProcess
 
-    return Host(HostConfig(**config), channel, inbox)
+    return OperatorProcess(ProcessConfig(**config), channel, inbox, box=handed[0] if handed else None)
 
 
-def _hand_over(host: Any) -> None:
-    """Sends the firing records that a host still holds; where that fails too, the first cause is reported."""
+def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
+    """The sink that writes an MCAP recording; options: `path`, `metadata`, `compression`, `overwrite`."""
+    from dataflow.process.recorder import RecorderSink
+
+    return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)
+
+
+def _viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
+    """The sink that writes a viewer file; options: `path`."""
+    from dataflow.process.viewer_file import ViewerFileSink
+
+    return ViewerFileSink(config.options["path"], graph, config.streams)
+
+
+def _hand_over(process: Any) -> None:
+    """Sends the firing records that a process still holds; where that fails too, the first cause is reported."""
     try:
-        if host is not None:
-            host.hand_over()
+        if process is not None:
+            process.hand_over()
     except Exception as error:
         print(f"firing records are lost: {type(error).__name__}: {error}", file=sys.stderr)
 
 
-def _report(channel: Channel, error: BaseException) -> None:
-    """Tells the supervisor what failed, if it is still there."""
+def _report(channel: Channel, error: BaseException, phase: str) -> None:
+    """Tells the supervisor what failed, and in which phase of this process, if it is still there."""
     operator = getattr(error, "operator", None)
-    text = getattr(error, "traceback", None) or "".join(traceback.format_exception(error))
-    summary = getattr(error, "summary", None) or f"{type(error).__name__}: {error}"
+    text = cut(getattr(error, "traceback", None) or "".join(traceback.format_exception(error)), MOST_OF_A_TRACEBACK)
+    summary = cut(getattr(error, "summary", None) or f"{type(error).__name__}: {error}")
+    when = getattr(error, "when", "")
     try:
-        channel.send("failed", operator=operator, when=getattr(error, "when", ""), summary=summary, traceback=text)
+        channel.send("failed", operator=operator, when=when, phase=phase, summary=summary, traceback=text)
     except ChannelClosed:
         print(text, file=sys.stderr)
 
@@ -74,36 +105,43 @@ def _await_leave(inbox: queue.SimpleQueue[tuple[Any, ...]]) -> str:
     return "the supervisor did not answer"
 
 
-def main(descriptor: int) -> int:
-    """Runs one host to its end; returns the exit code."""
+def main(descriptor: int, handed: Sequence[int]) -> int:
+    """Runs one process to its end; returns the exit code.
+
+    `descriptor` is its end of the control channel, `handed` what it inherits besides: in a live run the memory for its
+    firing records.
+    """
+    for each in handed:
+        os.set_inheritable(each, False)  # operators' own processes get none of it
     channel = Channel(descriptor)
     inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
     try:
         kind, config = channel.receive()
     except ChannelClosed:
         return SUPERVISOR_GONE
+    sys.setswitchinterval(SWITCH_INTERVAL)
     threading.Thread(target=_listen, args=(channel, inbox), name="control", daemon=True).start()
-    code = 0
-    host = None
+    code, process, phase = 0, None, "starting"
     try:
-        host = _make(kind, config, channel, inbox)
-        host.open()
-        host.run()
+        process = _make(kind, config, channel, inbox, handed)
+        process.open()
+        phase = "running"
+        process.run()
     except ChannelClosed:
         code = SUPERVISOR_GONE
-        _hand_over(host)
+        _hand_over(process)
     except BaseException as error:
         code = FAILED
-        _hand_over(host)
-        _report(channel, error)
+        _hand_over(process)
+        _report(channel, error, phase)
         _await_leave(inbox)
     facts: Any = {}
     try:
-        if host is not None:
-            facts = host.close() or {}
+        if process is not None:
+            facts = process.close() or {}
     except Exception as error:
         code = code or FAILED
-        _report(channel, error)
+        _report(channel, error, "closing")
     try:
         channel.send("closed", facts=dict(facts))
     except ChannelClosed:

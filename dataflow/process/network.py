@@ -7,9 +7,14 @@ from collections.abc import Iterable
 from dataflow.graph.model import Network
 from dataflow.transport import NetworkConfig
 
+BLOCKED, BLOCKED_LIVE = 30.0, 2.0
+"""Seconds that a publication waits for a subscriber that takes nothing. A live run loses messages rather than time."""
 
-def network_config(network: Network, listen: Iterable[str], connect: Iterable[str]) -> NetworkConfig:
-    """The configuration of a host: its own endpoints, and what the graph says of TLS, access and other machines."""
+
+def network_config(
+    network: Network, secret: str, listen: Iterable[str], connect: Iterable[str], *, live: bool
+) -> NetworkConfig:
+    """Returns a process's configuration: its own endpoints, and what the graph says of TLS and other machines."""
     settings = {
         "transport/link/tls": dict(network.tls),
         "access_control": dict(network.access_control),
@@ -19,6 +24,8 @@ def network_config(network: Network, listen: Iterable[str], connect: Iterable[st
         listen=tuple(listen),
         connect=(*connect, *network.connect),
         shared_memory=network.shared_memory,
+        secret=secret,
+        blocked=BLOCKED_LIVE if live else BLOCKED,
         exposed=not network.loopback_only,
         zenoh={path: value for path, value in settings.items() if value},
     )

@@ -11,7 +11,6 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
-from dataflow.process.sink import stream_types
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import ENDS, OUTCOME
 
@@ -36,8 +35,8 @@ class RecorderSink:
         self._clock = 0
         self._early: list[tuple[str, bytes]] = []
         for stream in streams:
-            types = stream_types(graph, stream)
-            if len(types) == 1:
+            types = graph.message_types(stream)
+            if len(types) == 1 and types[0] is not Message:
                 self._add(stream, types[0])
 
     def _add(self, stream: str, message_type: type[Message]) -> None:

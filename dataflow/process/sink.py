@@ -1,4 +1,4 @@
-"""A sink host: a process that takes whole streams losslessly, in arrival order, without aligning them.
+"""A sink process: it takes whole streams losslessly, in arrival order, without aligning them.
 
 The recorder is one, and so is the writer of a viewer file. What they have taken counts towards the flow control of
 feeds, so neither can be outrun.
@@ -7,25 +7,24 @@ feeds, so neither can be outrun.
 from __future__ import annotations
 
 import queue
-import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
-from dataflow.messages.base import Message, message_type
+from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.inlet import Inlet
 from dataflow.process.network import network_config
-from dataflow.records.firing import consecutive, decode_batch, encode_batch
+from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
-from dataflow.transport import Bus, DecodeError, Kind, decode
-from dataflow.transport.codec import MAGIC
+from dataflow.transport import Bus, Envelope, Kind
+from dataflow.transport.envelope import MAGIC
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01
@@ -36,7 +35,7 @@ DRAIN_WITHIN = 5.0
 
 @dataclass(frozen=True, slots=True)
 class SinkConfig:
-    """What the supervisor tells a sink host to be: `kind` is "record" or "view", `options` belong to the kind."""
+    """What the supervisor tells a sink process to be: `kind` is "record" or "view", `options` belong to the kind."""
 
     label: str
     kind: str
@@ -44,12 +43,13 @@ class SinkConfig:
     streams: list[str]
     firings: list[str]
     connect: list[str]
+    secret: str
     options: dict[str, Any]
     live: bool = False
 
 
 class StreamSink(Protocol):
-    """What a sink host feeds."""
+    """Takes what a sink process is given."""
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None: ...
 
@@ -58,7 +58,7 @@ class StreamSink(Protocol):
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None: ...
 
     def event(self, name: str, stamp: int, data: Mapping[str, Any]) -> None:
-        """Something happened to the run: an operator was started again, a fault was planned."""
+        """Something happened to the run: an operator was restarted, a fault was planned."""
 
     def diagnostics(self, message: Diagnostics) -> None:
         """How every operator fares."""
@@ -70,10 +70,10 @@ class StreamSink(Protocol):
 
 
 class SinkFailure(RuntimeError):
-    """A stream reached the sink damaged, or the sink could not store it."""
+    """The sink could not store what it was given."""
 
 
-class SinkHost:
+class SinkProcess:
     """Takes streams until all have ended or the supervisor says so."""
 
     def __init__(
@@ -87,14 +87,17 @@ class SinkHost:
         self.graph = Graph.from_json(config.graph)
         self.make_sink = make_sink
         self.frontiers = dict.fromkeys(config.streams, NEVER)
-        self.firings_open = {firings_key(self.graph.namespace, o): o for o in config.firings}
+        self._operator_of = {firings_key(self.graph.namespace, o): o for o in config.firings}
+        self.firings_open = set(self._operator_of)
+        """Keys on which an operator's last firing records have not come yet."""
         self.sink: StreamSink | None = None
-        self.received = 0
+        static = [s for s in config.streams if self.graph.streams[s].static]
+        self.inlet = Inlet(config.label, channel, self._deliver, static=static, live=config.live)
+        self.batches = 0
+        """Batches of firing records that were taken."""
         self.written = 0
-        self._expected: dict[str, tuple[int, int]] = {}
         self._recorded: dict[str, tuple[int, int]] = {}  # operator → the record that follows those stored
         self._lacking: dict[str, set[tuple[int, int]]] = {}  # operator → records before it that did not come
-        self._probed: set[str] = set()
         taken = [*(self.graph.streams[s].node for s in config.streams), *config.firings]
         self._taken = {name: NEVER for name in taken if self.graph.nodes[name].source}
         self._told: dict[str, int] = {}
@@ -107,8 +110,9 @@ class SinkHost:
         self._outcome = "the supervisor is gone"
 
     def open(self) -> None:
-        self.bus = Bus(network_config(self.graph.network, [], self.config.connect))
-        for key in (*self.frontiers, *self.firings_open):
+        config = self.config
+        self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
+        for key in (*self.frontiers, *self._operator_of):
             self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
@@ -149,34 +153,28 @@ class SinkHost:
                 self._control(kind, fields)
 
     def _receive(self, key: str, payload: Any) -> None:
-        assert self.sink is not None
-        if key in self.firings_open and bytes(payload[: len(MAGIC)]) != MAGIC:
-            self.received += 1
-            if self._take_records(bytes(payload)):
-                self.firings_open.pop(key)
+        if key not in self._operator_of or bytes(payload[: len(MAGIC)]) == MAGIC:
+            self.inlet.take(key, payload)
             return
         try:
-            envelope = decode(payload)
-        except DecodeError as error:  # from outside: of our own, the next number would show the gap
-            print(f"dropped a malformed message on {key!r}: {error}", file=sys.stderr)
+            batch = decode_batch(bytes(payload))
+        except FiringRecordError as error:
+            self.inlet.refuse_malformed(key, error)
+            return
+        if not batch.records or batch.operator != self._operator_of[key]:
+            self.inlet.refuse(key, f"{len(batch.records)} firing records of {batch.operator!r}")
+            return
+        self.batches += 1
+        if self._take_records(batch):
+            self.firings_open.discard(key)
+
+    def _deliver(self, key: str, envelope: Envelope) -> None:
+        assert self.sink is not None
+        if key not in self.frontiers:
+            self.inlet.refuse(key, "an envelope")
             return
         match envelope.kind:
-            case Kind.PROBE:
-                if key not in self._probed:
-                    self._probed.add(key)
-                    self.channel.send("seen", stream=key)
-                return
-            case Kind.MESSAGE if self.graph.streams[key].static and key in self._expected:
-                self.received += 1  # its operator was started again; the stream goes on as it is
-                return
             case Kind.MESSAGE:
-                incarnation, expected = self._expected.get(key, (envelope.incarnation, envelope.seq))
-                if incarnation == envelope.incarnation and expected != envelope.seq:
-                    if self.config.live:
-                        self.channel.send("gap", stream=key, first=expected, following=envelope.seq)
-                    else:
-                        self._lost(key, expected, envelope.seq)
-                self._expected[key] = (envelope.incarnation, envelope.seq + 1)
                 assert envelope.message is not None
                 self.sink.message(key, envelope.message, envelope.seq, envelope.incarnation)
                 self.written += 1
@@ -187,25 +185,21 @@ class SinkHost:
             case Kind.END:
                 self.frontiers[key] = FOREVER
                 self.sink.end(key, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
-        self.received += 1
 
-    def _lost(self, stream: str, due: int, came: int) -> None:
-        raise SinkFailure(f"stream {stream!r} lost messages: number {due} was due, {came} came")
-
-    def _take_records(self, data: bytes) -> bool:
+    def _take_records(self, batch: Batch) -> bool:
         """Stores a batch of firing records, those of it that are not stored yet; True for an operator's last batch.
 
-        Records come twice when their operator's process has died or the run has failed, and when some were lost on
-        their way: once from the operator and once from the supervisor, which is asked for what is lacking.
+        Records come twice when their operator's process has died, and when some were lost on their way: then that
+        process sends what it has kept of them again, or, if it is dead, the supervisor what it has left.
         """
         assert self.sink is not None
-        batch = decode_batch(data)
         last = batch.records[-1]
         following = self._recorded.get(batch.operator, (-1, 0))
         lacking = self._lacking.setdefault(batch.operator, set())
         places = [(r.incarnation, r.index) for r in batch.records]
-        if places[0][0] == following[0] and places[0] > following:
-            lacking.update((batch.incarnation, index) for index in range(following[1], places[0][1]))
+        due = following[1] if batch.incarnation == following[0] else 0
+        if batch.incarnation >= following[0] and places[0][1] > due:
+            lacking.update((batch.incarnation, index) for index in range(due, places[0][1]))
             self.channel.send("lacks", operator=batch.operator)
         fresh = [r for r, place in zip(batch.records, places, strict=True) if place >= following or place in lacking]
         lacking.difference_update(places)
@@ -229,7 +223,7 @@ class SinkHost:
             self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
             self._ended = True
-            self.channel.send("ended", report={"counts": self._counts()})
+            self.channel.send("ended", report={"counts": self._counts(), "transport": self.bus.counters()})
 
     def _counts(self) -> dict[str, list[int]]:
         return {self.config.label: [0, self.written, 0, self._busy_ns, self._done]}
@@ -242,16 +236,16 @@ class SinkHost:
                     round=fields["round"],
                     idle=self.inbox.empty(),
                     sent=0,
-                    received=self.received,
+                    received=self.inlet.received + self.batches,
                     full=False,
                     waiting={},
                 )
             case "records":
                 assert self.sink is not None
                 for data in fields["batches"]:
-                    self._take_records(data)
+                    self._take_records(decode_batch(data))
             case "expect":
-                self._probed.difference_update(fields["streams"])
+                self.inlet.restarted(fields["streams"])
             case "event":
                 assert self.sink is not None
                 self.sink.event(fields["name"], fields["stamp"], fields["data"])
@@ -261,7 +255,7 @@ class SinkHost:
             case "leave":
                 self._outcome = fields["outcome"]
                 self._left = True
-                if self._outcome != "complete":
+                if self._outcome != "complete" or any(self._lacking.values()):
                     self._drain()
             case "lost":
                 self._drain()
@@ -300,25 +294,3 @@ def _diagnostics(fields: Mapping[str, Any]) -> Diagnostics:
         levels=np.array(fields["levels"], np.uint8),
         owners=np.array([k for k, _, _ in pairs], np.int32) if pairs else None,
     )
-
-
-def recorder(config: SinkConfig, graph: Graph) -> StreamSink:
-    """The sink that writes an MCAP recording; options: `path`, `metadata`, `compression`."""
-    from dataflow.process.recorder import RecorderSink
-
-    return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)
-
-
-def viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
-    """The sink that writes a viewer file; options: `path`."""
-    from dataflow.process.viewer_file import ViewerFileSink
-
-    return ViewerFileSink(config.options["path"], graph, config.streams)
-
-
-SINKS: Mapping[str, Callable[[SinkConfig, Graph], StreamSink]] = {"record": recorder, "view": viewer_file}
-
-
-def stream_types(graph: Graph, stream: str) -> tuple[type[Message], ...]:
-    """The message classes that a stream may carry."""
-    return tuple(message_type(schema) for schema in graph.streams[stream].types)

@@ -9,7 +9,7 @@ from typing import Any
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
-from dataflow.process.sink import SinkFailure, stream_types
+from dataflow.process.sink import SinkFailure
 from dataflow.view import Save, ViewerSink
 
 PATIENCE = 30.0
@@ -21,7 +21,7 @@ class ViewerFileSink:
     def __init__(self, path: str, graph: Graph, streams: list[str]) -> None:
         self.path = Path(path)
         self.viewer = ViewerSink(Save(self.path))
-        self.viewer.open({s: stream_types(graph, s)[0] for s in streams}, graph)
+        self.viewer.open({s: graph.message_types(s)[0] for s in streams}, graph)
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
         dropped = self.viewer.statistics().dropped

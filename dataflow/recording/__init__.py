@@ -1,11 +1,12 @@
 """Recordings: MCAP files that other tools open as they are, written safely and read back without loss."""
 
-from dataflow.recording.codecs import ForeignDecoder, register_decoder
 from dataflow.recording.diff import DiffReport, StreamDiff, diff
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.facts import machine_facts
+from dataflow.recording.foreign import ForeignDecoder, register_decoder
 from dataflow.recording.info import Description, describe
 from dataflow.recording.reader import Event, RawRecord, Recorded, Recording, StreamInfo
+from dataflow.recording.text import visible
 from dataflow.recording.writer import RecordingWriter
 
 __all__ = [
@@ -24,4 +25,5 @@ __all__ = [
     "diff",
     "machine_facts",
     "register_decoder",
+    "visible",
 ]

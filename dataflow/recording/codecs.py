@@ -1,15 +1,17 @@
-"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON; foreign decoders."""
+"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON."""
 
 from __future__ import annotations
 
+import json
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
 import xxhash
 
-from dataflow.messages.base import ArrayField, Field, Message, MessageError
+from dataflow.messages.base import ArrayField, Field, Message, MessageError, is_built_in
+from dataflow.messages.declaration import Declaration
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, Parts, file_descriptor_set
 from dataflow.recording.json_codec import (
@@ -22,6 +24,7 @@ from dataflow.recording.json_codec import (
     json_schema,
     timestamp_object,
 )
+from dataflow.recording.layout import FIELDS
 
 M = TypeVar("M", bound=Message)
 
@@ -140,6 +143,22 @@ def codec_for(message: type[Message]) -> Codec:
         return codec
 
 
+def declaration_metadata(message: type[Message]) -> dict[str, str]:
+    """What a stream's channel says of its type: a digest of the declaration, and the whole of it for an own type."""
+    declared = {"declaration": declaration_digest(message)}
+    if not is_built_in(message):
+        declared[FIELDS] = json.dumps(Declaration.of(message).to_json(), ensure_ascii=False)
+    return declared
+
+
+def recorded_declaration(metadata: Mapping[str, str]) -> Declaration | None:
+    """The declaration that a stream's channel holds; None where it holds none that can be read."""
+    try:
+        return Declaration.from_json(json.loads(metadata[FIELDS]))
+    except (KeyError, ValueError, RecursionError):
+        return None
+
+
 def declaration_digest(message: type[Message]) -> str:
     """16 hex digits that change when the names, kinds, dtypes or shapes of a type's fields change."""
     words = [message.SCHEMA]
@@ -147,33 +166,3 @@ def declaration_digest(message: type[Message]) -> str:
         kind = f"{field.dtype_text()} {field.shape_text()}" if isinstance(field, ArrayField) else field.kind
         words.append(f"{field.name}: {kind}{' | None' if field.optional else ''}")
     return xxhash.xxh3_64_hexdigest("\n".join(words).encode())
-
-
-@dataclass(frozen=True, slots=True)
-class ForeignDecoder:
-    """Reads the messages that other programs wrote with one schema.
-
-    `bind(schema)` is called once per channel with the schema as it stands in the file, and returns the function that
-    turns (data, log time) into a message. Its stamp is the one that the data carries, or else the log time.
-    """
-
-    bind: Callable[[SchemaText], Callable[[bytes, int], Message]]
-
-
-_foreign: dict[tuple[str, str], ForeignDecoder] = {}
-
-
-def register_decoder(message_encoding: str, schema: str, decoder: ForeignDecoder) -> None:
-    """Makes streams of (message encoding, schema name), written by other programs, readable as messages."""
-    key = (message_encoding, schema)
-    if key in _foreign:
-        raise RecordingError(f"there is a decoder for {message_encoding} messages of schema {schema!r} already")
-    _foreign[key] = decoder
-
-
-def foreign_decoder(message_encoding: str, schema: SchemaText) -> Callable[[bytes, int], Message] | None:
-    """The decoder of a foreign channel, or None where the schema is not known."""
-    from dataflow.recording import foreign  # noqa: F401  (registers the decoders that come with this package)
-
-    found = _foreign.get((message_encoding, schema.name))
-    return None if found is None else found.bind(schema)

@@ -1,7 +1,9 @@
 """The MCAP container, writing side: records, compressed chunks and their indexes, safe against a kill and a full disk.
 
-Schemas and channels are written at once, outside chunks, and messages are gathered into chunks; every chunk goes to the
-operating system, with its message indexes, in one step. What is in the file at any moment is therefore readable.
+Schemas and channels are written at once, outside chunks, and messages are gathered into chunks: those of streams in
+one, the run's records (firing records, events) in another, so that records can be read without the streams. Both go to
+the operating system, with their message indexes, in one step, the records first. What is in the file at any moment is
+therefore readable, and holds what was added up to some moment.
 Layout: https://mcap.dev/spec.
 """
 
@@ -12,14 +14,9 @@ import os
 import struct
 import time
 import zlib
-from array import array
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
@@ -37,20 +34,13 @@ from mcap.records import (
 )
 
 from dataflow.recording.errors import RecordingError
-
-Compression = Literal["zstd", "lz4", "none"]
-Buffer = bytes | memoryview
+from dataflow.recording.packing import MAX_CHUNK_BYTES, Buffer, Compression, Gathered, Packer, message_size
+from dataflow.recording.seals import sealed
 
 MAGIC = b"\x89MCAP0\r\n"
-ZSTD_LEVEL = 1
 CHUNK_BYTES = 4 * 1024 * 1024
 CHUNK_SECONDS = 1.0
 MAX_CHANNELS = 65535
-
-_MESSAGE = struct.Struct("<BQHIQQ")
-_MESSAGE_FIXED = _MESSAGE.size - 9
-_INDEX = struct.Struct("<BQHI")
-_CHUNK = struct.Struct("<BQQQQI")
 
 
 def record_bytes(record: McapRecord) -> bytes:
@@ -60,47 +50,10 @@ def record_bytes(record: McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
-def _compressor(compression: Compression) -> Callable[[bytes], bytes]:
-    match compression:
-        case "zstd":
-            return zstandard.ZstdCompressor(level=ZSTD_LEVEL, write_checksum=False).compress
-        case "lz4":
-            return lambda data: bytes(lz4.frame.compress(data))
-        case "none":
-            return lambda data: data
-    raise RecordingError(f"unknown compression {compression!r}; known: zstd, lz4, none")
-
-
-@dataclass(slots=True)
-class _Chunk:
-    """The messages gathered since the last chunk was written."""
-
-    since: float
-    parts: list[Buffer] = field(default_factory=list)
-    size: int = 0
-    entries: dict[int, array[int]] = field(default_factory=dict)
-    """By channel: log time and offset of each message, alternating."""
-    first: int = 0
-    last: int = 0
-
-    def add(self, channel: int, log_time: int, sequence: int, parts: Sequence[Buffer]) -> None:
-        length = _MESSAGE_FIXED + sum(len(part) for part in parts)
-        self.first = log_time if not self.parts else min(self.first, log_time)
-        self.last = max(self.last, log_time)
-        self.parts.append(_MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time, log_time))
-        self.parts.extend(parts)
-        self.entries.setdefault(channel, array("Q")).extend((log_time, self.size))
-        self.size += length + 9
-
-    @property
-    def messages(self) -> int:
-        return sum(len(entries) // 2 for entries in self.entries.values())
-
-
 class ContainerWriter:
     """Writes one MCAP file. Not thread-safe.
 
-    A chunk ends at `chunk_bytes` of messages, or when a message is added `chunk_seconds` after the chunk's first one.
+    Chunks end when one has `chunk_bytes` of messages, or when one is added `chunk_seconds` after the first one.
     After a failed write the file is cut back to its last whole record, every later call raises the same
     `RecordingError`, and `close()` still adds the index if there is room for it.
     """
@@ -116,22 +69,22 @@ class ContainerWriter:
         overwrite: bool = False,
     ) -> None:
         self.path = path
-        self._compress = _compressor(compression)
-        self._compression = "" if compression == "none" else compression
-        self._chunk_bytes, self._chunk_seconds = chunk_bytes, chunk_seconds
+        self._packer = Packer(compression)
+        self._chunk_bytes, self._chunk_seconds = min(chunk_bytes, MAX_CHUNK_BYTES), chunk_seconds
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._counts: dict[int, int] = {}
         self._chunks: list[ChunkIndex] = []
         self._metadata: list[MetadataIndex] = []
-        self._chunk: _Chunk | None = None
+        self._records: Gathered | None = None
+        self._messages: Gathered | None = None
         self.first_time: int | None = None
         self.last_time = 0
         self._failure: str | None = None
         self._position = 0
         self._fd = self._open(overwrite)
         try:
-            self._append(MAGIC, record_bytes(Header(profile="", library=library)))
+            self._append(MAGIC, sealed(record_bytes(Header(profile="", library=library))))
         except RecordingError:
             os.close(self._fd)
             raise
@@ -152,7 +105,7 @@ class ContainerWriter:
     @property
     def messages(self) -> int:
         """Messages added so far, those of the unfinished chunk included."""
-        return sum(self._counts.values()) + (self._chunk.messages if self._chunk else 0)
+        return sum(self._counts.values()) + self._unsaved()
 
     @property
     def saved_bytes(self) -> int:
@@ -165,7 +118,7 @@ class ContainerWriter:
             if (known.name, known.encoding, known.data) == (name, encoding, data):
                 return known.id
         schema = Schema(id=len(self._schemas) + 1, name=name, encoding=encoding, data=data)
-        self._append(record_bytes(schema))
+        self._append(sealed(record_bytes(schema)))
         self._schemas.append(schema)
         return schema.id
 
@@ -180,73 +133,80 @@ class ContainerWriter:
             schema_id=schema_id,
             metadata=dict(metadata),
         )
-        self._append(record_bytes(channel))
+        self._append(sealed(record_bytes(channel)))
         self._channels.append(channel)
         self._counts[channel.id] = 0
         return channel.id
 
     def add_metadata(self, name: str, metadata: Mapping[str, str]) -> None:
-        record = record_bytes(Metadata(name=name, metadata=dict(metadata)))
+        record = sealed(record_bytes(Metadata(name=name, metadata=dict(metadata))))
         offset = self._position
         self._append(record)
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
 
     def add_messages(self, group: Sequence[tuple[int, int, int, Sequence[Buffer]]]) -> None:
-        """Adds messages, each (channel, log time, sequence, parts of its data), that must not be torn apart."""
-        self._check_usable()
-        now = time.monotonic()
-        if self._chunk is not None and now - self._chunk.since >= self._chunk_seconds:
-            self.finish_chunk()
-        chunk = self._chunk = self._chunk or _Chunk(now)
+        """Adds messages, each (channel, log time, sequence, parts of its data), that must not be torn apart.
+
+        Raises `RecordingError` for a group larger than a chunk that readers take.
+        """
+        size = sum(message_size(parts) for _, _, _, parts in group)
+        if size > MAX_CHUNK_BYTES:
+            raise RecordingError(f"{self.path}: a message of {size} bytes; at most {MAX_CHUNK_BYTES} are recorded")
+        now = self._begin(0 if self._messages is None else self._messages.size + size)
+        chunk = self._messages = self._messages or Gathered(now)
         for channel, log_time, sequence, parts in group:
             chunk.add(channel, log_time, sequence, parts)
         if chunk.size >= self._chunk_bytes:
-            self.finish_chunk()
+            self.finish_chunks()
 
-    def finish_chunk(self) -> None:
-        """Compresses the messages gathered so far and hands them to the operating system with their indexes."""
+    def add_record(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
+        """Adds a record of the run, which lies apart from the messages of streams."""
+        size = message_size([data])
+        if size > MAX_CHUNK_BYTES:
+            raise RecordingError(f"{self.path}: a record of {size} bytes; at most {MAX_CHUNK_BYTES} are recorded")
+        now = self._begin(0 if self._records is None else self._records.size + size)
+        chunk = self._records = self._records or Gathered(now)
+        chunk.add(channel, log_time, sequence, [data])
+        if chunk.size >= self._chunk_bytes:
+            self.finish_chunks()
+
+    def _begin(self, size: int) -> float:
+        """The time now, after the chunks are finished that are old, or would become larger than readers take."""
         self._check_usable()
-        chunk = self._chunk
-        if chunk is None:
-            return
-        raw = b"".join(chunk.parts)
-        data = self._compress(raw)
-        name = self._compression.encode()
-        length = 32 + len(name) + 8 + len(data)
-        head = (
-            _CHUNK.pack(Opcode.CHUNK, length, chunk.first, chunk.last, len(raw), zlib.crc32(raw))
-            + struct.pack("<I", len(name))
-            + name
-            + struct.pack("<Q", len(data))
-        )
-        start = self._position
-        offset = start + len(head) + len(data)
-        indexes: list[bytes] = []
-        offsets: dict[int, int] = {}
-        for channel, entries in chunk.entries.items():
-            body = entries.tobytes()
-            offsets[channel] = offset
-            indexes.append(_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + len(body), channel, len(body)) + body)
-            offset += len(indexes[-1])
-        self._append(head, data, *indexes)
-        self._chunks.append(
-            ChunkIndex(
-                chunk_length=len(head) + len(data),
-                chunk_start_offset=start,
-                compression=self._compression,
-                compressed_size=len(data),
-                message_end_time=chunk.last,
-                message_index_length=sum(map(len, indexes)),
-                message_index_offsets=offsets,
-                message_start_time=chunk.first,
-                uncompressed_size=len(raw),
-            )
-        )
-        self.first_time = chunk.first if self.first_time is None else min(self.first_time, chunk.first)
-        self.last_time = max(self.last_time, chunk.last)
-        for channel, entries in chunk.entries.items():
-            self._counts[channel] += len(entries) // 2
-        self._chunk = None
+        now = time.monotonic()
+        oldest = min((chunk.since for chunk in self._gathered()), default=now)
+        if now - oldest >= self._chunk_seconds or size > MAX_CHUNK_BYTES:
+            self.finish_chunks()
+        return now
+
+    def finish_chunks(self) -> None:
+        """Compresses what was gathered so far and hands it to the operating system with its indexes."""
+        self._check_usable()
+        gathered = self._gathered()
+        parts: list[bytes] = []
+        indexes: list[ChunkIndex] = []
+        position = self._position
+        for chunk in gathered:
+            packed, index = self._packer.pack(chunk, position)
+            parts += packed
+            indexes.append(index)
+            position += index.chunk_length + index.message_index_length
+        self._append(*parts)
+        self._chunks += indexes
+        for chunk in gathered:
+            self.first_time = chunk.first if self.first_time is None else min(self.first_time, chunk.first)
+            self.last_time = max(self.last_time, chunk.last)
+            for channel, count in chunk.counts.items():
+                self._counts[channel] += count
+        self._records = self._messages = None
+
+    def _gathered(self) -> list[Gathered]:
+        """The chunks in progress, in the order in which they are written."""
+        return [chunk for chunk in (self._records, self._messages) if chunk is not None]
+
+    def _unsaved(self) -> int:
+        """Messages and records in chunks in progress."""
+        return sum(sum(chunk.counts.values()) for chunk in self._gathered())
 
     def close(self) -> None:
         """Finishes the last chunk and writes the index. Idempotent; the file is closed whatever happens."""
@@ -254,7 +214,7 @@ class ContainerWriter:
             return
         try:
             if self._failure is None:
-                self.finish_chunk()
+                self.finish_chunks()
                 self._append(self._ending())
             else:
                 self._close_after_failure()
@@ -302,7 +262,7 @@ class ContainerWriter:
         self._failure = (
             f"writing {self.path} failed: {error.strerror or error}. Saved: {self._position} bytes on disk, "
             f"{len(self._chunks)} chunks ({saved} bytes of messages{until}); the file is readable, {cut}. "
-            f"The {self._chunk.messages if self._chunk else 0} messages since then are lost. "
+            f"The {self._unsaved()} messages since then are lost. "
             "Free some space or record to another disk."
         )
         raise RecordingError(self._failure) from error

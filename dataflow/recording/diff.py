@@ -8,13 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from rich.table import Table
-from rich.text import Text
 
 from dataflow.messages.base import Message
+from dataflow.messages.declaration import Declaration
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.reader import Recorded, Recording
-from dataflow.sync.stamps import format_stamp
 
 Outcome = Literal["same", "within tolerance", "different", "only in A", "only in B"]
 
@@ -91,23 +89,6 @@ class DiffReport:
             for s in self.streams
         ]
         return {"same": self.same, "a": self.a, "b": self.b, "tolerance": self.tolerance, "streams": streams}
-
-    def table(self) -> Table:
-        """One line a stream."""
-        table = Table(title="the same" if self.same else "different", title_justify="left")
-        for heading in ("stream", "result", "A", "B", "differ", "max |A-B|", "first difference"):
-            table.add_column(heading, justify="right" if heading in ("A", "B", "differ", "max |A-B|") else "left")
-        for s in self.streams:
-            table.add_row(
-                Text(s.stream),
-                Text(s.outcome, style="green" if s.outcome in ("same", "within tolerance") else "red"),
-                str(s.count_a),
-                str(s.count_b),
-                str(s.differing + s.missing_in_a + s.missing_in_b),
-                f"{s.max_difference:.3g}" if s.max_difference else "0",
-                Text("" if s.first is None else f"{format_stamp(s.first.stamp)} {s.first.field}: {s.first.detail}"),
-            )
-        return table
 
 
 def diff(
@@ -198,9 +179,11 @@ def differences(a: Message, b: Message, tolerance: float | None = None) -> tuple
     much, absolutely, and NaN equals NaN; everything else must be equal.
     """
     if type(a) is not type(b):
-        return [
-            FieldDifference(a.stamp, "(message)", f"{a.SCHEMA} against {b.SCHEMA}", None, a=a.SCHEMA, b=b.SCHEMA)
-        ], 0
+        kinds = Declaration.of(type(a)), Declaration.of(type(b))
+        forms = kinds[0].differences(kinds[1], "A", "B") if a.SCHEMA == b.SCHEMA else ()
+        text = f"two declarations of {a.SCHEMA}: {'; '.join(forms)}" if forms else f"{a.SCHEMA} against {b.SCHEMA}"
+        if forms or a.SCHEMA != b.SCHEMA:
+            return [FieldDifference(a.stamp, "(message)", text, None, a=a.SCHEMA, b=b.SCHEMA)], 0
     found: list[FieldDifference] = []
     largest = 0.0
     for (name, left), (_, right) in zip(a.items(), b.items(), strict=True):

@@ -1,8 +1,9 @@
-"""Decoders for recordings of other programs that hold Foxglove schemas, as protobuf or as JSON."""
+"""Decoders for recordings of other programs: a registry, and those of Foxglove schemas, as protobuf or as JSON."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
@@ -11,7 +12,7 @@ from google.protobuf.timestamp_pb2 import Timestamp
 
 from dataflow.messages import DepthImage, Image
 from dataflow.messages.base import Message
-from dataflow.recording.codecs import ForeignDecoder, SchemaText, build, register_decoder
+from dataflow.recording.codecs import SchemaText, build
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
 from dataflow.recording.json_codec import decode_object
@@ -19,6 +20,34 @@ from dataflow.recording.json_codec import decode_object
 DEPTH_ENCODINGS = ("32FC1",)
 _PREFERRED = {"foxglove.PoseInFrame": "Pose", "foxglove.RawImage": "Image"}
 """The message type of a Foxglove schema that serves several."""
+
+
+@dataclass(frozen=True, slots=True)
+class ForeignDecoder:
+    """Reads the messages that other programs wrote with one schema.
+
+    `bind(schema)` is called once per channel with the schema as it stands in the file, and returns the function that
+    turns (data, log time) into a message. Its stamp is the one that the data carries, or else the log time.
+    """
+
+    bind: Callable[[SchemaText], Callable[[bytes, int], Message]]
+
+
+_foreign: dict[tuple[str, str], ForeignDecoder] = {}
+
+
+def register_decoder(message_encoding: str, schema: str, decoder: ForeignDecoder) -> None:
+    """Makes streams of (message encoding, schema name), written by other programs, readable as messages."""
+    key = (message_encoding, schema)
+    if key in _foreign:
+        raise RecordingError(f"there is a decoder for {message_encoding} messages of schema {schema!r} already")
+    _foreign[key] = decoder
+
+
+def foreign_decoder(message_encoding: str, schema: SchemaText) -> Callable[[bytes, int], Message] | None:
+    """The decoder of a foreign channel, or None where the schema is not known."""
+    found = _foreign.get((message_encoding, schema.name))
+    return None if found is None else found.bind(schema)
 
 
 def _stamp(proto: Any, log_time: int) -> int:

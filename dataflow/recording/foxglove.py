@@ -18,6 +18,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage as Com
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan as LaserScanProto
 from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
+from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud as PointCloudProto
 from foxglove_schemas_protobuf.Pose_pb2 import Pose as PoseProto
@@ -31,6 +32,7 @@ from google.protobuf.message import DecodeError
 from google.protobuf.timestamp_pb2 import Timestamp
 
 from dataflow.messages import (
+    Alarm,
     CameraInfo,
     CompressedImage,
     DepthImage,
@@ -63,6 +65,8 @@ _NUMERIC_DTYPES: dict[int, np.dtype[Any]] = {
     NUMERIC.FLOAT32: np.dtype("<f4"),
     NUMERIC.FLOAT64: np.dtype("<f8"),
 }
+LOG_LEVELS = ("info", "debug", "info", "warning", "error", "fatal")
+"""In the order of `Log.Level`; an unknown one is read as info."""
 COVARIANCE_TYPES = ("unknown", "approximated", "diagonal_known", "known")
 """In the order of `LocationFix.PositionCovarianceType`."""
 
@@ -86,7 +90,7 @@ class FoxgloveSchema:
         """The protobuf object; raises `RecordingError`."""
         parsed = self.proto()
         try:
-            parsed.ParseFromString(bytes(data))
+            parsed.ParseFromString(data)
         except DecodeError as error:
             raise RecordingError(f"not a {self.name}: {error}") from error
         return parsed
@@ -548,6 +552,19 @@ def _decode_fix(proto: LocationFix) -> Fields:
     }
 
 
+def _encode_alarm(message: Alarm) -> tuple[Parts, tuple[str, ...]]:
+    level = LOG_LEVELS.index(message.level, 1)
+    stamp = _timestamp(message.stamp)
+    proto = Log(timestamp=stamp, level=level, message=message.text, name=message.name)  # type: ignore[arg-type]
+    return [proto.SerializeToString()], ()
+
+
+def _decode_alarm(proto: Log) -> Fields:
+    if not 0 <= proto.level < len(LOG_LEVELS):
+        raise RecordingError(f"Log has the unknown level {proto.level}")
+    return {"level": LOG_LEVELS[proto.level], "name": proto.name, "text": proto.message}
+
+
 FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
     schema.message: schema
     for schema in (
@@ -568,6 +585,7 @@ FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
         FoxgloveSchema(Path, PosesInFrame, _encode_path, _decode_path, ("orientations", "stamps")),
         FoxgloveSchema(LaserScan, LaserScanProto, _encode_scan, _decode_scan, _SCAN_EXTRAS),
         FoxgloveSchema(NavSatFix, LocationFix, _encode_fix, _decode_fix, ("status", "satellites")),
+        FoxgloveSchema(Alarm, Log, _encode_alarm, _decode_alarm),
     )
 }
 """How the well-known types are written. Every other type is JSON."""

@@ -30,8 +30,12 @@ class FrameTree:
         if isinstance(message, Odometry):
             if message.child_frame and self._placed_by.setdefault(message.child_frame, stream) == stream:
                 link = self._root(message.frame)
-                own = Transforms.from_matrix(
-                    message.matrix(), stamp=message.stamp, frame=message.frame, child_frame=message.child_frame
+                own = Transforms(
+                    stamp=message.stamp,
+                    frames=(message.frame,),
+                    child_frames=(message.child_frame,),
+                    translations=message.position[np.newaxis],
+                    rotations=message.orientation[np.newaxis],
                 )
                 yield own if link is None else _joined(own, link)
         elif isinstance(message, Transforms):

@@ -7,14 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rich.console import Group
-from rich.table import Table
-from rich.text import Text
-
 from dataflow.recording.reader import Recording
-from dataflow.sync.stamps import format_duration, format_stamp
-
-LONG_VALUE = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +26,7 @@ class StreamSummary:
     bytes: int
     incarnations: int
     readable: bool
+    generic: bool
     declared_otherwise: bool
 
 
@@ -40,7 +34,8 @@ class StreamSummary:
 class Description:
     """What `describe` finds. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
 
-    `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator.
+    `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator. `damage` notes
+    what is damaged. Text is as in the file: for a terminal, `dataflow.recording.visible` escapes it.
     """
 
     path: str
@@ -49,6 +44,7 @@ class Description:
     profile: str
     torn: bool
     lost_bytes: int
+    damage: tuple[str, ...]
     start: int | None
     end: int | None
     duration: int
@@ -61,58 +57,6 @@ class Description:
     def as_json(self) -> dict[str, Any]:
         """JSON values."""
         return asdict(self)
-
-    def render(self) -> Group:
-        """Tables for a terminal."""
-        parts: list[Any] = [self._facts(), self._stream_table()]
-        if self.firings:
-            parts.append(_counts("firing records", "operator", "batches", self.firings))
-        if self.events:
-            parts.append(_counts("events", "event", "count", self.events))
-        if self.metadata:
-            parts.append(self._metadata_table())
-        return Group(*parts)
-
-    def _facts(self) -> Table:
-        grid = Table.grid(padding=(0, 2))
-        size = f"{_size(self.bytes)}, {_size(sum(s.bytes for s in self.streams))} uncompressed"
-        grid.add_row("file", Text(self.path))
-        grid.add_row("size", size)
-        grid.add_row("written by", Text(self.library + (f" (profile {self.profile})" if self.profile else "")))
-        if self.start is not None and self.end is not None:
-            grid.add_row("from", f"{format_stamp(self.start)} ({self.start})")
-            grid.add_row("to", f"{format_stamp(self.end)} ({self.end})")
-            grid.add_row("duration", format_duration(self.duration))
-        grid.add_row("messages", str(self.messages))
-        if self.torn:
-            lost = f"; {self.lost_bytes} bytes of an unfinished record are left out" if self.lost_bytes else ""
-            grid.add_row("torn", Text(f"the file has no proper end: its writer died{lost}", style="yellow"))
-        return grid
-
-    def _stream_table(self) -> Table:
-        table = Table(title="streams", title_justify="left")
-        for heading in ("stream", "type", "schema", "messages", "rate", "size", ""):
-            table.add_column(heading, justify="right" if heading in ("messages", "rate", "size") else "left")
-        for s in self.streams:
-            notes = ["static"] if s.static else []
-            notes += [f"{s.incarnations} incarnations"] if s.incarnations > 1 else []
-            notes += [] if s.readable else ["not readable here"]
-            notes += ["declared otherwise now"] if s.declared_otherwise else []
-            rate = "" if s.rate is None or s.static else f"{s.rate:.2f} Hz"
-            row = (s.name, s.type, f"{s.schema} ({s.encoding})", str(s.count), rate, _size(s.bytes), ", ".join(notes))
-            table.add_row(*map(Text, row))
-        return table
-
-    def _metadata_table(self) -> Table:
-        table = Table(title="metadata", title_justify="left")
-        for heading in ("record", "key", "value"):
-            table.add_column(heading)
-        for name, mapping in self.metadata.items():
-            for key, value in mapping.items():
-                short = value.splitlines()[0][:LONG_VALUE] if value else ""
-                more = f" … ({len(value)} characters)" if short != value else ""
-                table.add_row(Text(name), Text(key), Text(short + more))
-        return table
 
 
 def describe(recording: Recording) -> Description:
@@ -131,6 +75,7 @@ def describe(recording: Recording) -> Description:
         profile=recording.profile,
         torn=recording.torn,
         lost_bytes=recording.lost_bytes,
+        damage=recording.damage,
         start=start,
         end=end,
         duration=0 if start is None or end is None else end - start,
@@ -158,23 +103,6 @@ def _summary(recording: Recording, name: str) -> StreamSummary:
         bytes=info.bytes,
         incarnations=info.incarnations,
         readable=info.message_type is not None,
+        generic=info.generic,
         declared_otherwise=info.declared_otherwise,
     )
-
-
-def _counts(title: str, name: str, number: str, counts: Mapping[str, int]) -> Table:
-    table = Table(title=title, title_justify="left")
-    table.add_column(name)
-    table.add_column(number, justify="right")
-    for key, count in counts.items():
-        table.add_row(Text(key), str(count))
-    return table
-
-
-def _size(count: int) -> str:
-    value = float(count)
-    for unit in ("B", "kB", "MB"):
-        if value < 1000:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.2f} GB"

@@ -12,10 +12,12 @@ does not tell them. A field that stands nowhere is None.
 from __future__ import annotations
 
 import base64
+import binascii
 import json
 import math
 import struct
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -87,7 +89,7 @@ def encode_object(value: Mapping[str, Any]) -> bytes:
 
 def decode_object(data: Any) -> Any:
     try:
-        return json.loads(bytes(data))
+        return json.loads(str(data, "utf-8"))  # strings cost no second look at their encoding
     except (ValueError, RecursionError) as error:
         raise RecordingError(f"not JSON: {error}") from error
 
@@ -175,14 +177,14 @@ def _schemas(spec: Field) -> tuple[dict[str, Any], dict[str, Any] | None]:
 def _encode_array(spec: ArrayField, data: npt.NDArray[Any], plain: dict[str, Any], exact: dict[str, Any]) -> None:
     if data.size > MAX_LISTED or not _listable(data):
         exact[spec.name] = {
-            "dtype": data.dtype.name,
+            "dtype": _dtype_name(data.dtype),
             "shape": list(data.shape),
             "base64": base64.b64encode(data.data).decode() if data.size else "",
         }
         return
     plain[spec.name] = data.ravel().tolist()
     if data.ndim != 1 or data.dtype != spec.dtypes[0]:
-        exact[spec.name] = {"dtype": data.dtype.name, "shape": list(data.shape)}
+        exact[spec.name] = {"dtype": _dtype_name(data.dtype), "shape": list(data.shape)}
 
 
 def _listable(data: npt.NDArray[Any]) -> bool:
@@ -197,7 +199,7 @@ def _listable(data: npt.NDArray[Any]) -> bool:
 def _decode_array(spec: ArrayField, plain: Any, exact: Any) -> npt.NDArray[Any]:
     dtype = spec.dtypes[0] if exact is None else _dtype(spec, exact["dtype"])
     if exact is not None and "base64" in exact:
-        data = np.frombuffer(base64.b64decode(exact["base64"], validate=True), dtype)
+        data = np.frombuffer(binascii.a2b_base64(exact["base64"], strict_mode=True), dtype)
     else:
         data = np.array(plain, dtype)
     if exact is not None:
@@ -208,9 +210,15 @@ def _decode_array(spec: ArrayField, plain: Any, exact: Any) -> npt.NDArray[Any]:
 
 def _dtype(spec: ArrayField, name: Any) -> np.dtype[Any]:
     for dtype in spec.dtypes:
-        if dtype.name == name:
+        if _dtype_name(dtype) == name:
             return dtype
     raise ValueError(f"dtype {name!r}; the declaration has {spec.dtype_text()}")
+
+
+@cache
+def _dtype_name(dtype: np.dtype[Any]) -> str:
+    """Its name, which numpy makes anew each time."""
+    return dtype.name
 
 
 def _decode_scalar(spec: ScalarField, plain: Any, exact: Any) -> Any:

@@ -15,6 +15,8 @@ ENDS: Final = "dataflow:ends"
 OUTCOME: Final = "dataflow:outcome"
 COMPLETED: Final = "dataflow:completed"
 RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})
+FIELDS: Final = "fields"
+"""Key of a stream's channel metadata: the declaration of a type that is not of `dataflow.messages`, as JSON."""
 COMPANION_SUFFIX: Final = "/@companion"
 SEQUENCE_SPAN: Final = 2**32
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 from mcap.records import Channel
 
-from dataflow.messages.base import Message, MessageError, message_types
+from dataflow.messages.base import Message, MessageError, message_types, registered_type
+from dataflow.messages.declaration import Declaration, GenericMessage, known_type
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest, foreign_decoder
+from dataflow.recording.codecs import SchemaText, codec_for, declaration_digest, recorded_declaration
+from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.index import Entries, McapFile, RawMessage
+from dataflow.recording.foreign import foreign_decoder
+from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
-from dataflow.recording.layout import DIGESTS, Kind
+from dataflow.recording.layout import Kind
+from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,29 +66,54 @@ class StreamInfo:
     """What a recording knows of one stream without decoding it.
 
     - `schema`, `encoding`: of the file, such as foxglove.RawImage and protobuf.
-    - `message_type`: the class that its messages are read as; None where this program has none.
+    - `declaration`: of a type that the recording itself declares, since it is not of `dataflow.messages`.
+    - `known`: the class of any other type; None where this program has none.
     - `first`, `last`: smallest and largest log time (our own recordings: stamp), ns; None for an empty stream.
     - `bytes`: message data before compression, companions included.
-    - `declared_otherwise`: the type's declaration has changed since the recording was made.
     - `metadata`: of the stream's channel.
     """
 
     name: str
     schema: str
     encoding: str
-    message_type: type[Message] | None
+    declaration: Declaration | None
+    known: type[Message] | None
     count: int
     first: int | None
     last: int | None
     static: bool
     bytes: int
     incarnations: int
-    declared_otherwise: bool
     metadata: Mapping[str, str]
+
+    @property
+    def message_type(self) -> type[Message] | None:
+        """The class that its messages are read as; None where there is none.
+
+        Of a type that the recording declares, that is the class of this program with the same fields, from when the
+        module that has it is imported; else a class made from the declaration.
+        """
+        return self.known if self.declaration is None else known_type(self.declaration)
+
+    @property
+    def generic(self) -> bool:
+        """Whether its messages are read by the recording's declaration, without the class that made them."""
+        found = self.message_type
+        return found is not None and issubclass(found, GenericMessage)
+
+    @property
+    def declared_otherwise(self) -> bool:
+        """Whether the type's declaration in this program differs from the one that the messages were written with."""
+        if self.declaration is not None:
+            return self.generic and registered_type(self.declaration.schema) is not None
+        written = self.metadata.get("declaration", "")
+        return self.metadata.get("kind") == Kind.STREAM and (
+            self.known is not None and written != declaration_digest(self.known)
+        )
 
 
 Decode = Callable[[RawMessage, memoryview | None], Message]
-BLOCK = 4096
+TypeOf = Callable[[], type[Message] | None]
 
 
 @dataclass(slots=True)
@@ -95,21 +124,13 @@ class _Channel:
     incarnation: int
     base: int
     entries: Entries
-    companion: Entries | None
+    companion: tuple[int, Entries] | None
+    """Id and entries of the companion."""
     decode: Decode | None
     stamps: npt.NDArray[np.int64] | None = None
     """By entry; of foreign channels only known after a pass."""
     by_log_time: bool = False
     """Foreign messages whose own times are not usable."""
-
-
-class _Entry(NamedTuple):
-    """One message in the merged sequence: what it is merged by, its entry in a channel, its rank in the stream."""
-
-    key: int
-    channel: _Channel
-    position: int
-    rank: int
 
 
 @dataclass(slots=True)
@@ -151,6 +172,14 @@ class Recording:
         return self._file.lost_bytes
 
     @property
+    def damage(self) -> tuple[str, ...]:
+        """What in the file is damaged, for people: it was read by other means, or is left out as the note says.
+
+        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read.
+        """
+        return tuple(self._file.damage)
+
+    @property
     def library(self) -> str:
         """The program that wrote the file, as it calls itself."""
         return str(self._file.header.library)
@@ -185,14 +214,16 @@ class Recording:
     ) -> Iterator[RawRecord]:
         """Undecoded messages of any streams with start ≤ log time ≤ end, merged by (log time, stream)."""
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
-        for stream, entry in self._positions(chosen, start, end, log_time=True):
-            entries = entry.channel.entries
-            raw = self._file.read(int(entries.chunks[entry.position]), int(entries.offsets[entry.position]))
+        for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
+            raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
             info = stream.info
             yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
 
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
-        """(operator, payload) of every batch of firing records, of one operator or of all, in file order."""
+        """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
+
+        One pass: they lie in chunks of their own, without the messages of streams (in older recordings among them).
+        """
         channels = {
             c.id: c.metadata.get("operator", "")
             for c in self._channels_of(Kind.FIRINGS)
@@ -236,10 +267,6 @@ class Recording:
             found[stream.info.name] = digest.hexdigest()
         return found
 
-    def written_digests(self) -> Mapping[str, str]:
-        """The stream digests that the writer noted when it closed the file; empty for torn and foreign files."""
-        return self.metadata.get(DIGESTS, {})
-
     def close(self) -> None:
         self._file.close()
 
@@ -275,8 +302,9 @@ class Recording:
     ) -> _Stream:
         first = records[0]
         own = first.metadata.get("kind") == Kind.STREAM
-        message_type = message_types().get(first.metadata.get("message_type", "")) if own else None
-        codec = codec_for(message_type) if message_type is not None else None
+        declaration = recorded_declaration(first.metadata) if own else None
+        known = message_types().get(first.metadata.get("message_type", "")) if own else None
+        read_as: TypeOf = (lambda: known) if declaration is None else partial(known_type, declaration)
         channels: list[_Channel] = []
         size = 0
         for record in records:
@@ -284,34 +312,33 @@ class Recording:
             companion = companions.get(_key(record, name)) if own else None
             if companion is not None:
                 size += sizes.get(companion.id, 0)
-            channels.append(self._own_channel(record, companion, codec) if own else self._foreign_channel(record))
+            channels.append(self._own_channel(record, companion, read_as) if own else self._foreign_channel(record))
         channels.sort(key=lambda c: (c.incarnation, c.base))
         if not own:
-            message_type = self._peek(name, channels)
+            known = self._peek(name, channels)
         times = [c.entries.times for c in channels if len(c.entries)]
         schema = self._schema(first)
         info = StreamInfo(
             name=name,
             schema=schema.name,
             encoding=first.message_encoding,
-            message_type=message_type,
+            declaration=declaration,
+            known=known,
             count=sum(len(c.entries) for c in channels),
             first=min((int(t.min()) for t in times), default=None),
             last=max((int(t.max()) for t in times), default=None),
             static=first.metadata.get("static") == "true" and own,
             bytes=size,
             incarnations=len({c.incarnation for c in channels if len(c.entries)}),
-            declared_otherwise=own
-            and message_type is not None
-            and first.metadata.get("declaration", "") != declaration_digest(message_type),
             metadata=first.metadata,
         )
         return _Stream(info, own, channels)
 
-    def _own_channel(self, record: Channel, companion: Channel | None, codec: Codec | None) -> _Channel:
+    def _own_channel(self, record: Channel, companion: Channel | None, read_as: TypeOf) -> _Channel:
         def decode(raw: RawMessage, extra: memoryview | None) -> Message:
-            assert codec is not None
-            return codec.decode(raw.log_time, raw.data, extra)
+            message_type = read_as()
+            assert message_type is not None
+            return codec_for(message_type).decode(raw.log_time, raw.data, extra)
 
         entries = self._entries(record.id)
         return _Channel(
@@ -319,8 +346,8 @@ class Recording:
             incarnation=_number(record.metadata.get("incarnation", "0")),
             base=_number(record.metadata.get("sequence_base", "0")),
             entries=entries,
-            companion=None if companion is None else self._entries(companion.id),
-            decode=None if codec is None else decode,
+            companion=None if companion is None else (companion.id, self._entries(companion.id)),
+            decode=None if read_as() is None else decode,
             stamps=entries.times,
         )
 
@@ -339,7 +366,7 @@ class Recording:
             if channel.decode is None or not len(channel.entries):
                 continue
             try:
-                return type(self._decode(name, channel, 0)[0])
+                return type(next(self._unordered(name, channel)))
             except RecordingError:
                 channel.decode = None
         return None
@@ -380,59 +407,49 @@ class Recording:
     # ------------------------------------------------------------------------------------------------- messages
 
     def _merge(self, streams: list[_Stream], start: int | None, end: int | None) -> Iterator[Recorded]:
-        for stream, entry in self._positions(streams, start, end, log_time=False):
-            message, sequence = self._decode(stream.info.name, entry.channel, entry.position)
-            seq = entry.channel.base + sequence if stream.own else entry.rank
-            yield Recorded(stream.info.name, message, seq, entry.channel.incarnation)
+        for stream, row in self._rows(streams, start, end, by_log_time=False):
+            _, owner, chunk, offset, time, companion_chunk, companion_offset, rank = row
+            channel = stream.channels[owner]
+            name = stream.info.name
+            raw = self._file.read(channel.record.id, chunk, offset, time)
+            extra = None
+            if companion_chunk != NOWHERE and channel.companion is not None:
+                companion = self._file.read(channel.companion[0], companion_chunk, companion_offset, time)
+                if companion.sequence != raw.sequence:
+                    raise self._unreadable(name, raw, f"its companion is numbered {companion.sequence}")
+                extra = companion.data
+            message = self._decode(name, channel, raw, extra)
+            seq = channel.base + raw.sequence if stream.own else rank
+            yield Recorded(name, message, seq, channel.incarnation)
 
-    def _positions(
-        self, streams: list[_Stream], start: int | None, end: int | None, *, log_time: bool
-    ) -> Iterator[tuple[_Stream, _Entry]]:
+    def _rows(
+        self, streams: list[_Stream], start: int | None, end: int | None, *, by_log_time: bool
+    ) -> Iterator[tuple[_Stream, Row]]:
         """The merged sequence: always the stream whose next message has the smallest (stamp, stream)."""
         ordered = sorted(streams, key=lambda s: s.info.name)
-        cursors = [self._cursor(stream, start, end, log_time=log_time) for stream in ordered]
-        heads = [next(cursor, None) for cursor in cursors]
-        heap = [(head.key, i) for i, head in enumerate(heads) if head is not None]
-        heapq.heapify(heap)
-        while heap:
-            _, i = heap[0]
-            head = heads[i]
-            assert head is not None
-            yield ordered[i], head
-            following = heads[i] = next(cursors[i], None)
-            if following is None:
-                heapq.heappop(heap)
-            else:
-                heapq.heapreplace(heap, (following.key, i))
+        cursors = [rows(self._tracks(stream, by_log_time), start, end) for stream in ordered]
+        return ((ordered[i], row) for i, row in merged(cursors))
 
-    def _cursor(self, stream: _Stream, start: int | None, end: int | None, *, log_time: bool) -> Iterator[_Entry]:
-        """The entries of one stream in its own order: incarnation after incarnation, by stamp in each.
+    def _tracks(self, stream: _Stream, by_log_time: bool) -> Iterator[Track]:
+        """The incarnations of a stream, one after the other, or all channels of a foreign one."""
+        for group in [[c] for c in stream.channels] if stream.own else [stream.channels]:
+            yield Track(
+                entries=[c.entries for c in group],
+                times=[c.entries.times if by_log_time else self._stamps(stream, c) for c in group],
+                companions=[None if by_log_time else self._companions(stream, c) for c in group],
+            )
 
-        An incarnation whose clock has jumped back is merged as if it followed directly on the one before.
-        """
-        groups = [[c] for c in stream.channels] if stream.own else [stream.channels]
-        rank = 0
-        newest: int | None = None
-        for group in groups:
-            times = np.concatenate([c.entries.times if log_time else self._stamps(stream, c) for c in group])
-            chunks = np.concatenate([c.entries.chunks for c in group])
-            offsets = np.concatenate([c.entries.offsets for c in group])
-            owners = np.concatenate([np.full(len(c.entries), i) for i, c in enumerate(group)])
-            positions = np.concatenate([np.arange(len(c.entries)) for c in group])
-            order = np.lexsort((offsets, chunks, times))
-            if not len(order):
-                continue
-            first, last = int(times[order[0]]), int(times[order[-1]])
-            shift = 0 if newest is None or first > newest else newest + 1 - first
-            newest = last + shift
-            low = 0 if start is None else int(np.searchsorted(times[order], start, "left"))
-            high = len(order) if end is None else int(np.searchsorted(times[order], end, "right"))
-            for at in range(low, high, BLOCK):
-                block = order[at : min(at + BLOCK, high)]
-                rows = zip(times[block].tolist(), owners[block].tolist(), positions[block].tolist(), strict=True)
-                for i, (time, owner, position) in enumerate(rows, at):
-                    yield _Entry(time + shift, group[owner], position, rank + i)
-            rank += len(order)
+    def _companions(
+        self, stream: _Stream, channel: _Channel
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]] | None:
+        if channel.companion is None:
+            return None
+        found = companions_of(channel.entries.times, channel.companion[1])
+        if found is None:
+            raise RecordingError(
+                f"{self.path}: stream {stream.info.name!r} has companion messages of messages it lacks"
+            )
+        return found
 
     def _stamps(self, stream: _Stream, channel: _Channel) -> npt.NDArray[np.int64]:
         """The stamps of a channel by entry; those of foreign messages lie within them, so that takes one pass.
@@ -441,46 +458,34 @@ class Recording:
         """
         if channel.stamps is None:
             count = len(channel.entries)
-            decoded = (self._decode(stream.info.name, channel, i)[0].stamp for i in range(count))
+            decoded = (message.stamp for message in self._unordered(stream.info.name, channel))
             channel.stamps = np.fromiter(decoded, np.int64, count)
             if len(np.unique(channel.stamps)) < count:
                 channel.stamps, channel.by_log_time = channel.entries.times, True
         return channel.stamps
 
-    def _decode(self, stream: str, channel: _Channel, position: int) -> tuple[Message, int]:
-        """The message of an entry and its number in the file."""
-        raw = self._file.read(int(channel.entries.chunks[position]), int(channel.entries.offsets[position]))
+    def _unordered(self, stream: str, channel: _Channel) -> Iterator[Message]:
+        """The messages of a foreign channel in the order of its entries."""
+        entries = channel.entries
+        for i in range(len(entries)):
+            place = int(entries.chunks[i]), int(entries.offsets[i]), int(entries.times[i])
+            yield self._decode(stream, channel, self._file.read(channel.record.id, *place), None)
+
+    def _decode(self, stream: str, channel: _Channel, raw: RawMessage, extra: memoryview | None) -> Message:
         try:
             if channel.decode is None:
                 raise RecordingError(f"no decoder for {channel.record.message_encoding} of this schema")
-            message = channel.decode(raw, self._companion(channel, raw))
-            if channel.by_log_time:
-                message = message.replace(stamp=raw.log_time)
-            return message, raw.sequence
+            message = channel.decode(raw, extra)
+            return message.replace(stamp=raw.log_time) if channel.by_log_time else message
         except (RecordingError, MessageError) as error:
-            raise RecordingError(
-                f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {error}"
-            ) from error
+            raise self._unreadable(stream, raw, str(error)) from error
 
-    def _companion(self, channel: _Channel, raw: RawMessage) -> memoryview | None:
-        """The companion's data of a message: the entry of the same time and number."""
-        entries = channel.companion
-        if entries is None:
-            return None
-        at = int(np.searchsorted(entries.times, raw.log_time))
-        if at == len(entries) or entries.times[at] != raw.log_time:
-            return None
-        found = self._file.read(int(entries.chunks[at]), int(entries.offsets[at]))
-        return found.data if found.sequence == raw.sequence else None
+    def _unreadable(self, stream: str, raw: RawMessage, why: str) -> RecordingError:
+        return RecordingError(f"{self.path}: stream {stream!r}, message {raw.sequence} at {raw.log_time}: {why}")
 
     def _in_file_order(self, channels: list[int]) -> Iterator[RawMessage]:
-        known = [self._entries(c) for c in channels]
-        if not known:
-            return
-        chunks = np.concatenate([e.chunks for e in known])
-        offsets = np.concatenate([e.offsets for e in known])
-        for i in np.lexsort((offsets, chunks)):
-            yield self._file.read(int(chunks[i]), int(offsets[i]))
+        for place in in_file_order([(c, self._entries(c)) for c in channels]):
+            yield self._file.read(*place)
 
 
 def _key(channel: Channel, stream: str) -> tuple[str, str, str]:

@@ -12,8 +12,8 @@ from typing import Any, Self
 from dataflow.messages import Transforms
 from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_digest
-from dataflow.recording.container import CHUNK_BYTES, CHUNK_SECONDS, Buffer, Compression, ContainerWriter
+from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_metadata
+from dataflow.recording.container import CHUNK_BYTES, CHUNK_SECONDS, ContainerWriter
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.frames import FrameTree
 from dataflow.recording.json_codec import TIMESTAMP, encode_object, timestamp_object
@@ -30,6 +30,7 @@ from dataflow.recording.layout import (
     firings_topic,
     frames_topic,
 )
+from dataflow.recording.packing import Buffer, Compression
 from dataflow.sync.stamps import FOREVER
 
 
@@ -55,7 +56,8 @@ class RecordingWriter:
 
     What was added before `flush()` survives the death of this process, and so does every chunk that filled up or was
     `chunk_seconds` old when the next message came: a recorder calls `flush()` when nothing came for that long.
-    Memory holds one chunk. A failed write (full disk) raises `RecordingError`, then and at every later call.
+    Memory holds two chunks, one of messages and one of firing records and events. A failed write (full disk) raises
+    `RecordingError`, then and at every later call.
     """
 
     def __init__(
@@ -125,9 +127,8 @@ class RecordingWriter:
         metadata = {
             "kind": Kind.STREAM,
             "message_type": message_type.SCHEMA,
-            "declaration": declaration_digest(message_type),
             "static": "true" if static else "false",
-        }
+        } | declaration_metadata(message_type)
         clash = metadata.keys() & (extra or {}).keys()
         if clash:
             raise RecordingError(f"{self.path}: stream {stream!r}: extra must not set {', '.join(sorted(clash))}")
@@ -166,7 +167,7 @@ class RecordingWriter:
         A `stamp` that is no time (the epoch or before it, or forever) is logged at the newest time so far.
         """
         channel, count = self._firings.get(operator) or (self._add_firings_channel(operator), 0)
-        self._file.add_messages([(channel, self._log_time(stamp), count % SEQUENCE_SPAN, [payload])])
+        self._file.add_record(channel, self._log_time(stamp), count % SEQUENCE_SPAN, payload)
         self._firings[operator] = (channel, count + 1)
 
     def write_event(self, name: str, stamp: int, mapping: Mapping[str, Any]) -> None:
@@ -185,7 +186,7 @@ class RecordingWriter:
             data = encode_object(body)
         except (TypeError, ValueError) as error:
             raise RecordingError(f"{self.path}: event {name!r} does not hold JSON values only: {error}") from error
-        self._file.add_messages([(channel, log_time, count % SEQUENCE_SPAN, [data])])
+        self._file.add_record(channel, log_time, count % SEQUENCE_SPAN, data)
         self._events = (channel, count + 1)
 
     def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
@@ -200,14 +201,14 @@ class RecordingWriter:
 
     def flush(self) -> None:
         """Hands everything added so far to the operating system: it survives `kill -9` of this process."""
-        self._file.finish_chunk()
+        self._file.finish_chunks()
 
     def close(self) -> None:
         """Writes what is left, the stream digests and the index. Idempotent."""
         if self._file.closed:
             return
         try:
-            self._file.finish_chunk()
+            self._file.finish_chunks()
             self._file.add_metadata(DIGESTS, self.digests())
         finally:
             self._file.close()

@@ -20,7 +20,7 @@ import msgpack
 
 from dataflow.records.firing import WITHHELD, FiringRecord, decode_batch, encode_batch
 
-SEGMENT = 4 << 20
+SEGMENT = 1 << 20
 """Bytes of one segment at first; one that must hold a larger record (a snapshot of a map) grows. Unused pages cost
 nothing."""
 _HEADER = 4096
@@ -76,6 +76,11 @@ class BlackBox:
             self._begin(1 - self._active, self._words[4 * self._active + _GENERATION] + 1, least=len(data))
         self._append(_RECORD, data)
         self._reached[record.operator].take(record, self._ports[record.operator])
+
+    def kept(self, operator: str) -> list[FiringRecord]:
+        """Returns the latest records of an operator, in order."""
+        batches = read_black_box(self._descriptor, self._ports).batches[operator]
+        return [record for data in batches for record in decode_batch(data).records]
 
     def close(self) -> None:
         """Unmaps the memory; the supervisor's descriptor keeps what it holds."""

@@ -13,21 +13,22 @@ from typing import Any, Literal
 
 import msgpack
 
-from dataflow.sync import FiringInputs, InputRef, MessageRef, RunRef
+from dataflow.sync import Drop, FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
 Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot"]
 Outcome = Literal["ok", "error"]
 KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
 OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
-
+CALLS: tuple[Kind, ...] = ("fire", "tick", "finish")
+"""The kinds that stand for a call with messages."""
 
 WITHHELD = -1
 """The place in its stream of a message that was not sent, since its stamp did not increase (live runs only)."""
 
 
 class FiringRecordError(ValueError):
-    """A batch of firing records that cannot be read: says which operator and what is wrong."""
+    """A batch of firing records that cannot be written or read: says what is wrong with it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,19 +38,6 @@ class Emission:
     seq: int
     stamp: int
     digest: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class DropRecord:
-    """A message that an operator did not use, and why; `because` names the input that was missing, if any."""
-
-    input: str
-    stream: str
-    incarnation: int
-    seq: int
-    stamp: int
-    reason: str
-    because: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +64,7 @@ class FiringRecord:
     late: frozenset[str] = frozenset()
     outputs: tuple[Emission | None, ...] = ()
     outcome: Outcome = "ok"
-    drops: tuple[DropRecord, ...] = ()
+    drops: tuple[Drop, ...] = ()
     detail: Mapping[str, Any] = field(default_factory=dict)
     wall_start: int = 0
     duration: int = 0
@@ -170,8 +158,9 @@ def decode_batch(data: bytes) -> Batch:
         last = bool(batch["last"])
     except FiringRecordError:
         raise
-    except (ValueError, TypeError, KeyError, IndexError, msgpack.UnpackException) as error:
-        raise FiringRecordError(f"not a batch of firing records: {type(error).__name__}: {error}") from error
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, msgpack.UnpackException) as error:
+        what = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise FiringRecordError(f"not a batch of firing records ({what})") from error
     return Batch(operator, incarnation, last, records)
 
 
@@ -191,7 +180,7 @@ def _record(
         late=frozenset(late),
         outputs=tuple(None if e is None else Emission(e[0], stamp + e[1], e[2]) for e in outputs),
         outcome=OUTCOMES[outcome],
-        drops=tuple(DropRecord(i, streams[s], *rest) for i, s, *rest in drops),
+        drops=tuple(Drop(i, streams[s], at, n, inc, why, of) for i, s, inc, n, at, why, of in drops),
         detail=detail,
         wall_start=wall_start,
         duration=duration,

@@ -1,30 +1,24 @@
-"""Re-executes recorded operators in this process, in sight of whoever wants their messages.
+"""Re-executes recorded operators by their firing records, in this process, fed from the recording.
 
-`verify` compares digests wherever operators run; this is for what needs the messages themselves: to say which field of
-one differs, and to store them.
+Verification, the completion of thin recordings and replays that begin in the middle all run operators through
+`Recomputation`; they differ in what they do with the messages.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 from dataflow.feeds.log import LogFeed
+from dataflow.firing.recorded import RecordedRunner
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph, Node
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.recorded import (
-    CALLS,
-    RecordedRunner,
-    Verification,
-    beginning,
-    needed_from,
-    recorded_digests,
-    recorded_firings,
-    whole,
-)
-from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
+from dataflow.records.comparison import Verification
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import FiringLog, beginning, needed_from, whole
+from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
 
 Take = Callable[[str, Entry], None]
@@ -35,6 +29,26 @@ End = Callable[[str, int | None, str], None]
 
 class Stuck(RuntimeError):
     """No recorded firing can be made, and nothing is left to read: a fault of the records or of the engine."""
+
+
+class Watcher(Protocol):
+    """Is told what re-execution is about to do, and what it has done. Called for every step: it must be cheap."""
+
+    def begins(self, phase: str, operator: str) -> None:
+        """`phase`: setup, fire, read or close; `operator`: whose turn it is, empty for read."""
+
+    def stepped(self, runner: RecordedRunner) -> None:
+        """A runner has made a firing, or has ended."""
+
+
+class Unwatched:
+    """The watcher of a re-execution that nobody looks at."""
+
+    def begins(self, phase: str, operator: str) -> None:
+        """Takes no notice."""
+
+    def stepped(self, runner: RecordedRunner) -> None:
+        """Takes no notice."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,9 +87,9 @@ def plan_feeding(recording: Recording, graph: Graph, operators: Collection[str])
 class Recomputation:
     """Recorded operators, driven by their records on one thread.
 
-    Re-execution begins at the stamp `begin` (see `reexecute.beginning`) and ends before the firings from `end` on.
-    `made` is given every message that the operators make, `read` every message that is read for them; `ended` the ends
-    of the streams that are made.
+    Re-execution begins at the stamp `begin` (see `records.reading.beginning`) and ends before the firings from `end`
+    on. `made` is given every message that the operators make, `read` every message that is read for them; `ended` the
+    ends of the streams that are made.
     """
 
     def __init__(
@@ -83,92 +97,111 @@ class Recomputation:
         recording: Recording,
         graph: Graph,
         feeding: Feeding,
+        log: FiringLog,
         *,
         made: Take,
         read: Take | None = None,
         ended: End | None = None,
         begin: int | None = None,
         end: int | None = None,
+        watcher: Watcher | None = None,
     ) -> None:
         self._fed = frozenset(feeding.streams)
-        self._consumers: dict[str, list[RecordedRunner]] = {}
-        self.records = {name: list(_until(recorded_firings(recording, name), end)) for name in feeding.operators}
-        outlet = _Outlet(self._consumers, self._fed, made, ended)
+        self._watcher: Watcher = watcher or Unwatched()
+        self._ready: dict[str, RecordedRunner] = {}
+        consumers: dict[str, list[RecordedRunner]] = {}
+        self.records = {name: list(_until(log.of(name), end)) for name in feeding.operators}
+        outlet = _Outlet(consumers, self._ready, self._fed, made, ended)
         begins = {} if begin is None else _begins(graph, self.records, self._fed, begin)
+        nodes = [graph.nodes[name] for name in feeding.operators]
+        taken = {stream for node in nodes for stream in _streams_into(node)}
+        inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
         self.runners = {
-            name: _runner(recording, graph, graph.nodes[name], self.records[name], outlet, begins.get(name))
-            for name in feeding.operators
+            node.name: RecordedRunner(
+                node,
+                outlet,
+                static=frozenset(name for name, stream in graph.streams.items() if stream.static),
+                records=self.records[node.name],
+                inputs=inputs,
+                seed=graph.seed,
+                seeding=seeding_of(recording),
+                begin=begins.get(node.name),
+            )
+            for node in nodes
         }
         for runner in self.runners.values():
-            for stream in {s for taken in runner.node.inputs.values() for s in taken}:
-                self._consumers.setdefault(stream, []).append(runner)
+            for stream in _streams_into(runner.node):
+                consumers.setdefault(stream, []).append(runner)
         makers = {stream: graph.streams[stream].node for stream in feeding.streams}
         self._feed = LogFeed(
             recording,
             makers,
-            _Outlet(self._consumers, frozenset(), read or _nowhere, None),
+            _Outlet(consumers, self._ready, frozenset(), read or _nowhere, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
             finals=final_stamps(recording, feeding.streams),
-            start=None if begin is None else _first_stamp(recording, graph, self.runners.values()),
+            start=None if begin is None else _first_stamp(log, graph, self.runners.values()),
             end=end,
             promises=False,
         )
         self._threads = graph.threads
 
     def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
-        """Makes the recorded firings, to the end or until `until()`, asked after every round; then closes.
+        """Makes the recorded firings, to the end or until `until()`, asked between them; then closes.
 
         Raises `OperatorFailure`, `RecordingError`, `Stuck`.
         """
         limit_threads(self._threads)
-        runners = list(self.runners.values())
         try:
-            for runner in runners:
+            for name, runner in self.runners.items():
+                self._watcher.begins("setup", name)
                 runner.setup()
+            limit_threads(self._threads)  # of libraries that were imported in setup()
+            self._ready |= self.runners
             self._feed.setup()
-            while not until():
-                if any(runner.step() for runner in runners):
-                    continue
-                if self._feed.ended:
-                    break
-                if self._feed.look_ahead() is None:
-                    self._feed.finish()
-                else:
-                    self._feed.admit()
-            else:
+            if not self._drive(until):
                 return self.results()
         finally:
-            for runner in runners:
-                if close:
-                    runner.operator.close()
-        if waiting := [r.node.name for r in runners if not r.ended]:
+            if close:
+                self.close()
+        if waiting := [r.node.name for r in self.runners.values() if not r.ended]:
             raise Stuck(f"everything is read and {', '.join(waiting)} still wait: {self.runners[waiting[0]].waiting()}")
         return self.results()
 
+    def close(self, *, besides: str = "") -> None:
+        """Closes all operators but the one named."""
+        for name, runner in self.runners.items():
+            if name != besides:
+                self._watcher.begins("close", name)
+                runner.operator.close()
+
     def results(self) -> Mapping[str, Verification]:
-        """What re-executing each operator has come to so far."""
+        """The outcome for each operator so far."""
         return {name: runner.result for name, runner in self.runners.items()}
 
+    def _drive(self, until: Callable[[], bool]) -> bool:
+        """Steps the runners that were given something, and reads on when there is none. False: `until()` said so."""
+        while True:
+            while self._ready:
+                name, runner = next(iter(self._ready.items()))
+                self._watcher.begins("fire", name)
+                if not runner.step():
+                    del self._ready[name]
+                    continue
+                self._watcher.stepped(runner)
+                if until():
+                    return False
+            if self._feed.ended:
+                return True
+            self._watcher.begins("read", "")
+            if self._feed.look_ahead() is None:
+                self._feed.finish()
+                self._ready |= self.runners
+            else:
+                self._feed.admit()
 
-def _runner(
-    recording: Recording,
-    graph: Graph,
-    node: Node,
-    records: Iterable[FiringRecord],
-    outlet: _Outlet,
-    begin: int | None,
-) -> RecordedRunner:
-    inputs = frozenset(s for taken in node.inputs.values() for s in taken)
-    producers = [graph.nodes[name] for name in {graph.streams[s].node for s in inputs}]
-    return RecordedRunner(
-        node,
-        outlet,
-        static=frozenset(name for name, stream in graph.streams.items() if stream.static),
-        records=records,
-        inputs=recorded_digests(recording, producers, inputs),
-        seed=graph.seed,
-        begin=begin,
-    )
+
+def _streams_into(node: Node) -> set[str]:
+    return {stream for taken in node.inputs.values() for stream in taken}
 
 
 def _begins(
@@ -210,7 +243,7 @@ def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringR
         yield record
 
 
-def _first_stamp(recording: Recording, graph: Graph, runners: Iterable[RecordedRunner]) -> int | None:
+def _first_stamp(log: FiringLog, graph: Graph, runners: Iterable[RecordedRunner]) -> int | None:
     """The stamp from which the recording must be read; None where that is not known: then from its start."""
     needed: dict[str, tuple[int, int]] = {}
     for runner in runners:
@@ -220,7 +253,7 @@ def _first_stamp(recording: Recording, graph: Graph, runners: Iterable[RecordedR
     for maker in {graph.streams[stream].node for stream in needed}:
         streams = list(graph.nodes[maker].outputs.values())
         known: set[str] = set()
-        for record in recorded_firings(recording, maker):
+        for record in log.of(maker):
             if record.kind == "reset":
                 return None  # stamps went back there
             for stream, emission in zip(streams, record.outputs, strict=False):
@@ -237,22 +270,28 @@ def _nowhere(stream: str, entry: Entry) -> None:
 
 
 class _Outlet:
-    """Hands messages to `take` and to the operators that take them, unless those of that stream are fed otherwise."""
+    """Hands messages to `take` and to the operators that take them, unless those of that stream are fed otherwise.
+
+    Whoever was given something is noted in `ready`.
+    """
 
     def __init__(
         self,
         consumers: Mapping[str, list[RecordedRunner]],
+        ready: dict[str, RecordedRunner],
         elsewhere: frozenset[str],
         take: Take,
         ended: End | None,
     ) -> None:
-        self._consumers, self._elsewhere, self._take, self._ended = consumers, elsewhere, take, ended
+        self._consumers, self._ready, self._elsewhere = consumers, ready, elsewhere
+        self._take, self._ended = take, ended
 
     def message(self, stream: str, entry: Entry) -> None:
         self._take(stream, entry)
         if stream not in self._elsewhere:
             for runner in self._consumers.get(stream, ()):
                 runner.push(stream, entry)
+                self._ready[runner.node.name] = runner
 
     def frontier(self, stream: str, frontier: int) -> None:
         """Recorded firings wait for messages, not for promises."""
@@ -263,6 +302,7 @@ class _Outlet:
         if stream not in self._elsewhere:
             for runner in self._consumers.get(stream, ()):
                 runner.end(stream, final_stamp, reason)
+                self._ready[runner.node.name] = runner
 
     def record(self, record: FiringRecord) -> None:
         """The records are those of the recorded run; none are made."""

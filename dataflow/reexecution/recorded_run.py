@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import asdict, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
 
-import pydantic
-
+from dataflow.firing.seeding import version_of
 from dataflow.graph import load_bundle
-from dataflow.graph.model import Bundle, Graph
-from dataflow.recording import Recording
-from dataflow.recording.layout import ENDS, GRAPH
+from dataflow.graph.model import Graph, Network
+from dataflow.messages.base import message_type
+from dataflow.messages.declaration import Declaration
+from dataflow.recording import Recording, RecordingError
+from dataflow.recording.layout import ENDS, GRAPH, RUN
 
 
 class ReplayError(ValueError):
@@ -19,34 +21,64 @@ class ReplayError(ValueError):
 
 
 def recorded_graph(recording: Recording) -> Graph:
-    """The graph that made a recording. Raises `ReplayError` when it does not hold one."""
+    """Returns the graph that made a recording, without its network: a recording opens no port and calls nobody.
+
+    Its operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`.
+    """
+    return isolated(graph_as_recorded(recording))
+
+
+def isolated(graph: Graph) -> Graph:
+    """Returns a graph whose processes can only be reached from this machine, whatever its `network:` section says."""
+    return replace(graph, network=Network(shared_memory=graph.network.shared_memory))
+
+
+def graph_as_recorded(recording: Recording) -> Graph:
+    """Returns the graph that made a recording, as it is; its operators are imported. Raises as `recorded_graph`."""
     bundle = recording.metadata.get(GRAPH, {}).get("bundle")
     if bundle is None:
         raise ReplayError(f"{recording.path} does not hold the graph that made it: name one with --graph")
+    try:
+        packed = json.loads(bundle)
+    except (ValueError, RecursionError):
+        packed = None
+    if not isinstance(packed, dict) or not packed.keys() >= {"format", "file", "files"}:
+        raise ReplayError(
+            f"{recording.path}: what it holds in place of the graph that made it is no graph: name one with --graph"
+        )
     return load_bundle(bundle)
 
 
-def wiring(recording: Recording) -> Graph | None:
-    """The resolved graph that a recording holds, without its files: nothing is imported and nothing can be run by it.
+def resolved_graph(recording: Recording) -> Graph | None:
+    """Returns the graph that made a recording as it was resolved then, for tools that look: imports no operator.
 
-    None where it holds none, or none that is sound (an older recording, or another program's).
+    None where the recording holds none, or none that is sound (another version's, or another program's).
     """
-    resolved = recording.metadata.get(GRAPH, {}).get("resolved")
-    if resolved is None:
-        return None
+    held = recording.metadata.get(GRAPH, {})
     try:
-        graph: Graph = pydantic.TypeAdapter(Graph).validate_json(resolved)
-    except pydantic.ValidationError:
+        graph = Graph.from_json(json.loads(held["resolved"]) | {"bundle": _bundle(json.loads(held["bundle"]))})
+    except (KeyError, TypeError, ValueError, AttributeError):
         return None
     makers = {stream.node for stream in graph.streams.values()}
     taken = {stream for node in graph.nodes.values() for streams in node.inputs.values() for stream in streams}
     return graph if makers <= graph.nodes.keys() and taken <= graph.streams.keys() else None
 
 
+def _bundle(packed: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in packed.items() if name != "format"}
+
+
 def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
-    """Gives what a recording must hold so that its graph can be loaded again, and be shown without its operators."""
-    resolved = json.dumps(asdict(replace(graph, sources_bundle=Bundle("", {}))))
-    return {GRAPH: {"name": graph.name, "bundle": graph.bundle(), "text": graph.text, "resolved": resolved}}
+    """What a recording must hold so that its graph can be loaded again, or looked at without its operators."""
+    resolved = {name: value for name, value in graph.to_json().items() if name != "bundle"}
+    return {
+        GRAPH: {
+            "name": graph.name,
+            "bundle": graph.bundle(),
+            "text": graph.text,
+            "resolved": json.dumps(resolved, ensure_ascii=False),
+        }
+    }
 
 
 def check_type(recording: Recording, graph: Graph, stream: str) -> None:
@@ -58,10 +90,35 @@ def check_type(recording: Recording, graph: Graph, stream: str) -> None:
             f"{recording.path}: stream {stream!r} holds {info.schema}, "
             f"the graph's {graph.streams[stream].node!r} emits {' | '.join(wanted)}"
         )
+    if info.declaration is None:
+        return
+    schema = info.declaration.schema
+    expected = graph.types.get(schema) or Declaration.of(message_type(schema))
+    if faults := info.declaration.differences(expected, "the recording", expected.path):
+        raise ReplayError(
+            f"{recording.path}: stream {stream!r} holds {schema} as it was declared when it was recorded, and "
+            f"{expected.path} declares it differently: {'; '.join(faults)}. Restore the fields, or give the new type "
+            "another schema name: class ...(Message, schema=...)"
+        )
 
 
 def final_stamps(recording: Recording, streams: Iterable[str]) -> dict[str, int]:
-    """The stamps that streams ended with in the recorded run, where the recording says so."""
+    """The stamps that streams ended with in the recorded run, where the recording says so.
+
+    Raises `RecordingError` where it cannot be read.
+    """
     ends = recording.metadata.get(ENDS, {})
-    known = {s: json.loads(ends[s]) for s in streams if s in ends}
-    return {s: end["final"] for s, end in known.items() if end["final"] is not None}
+    finals: dict[str, int] = {}
+    for stream in streams:
+        try:
+            final = json.loads(ends[stream])["final"] if stream in ends else None
+            if final is not None:
+                finals[stream] = int(final)
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise RecordingError(f"{recording.path}: how stream {stream!r} ended cannot be read: {error!r}") from error
+    return finals
+
+
+def seeding_of(recording: Recording) -> int:
+    """Returns the version of the scheme by which the recorded run seeded its generators."""
+    return version_of(recording.metadata.get(RUN, {}))

@@ -9,11 +9,11 @@ from pathlib import Path
 from dataflow.graph.model import Graph, Node
 from dataflow.operator import Operator
 from dataflow.recording import Recording
-from dataflow.records.firing import FiringRecord
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded import CALLS, messages_of, recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
-from dataflow.sync import Entry
+from dataflow.sync import Entry, messages_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,12 +54,10 @@ def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | 
             return None
         feeding = plan_feeding(recording, graph, [node.name])
         begin = stamp if feeding.operators == (node.name,) else None
-        work = Recomputation(recording, graph, feeding, made=lambda stream, entry: None, begin=begin, end=stamp)
-        results = work.run(close=False)
-        for name, runner in work.runners.items():
-            if name != node.name:
-                runner.operator.close()
-        result = results[node.name]
+        log = FiringLog.read(recording)
+        work = Recomputation(recording, graph, feeding, log, made=lambda stream, entry: None, begin=begin, end=stamp)
+        result = work.run(close=False)[node.name]
+        work.close(besides=node.name)
         if result.unverifiable or result.lost_records:
             work.runners[node.name].operator.close()
             return None

@@ -31,6 +31,8 @@ class Health:
     note: str = ""
     drops: Mapping[tuple[str, str], int] = field(default_factory=dict)
     """What was dropped so far, by (input, reason); a source's input is ""."""
+    waits: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    """Waits given up and messages that came late so far, by (input, "timeout" or "late")."""
 
     @property
     def level(self) -> int:
@@ -38,18 +40,22 @@ class Health:
 
     def values(self) -> dict[str, str]:
         """For a `Diagnostics` message."""
-        return {
-            "firings": str(self.firings),
-            "emitted": str(self.emitted),
-            "dropped": str(self.dropped),
-            "rate_hz": f"{self.rate:.2f}",
-            "drop_rate_hz": f"{self.drop_rate:.2f}",
-            "load": f"{self.load:.3f}",
-            "restarts": str(self.restarts),
-        } | {
-            ".".join(("dropped", *filter(None, (input_name, reason)))): str(count)
-            for (input_name, reason), count in sorted(self.drops.items())
-        }
+        return (
+            {
+                "firings": str(self.firings),
+                "emitted": str(self.emitted),
+                "dropped": str(self.dropped),
+                "rate_hz": f"{self.rate:.2f}",
+                "drop_rate_hz": f"{self.drop_rate:.2f}",
+                "load": f"{self.load:.3f}",
+                "restarts": str(self.restarts),
+            }
+            | {
+                ".".join(("dropped", *filter(None, (input_name, reason)))): str(count)
+                for (input_name, reason), count in sorted(self.drops.items())
+            }
+            | {".".join((what, input_name)): str(count) for (input_name, what), count in sorted(self.waits.items())}
+        )
 
 
 @dataclass(slots=True)
@@ -77,9 +83,11 @@ class HealthMonitor:
         ended: frozenset[str] = frozenset(),
         restarts: Mapping[str, int] | None = None,
         drops: Mapping[str, Mapping[tuple[str, str], int]] | None = None,
+        waits: Mapping[str, Mapping[tuple[str, str], int]] | None = None,
     ) -> list[Health]:
         """`counts`: per operator firings, emitted, dropped, nanoseconds of work, as hosts report them. `away`: those
-        that are being started again, and why; `restarts`: how often each was; `drops`: how many, by (input, reason)."""
+        that are being started again, and why; `restarts`: how often each was; `drops`: how many, by (input, reason);
+        `waits`: how many, by (input, "timeout" or "late")."""
         span = 0.0 if self._taken is None else now - self._taken
         self._taken = now
         found = []
@@ -113,7 +121,9 @@ class HealthMonitor:
             count = (restarts or {}).get(name, 0)
             drop_rate = lost / span if span else 0.0
             why = dict((drops or {}).get(name, {}))
-            found.append(Health(name, state, firings, emitted, dropped, rate, drop_rate, load, count, note, why))
+            waited = dict((waits or {}).get(name, {}))
+            health = Health(name, state, firings, emitted, dropped, rate, drop_rate, load, count, note, why, waited)
+            found.append(health)
         return found
 
 

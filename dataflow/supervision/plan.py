@@ -33,7 +33,6 @@ class RunPlan:
 
     - `placement`: see `Graph.hosts`.
     - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
-    - `verify`: the operators that are driven by the firing records of `log`; the others do not run.
     - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes
       into the recording.
     - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
@@ -51,7 +50,6 @@ class RunPlan:
     record: Path | None = None
     view_file: Path | None = None
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    verify: frozenset[str] | None = None
     live: bool = False
     faults: Iterator[Fault] | None = None
     rate: float | None = None
@@ -91,23 +89,19 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
         log_host = "all" if plan.placement == "one_host" else LOG_HOST
         labels |= dict.fromkeys(replaced, log_host)
 
-    idle = set() if plan.verify is None else set(graph.nodes) - replaced - plan.verify
     hosts: dict[str, list[str]] = {}
     for node in graph.nodes:
-        if node in idle:
-            continue
         hosts.setdefault(labels[node], []).append(node)
 
     streams = set(graph.streams)
     if plan.log is not None:
         silent = {s for s in streams if graph.streams[s].node in replaced} - set(plan.log.streams)
         streams -= silent
-    streams = {s for s in streams if graph.streams[s].node not in idle}
 
     made_in = {stream: labels[graph.streams[stream].node] for stream in streams}
     taken_in: dict[str, set[str]] = {stream: set() for stream in streams}
     for edge in graph.edges():
-        if edge.stream in streams and edge.consumer not in idle | replaced:
+        if edge.stream in streams and edge.consumer not in replaced:
             taken_in[edge.stream].add(labels[edge.consumer])
 
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
@@ -153,14 +147,11 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
     return plans
 
 
-def expected_probes(plan: RunPlan, plans: Mapping[str, HostPlan]) -> dict[str, set[str]]:
-    """Label → the keys on which that process must have seen a probe before sources are released."""
-    expected = {}
-    for label, host in plans.items():
-        keys = set(host.subscribe)
-        if host.sink is not None:
-            keys = set(host.streams)
-            if host.sink == "record":
-                keys |= {firings_key(plan.graph.namespace, node) for node in plan.graph.nodes}
-        expected[label] = keys
-    return expected
+def taken_keys(graph: Graph, host: HostPlan) -> set[str]:
+    """Returns the keys that a process takes: on each it must have seen a probe before sources are released."""
+    if host.sink is None:
+        return set(host.subscribe)
+    keys = set(host.streams)
+    if host.sink == "record":
+        keys |= {firings_key(graph.namespace, node) for node in graph.nodes}
+    return keys

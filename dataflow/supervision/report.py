@@ -1,4 +1,4 @@
-"""What a run tells while it goes on and at its end."""
+"""The status of a run while it goes on, its report at the end, and its failure."""
 
 from __future__ import annotations
 
@@ -43,12 +43,16 @@ class Status:
     operators: dict[str, OperatorCounts] = field(default_factory=dict)
     drops: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
     """By operator, how many messages were dropped by (input, reason); a source's input is ""."""
+    waits: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
+    """By operator and (input, "timeout" or "late"): waits that were given up, and messages that came late."""
     host_of: dict[str, str] = field(default_factory=dict)
     first: int | None = None
     steps: int | None = None
     notes: list[str] = field(default_factory=list)
     health: list[Health] = field(default_factory=list)
     restarts: dict[str, int] = field(default_factory=dict)
+    behind: dict[str, float] = field(default_factory=dict)
+    """Seconds by which each source of a live run is behind the clock."""
 
     @property
     def covered(self) -> int:
@@ -57,10 +61,10 @@ class Status:
 
 @dataclass(frozen=True, slots=True)
 class RunReport:
-    """What a run came to.
+    """The result of a run.
 
     `streams` maps each stream to (messages, digest); `drops` each operator to (input, reason, count) triples, those of
-    processes that were started again included, with the input "" for what a source has not sent; `summaries` holds what
+    processes that were restarted included, with the input "" for what a source has not sent; `summaries` holds what
     metrics sinks report; `wall` is in seconds from the release of the sources; `restarts` counts by operator.
     """
 
@@ -71,13 +75,15 @@ class RunReport:
     summaries: Mapping[str, Mapping[str, Any]]
     transport: Mapping[str, Mapping[str, int]]
     files: Mapping[str, Mapping[str, Any]]
-    verifications: tuple[Mapping[str, Any], ...]
     first: int | None
     last: int | None
     wall: float
     interrupted: bool
     notes: tuple[str, ...]
     restarts: Mapping[str, int] = field(default_factory=dict)
+    waits: Mapping[str, tuple[tuple[str, str, int], ...]] = field(default_factory=dict)
+    """Each operator's (input, "timeout" or "late", count): waits that were given up, which drops nothing, and messages
+    that came after what needed them was decided, of which those for a trigger are among the drops too."""
 
     def digests(self) -> dict[str, str]:
         return {stream: digest for stream, (_, digest) in sorted(self.streams.items())}

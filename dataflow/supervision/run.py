@@ -12,12 +12,12 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
+from dataflow.firing import seeding
 from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
-from dataflow.supervision.live import supervisor_of
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport, Status
@@ -58,7 +58,7 @@ def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunRepor
             file.parent.mkdir(parents=True, exist_ok=True)
     if plan.record is not None:
         plan = replace(plan, metadata=_metadata(plan, mode))
-    supervisor = supervisor_of(plan)
+    supervisor = Supervisor(plan)
     with _interrupts(supervisor.stop), _watching(supervisor, watch):
         return supervisor.run()
 
@@ -70,6 +70,7 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         "started": str(time.time_ns()),
         "rate": "as fast as it goes" if plan.rate is None else str(plan.rate),
         "seed": str(plan.graph.seed),
+        seeding.FACT: str(seeding.VERSION),
         "threads": str(plan.graph.threads),
         **{f"host of {node}": label for node, label in placed.items()},
     }
@@ -79,7 +80,10 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
 
 @contextmanager
 def _interrupts(stop: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C and SIGTERM call `stop` while the graph runs (in the main thread; elsewhere they are left alone)."""
+    """Ctrl-C, SIGTERM and SIGHUP call `stop` while the graph runs (in the main thread; elsewhere they are left alone).
+
+    One that was ignored when this program began stays ignored: that is how `nohup` and background jobs ask for it.
+    """
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -87,7 +91,9 @@ def _interrupts(stop: Callable[[], None]) -> Iterator[None]:
     def handle(number: int, frame: FrameType | None) -> None:
         stop()
 
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    asking = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    heeded = [number for number in asking if signal.getsignal(number) is not signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in heeded}
     try:
         yield
     finally:

@@ -2,6 +2,7 @@
 
 from dataflow.sync.aligner import Aligner, StreamEnd
 from dataflow.sync.demand import Cycle, Edge, stuck_cycle
+from dataflow.sync.drops import DropLog
 from dataflow.sync.entries import (
     TICK,
     Drop,
@@ -13,8 +14,8 @@ from dataflow.sync.entries import (
     StreamOrderError,
     Waiting,
 )
-from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, refs_of
-from dataflow.sync.replayer import RecordedAligner
+from dataflow.sync.recorded import RecordedAligner
+from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, messages_of, refs_of
 from dataflow.sync.spec import AlignSpec, BatchSpec, SampledSpec, TriggerSpec
 from dataflow.sync.stamps import FOREVER, NEVER, format_duration, format_stamp, parse_duration, trail
 
@@ -27,6 +28,7 @@ __all__ = [
     "BatchSpec",
     "Cycle",
     "Drop",
+    "DropLog",
     "DropReason",
     "Edge",
     "Entry",
@@ -45,6 +47,7 @@ __all__ = [
     "Waiting",
     "format_duration",
     "format_stamp",
+    "messages_of",
     "parse_duration",
     "refs_of",
     "stuck_cycle",

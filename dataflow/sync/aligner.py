@@ -26,6 +26,7 @@ leave room, this is the reading:
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import count
 from typing import NamedTuple
 
 from dataflow.sync.batch import Batch
@@ -92,6 +93,8 @@ class Aligner:
         self._decided = NEVER  # everything at or below is decided, or has been promised downstream
         self._last_firing = NEVER
         self._finished = False
+        self.paused = False
+        """Whether the last `poll` ended before all was decided, since it had dropped so many."""
 
     def begin_at(self, stamp: int) -> None:
         """Everything before `stamp` was decided elsewhere, ticks included. To be called before the first `push`;
@@ -108,7 +111,7 @@ class Aligner:
         Raises StreamOrderError if the stream had promised that there would be no such message.
         """
         state = self._stream(stream)
-        if entry.incarnation > state.incarnation:
+        if entry.incarnation > state.incarnation and entry.stamp < FOREVER:
             self.reset(stream, entry.incarnation)
         if not entry.stream:
             entry = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
@@ -128,10 +131,11 @@ class Aligner:
             lane.raise_frontier(frontier)
 
     def advance(self, stream: str, frontier: int) -> None:
-        """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back."""
+        """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back.
+
+        Raises StreamOrderError for a frontier at the end of time, where `end` is meant.
+        """
         state = self._stream(stream)
-        if frontier >= FOREVER:
-            raise ValueError(f"stream {stream!r}: a frontier lies before the end of time; end() is for end of stream")
         if state.advance(frontier):
             for lane in state.lanes:
                 lane.raise_frontier(frontier)
@@ -141,6 +145,7 @@ class Aligner:
 
         final_stamp: event time the stream reached, at or above its last message and every frontier it
             promised. None takes the larger of these, which is repeatable only if the promised frontiers are.
+            Raises StreamOrderError for one that lies below.
         """
         state = self._stream(stream)
         if state.ended:
@@ -165,14 +170,31 @@ class Aligner:
 
     # What the host decides when it will not wait
 
-    def force(self, input: str, frontier: int) -> None:
-        """Pretends that the streams of `input`, but for static ones, have promised `frontier`. Live only."""
+    def force(self, input: str, frontier: int) -> bool:
+        """Pretends that the streams of `input`, but for static ones, have promised `frontier`; False when that is no
+        news. Live only."""
         if input not in self._lanes:
             raise KeyError(f"no input {input!r}; the inputs are {', '.join(self._lanes)}")
         frontier = min(frontier, FOREVER - 1)
-        for lane in self._lanes[input]:
-            if not lane.state.static and frontier > lane.frontier:
-                lane.frontier = frontier
+        moved = [lane for lane in self._lanes[input] if not lane.state.static and frontier > lane.frontier]
+        for lane in moved:
+            lane.frontier = frontier
+        return bool(moved)
+
+    def owed_ticks(self) -> tuple[int, int, int]:
+        """The ticks that are due now, with nothing between them: how many, the first and the last."""
+        ticks = self._ticks
+        if ticks is None or self._finished:
+            return 0, NEVER, NEVER
+        self._settle()
+        if not ticks.confirmed:
+            return 0, NEVER, NEVER
+        last = min(ticks.reach, self._triggers.bound)
+        if self._triggers.stamp is not None:
+            last = min(last, self._triggers.stamp)
+        for name in (*self._sampled, *self._batches):
+            last = min(last, *(lane.frontier + lane.delay for lane in self._lanes[name]))
+        return ticks.owed(last)
 
     def skip_ticks(self, stamp: int) -> None:
         """Drops the ticks before `stamp` that are not decided yet, as overflow. Live only."""
@@ -181,13 +203,13 @@ class Aligner:
             return
         self._settle()
         if ticks.confirmed and ticks.stamp < stamp:
-            for skipped in ticks.skip(stamp):
-                self._drop_log.tick(skipped, "overflow", "")
+            self._drop_log.ticks(ticks.skip(stamp), "overflow")
 
     def waiting(self) -> Waiting | None:
         """The first undecided stamp and what it waits for; None if the next message decides.
 
-        When all inputs named in `needs` have been forced there, the stamp is decided.
+        When all inputs named in `needs` have been forced there, the stamp is decided, unless one needs `FOREVER`: a
+        static stream that has not come.
         """
         if self._finished:
             return None
@@ -211,15 +233,23 @@ class Aligner:
             need = context.needs(stamp)
             if need is not None:
                 needs[context.name] = max(need, needs.get(context.name, NEVER))
+        for name, frontier in needs.items():
+            if any(lane.state.static and lane.frontier < frontier for lane in self._lanes[name]):
+                needs[name] = FOREVER
         return Waiting(stamp, needs)
 
     # What comes out
 
-    def poll(self) -> Firing | None:
-        """The next firing, or None while it is not decided. The last one has kind "finish"."""
+    def poll(self, most: int | None = None) -> Firing | None:
+        """The next firing, or None while it is not decided. The last one has kind "finish".
+
+        None also after `most` decided stamps that were dropped instead of fired; `paused` then tells that there is
+        more to decide.
+        """
+        self.paused = False
         if self._finished:
             return None
-        while True:
+        for _ in count() if most is None else range(most):
             self._settle()
             stamp = self._stamp
             if not self._ready or stamp is None:
@@ -235,6 +265,8 @@ class Aligner:
             if firing is not None:
                 self._last_firing = stamp
                 return firing
+        self.paused = True
+        return None
 
     def output_frontier(self) -> int:
         """No firing that `poll` has still to return has a stamp at or below this. It never goes back.
@@ -277,9 +309,19 @@ class Aligner:
         """How many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
         return self._drop_log.counts
 
+    @property
+    def late(self) -> Mapping[str, int]:
+        """How many messages came after what needed them was decided, by input. Triggers among them are dropped as
+        `late`; Sampled and Batch messages still serve the firings to come."""
+        return self._drop_log.late
+
     def take_drops(self) -> list[Drop]:
-        """The drops since this was last asked. Ask regularly: they are kept until then."""
+        """The drops since this was last asked, at most the last `KEPT`."""
         return self._drop_log.take()
+
+    def take_unlisted(self) -> Mapping[tuple[str, str], int]:
+        """How many drops were too many to be kept since this was last asked, by (input, reason)."""
+        return self._drop_log.take_unlisted()
 
     def buffered(self) -> dict[str, int]:
         """The number of messages held, by input."""
@@ -410,6 +452,7 @@ class Aligner:
         lane.entries.append(entry)
         if entry.stamp + lane.delay <= self._last_firing:
             lane.late = entry.stamp
+            self._drop_log.came_late(lane)
         if len(lane.entries) > lane.limit:
             self._prune(lane)
 

@@ -7,14 +7,20 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 FiringKind = Literal["fire", "tick", "finish"]
-DropReason = Literal["unmatched", "no_sample", "stale", "unused", "late", "overflow"]
+DropReason = Literal["unmatched", "no_sample", "stale", "unused", "late", "overflow", "reset", "refused"]
 
 TICK = "@tick"
 """The input named by the drop of a tick, which belongs to no declared input."""
 
 
 class StreamOrderError(ValueError):
-    """A stream broke its own promise: a stamp that does not increase, or one at or below its frontier."""
+    """A stream broke its own promise: a stamp that does not increase, one at or below its frontier, one that lies at
+    the end of time, or a message of an earlier incarnation. Whatever said so has changed nothing: it can be dropped.
+    """
+
+    def __init__(self, stream: str, problem: str) -> None:
+        super().__init__(f"stream {stream!r}: {problem}")
+        self.stream, self.problem = stream, problem
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +68,9 @@ class Drop:
     no_sample, stale: the required Sampled input `because` had no message yet, or too old a one.
     unused: a Batch message cut off by `max` or `max_age`, or after the last firing.
     late: it came after a forced decision, or on a restarted stream that went back over its stamps.
+    overflow: the queue in front of a trigger was full, or ticks were left out.
+    reset: it waited when the clock behind an input jumped back, or came from before that.
+    refused: its stream had promised that there would be no such message.
     """
 
     input: str
@@ -75,7 +84,10 @@ class Drop:
 
 @dataclass(frozen=True, slots=True)
 class Waiting:
-    """The first undecided stamp, and the frontier that each input which holds it up would have to reach."""
+    """The first undecided stamp, and the frontier that each input which holds it up would have to reach.
+
+    `FOREVER` stands for a static stream whose message is missing: no forced frontier takes its place.
+    """
 
     stamp: int
     needs: Mapping[str, int]

@@ -13,7 +13,7 @@ from typing import Final
 
 from dataflow.sync.entries import DropReason, Entry, InputValue
 from dataflow.sync.lanes import DropEntry, Lane
-from dataflow.sync.stamps import NEVER
+from dataflow.sync.stamps import FOREVER, NEVER
 
 
 class _Unknown:
@@ -134,7 +134,7 @@ class Join:
                 below_stamp = lane.removed
 
         if above_stamp is None:
-            enough = stamp + self._tolerance
+            enough = min(stamp + self._tolerance, FOREVER)
             if below_stamp is not None:
                 enough = min(enough, 2 * stamp - below_stamp - 1)
             if lane.frontier < enough:
@@ -152,7 +152,7 @@ class Join:
 
     def _unless_next_anchor_is_nearer(self, above: Entry, stamp: int) -> Entry | _Unknown | None:
         anchors = self._anchor.entries
-        enough = 2 * above.stamp - stamp - 1
+        enough = min(2 * above.stamp - stamp - 1, FOREVER)
         if len(anchors) > 1:
             return above if anchors[1].stamp > enough else _NO_PARTNER
         return above if self._anchor.frontier >= enough else _Unknown(anchor=enough)

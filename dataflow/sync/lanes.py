@@ -48,6 +48,8 @@ class StreamState:
     def accept(self, entry: Entry) -> bool:
         """Takes note of a message. False if it is late, as the stream restarted; raises if it is wrong."""
         stamp = entry.stamp
+        if stamp >= FOREVER:
+            raise StreamOrderError(self.name, f"message {entry.seq} lies at the end of time")
         if stamp <= self.promised or self.ended or entry.incarnation != self.incarnation:
             self._check_order(entry)
             return False
@@ -60,6 +62,10 @@ class StreamState:
 
     def advance(self, frontier: int) -> bool:
         """Takes note of a promise; False if it says nothing new."""
+        if frontier >= FOREVER:
+            raise StreamOrderError(
+                self.name, "a frontier lies before the end of time; a stream that is over sends its end"
+            )
         if self.ended or self.static or frontier <= self.promised:
             return False
         self.promised = frontier
@@ -71,16 +77,19 @@ class StreamState:
             final_stamp = self.promised if self.promised != NEVER else None
         elif final_stamp < self.promised:
             raise StreamOrderError(
-                f"stream {self.name!r} ends with final stamp {format_stamp(final_stamp)}, below its "
-                f"promised frontier {format_stamp(self.promised)}: pass the larger of last stamp and frontier"
+                self.name,
+                f"it ends with final stamp {format_stamp(final_stamp)}, below its promised frontier "
+                f"{format_stamp(self.promised)}: pass the larger of last stamp and frontier",
             )
+        if final_stamp is not None and final_stamp >= FOREVER:
+            raise StreamOrderError(self.name, "its final stamp lies at the end of time")
         self.ended = True
         self.final = final_stamp
 
     def reset(self, incarnation: int) -> None:
         """Begins a new incarnation, which is open, and late up to where the old ones came."""
         if incarnation <= self.incarnation:
-            raise StreamOrderError(f"stream {self.name!r}: incarnation {incarnation} after {self.incarnation}")
+            raise StreamOrderError(self.name, f"incarnation {incarnation} after {self.incarnation}")
         self.incarnation = incarnation
         if self.static:
             self.last = NEVER
@@ -89,18 +98,18 @@ class StreamState:
 
     def _check_order(self, entry: Entry) -> None:
         """Returns if the message lies in the time of earlier incarnations; raises if it breaks a promise."""
-        where = f"stream {self.name!r}: message {entry.seq} at {format_stamp(entry.stamp)}"
+        what = f"message {entry.seq} at {format_stamp(entry.stamp)}"
         if entry.incarnation < self.incarnation:
-            raise StreamOrderError(f"{where} is of incarnation {entry.incarnation}, after {self.incarnation}")
-        if self.ended:
-            raise StreamOrderError(
-                f"{where}: {'a static stream carries one message' if self.static else 'the stream has ended'}"
-            )
-        if entry.stamp <= self.floor:
+            problem = f"{what} is of incarnation {entry.incarnation}, after {self.incarnation}"
+        elif self.ended:
+            problem = f"{what}: {'a static stream carries one message' if self.static else 'the stream has ended'}"
+        elif entry.stamp <= self.floor:
             return
-        if entry.stamp <= self.last:
-            raise StreamOrderError(f"{where} does not come after {format_stamp(self.last)}: stamps strictly increase")
-        raise StreamOrderError(f"{where} breaks the promised frontier {format_stamp(self.promised)}")
+        elif entry.stamp <= self.last:
+            problem = f"{what} does not come after {format_stamp(self.last)}: stamps strictly increase"
+        else:
+            problem = f"{what} breaks the promised frontier {format_stamp(self.promised)}"
+        raise StreamOrderError(self.name, problem)
 
 
 class Lane:

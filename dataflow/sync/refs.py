@@ -34,6 +34,20 @@ InputRef = MessageRef | None | tuple[RunRef, ...] | Mapping[str, MessageRef]
 """A message or None; of a Batch its runs; of a `many` trigger or Sampled a map from stream to message."""
 
 
+def messages_of(ref: InputRef) -> Iterator[MessageRef]:
+    """Every message that a reference names."""
+    match ref:
+        case None:
+            return
+        case MessageRef():
+            yield ref
+        case tuple():
+            for run in ref:
+                yield from run
+        case _:
+            yield from ref.values()
+
+
 @dataclass(frozen=True, slots=True)
 class FiringInputs:
     """Everything about a firing that `process()` could see, with messages by reference."""

@@ -50,6 +50,11 @@ class Ticks:
         self._next = self.stamp = self._grid_from(stamp)
         self.started = True
 
+    def owed(self, last: int) -> tuple[int, int, int]:
+        """Of the ticks from the next one, which is confirmed, to `last`: how many, the first and the last."""
+        number = (last - self.stamp) // self._period + 1
+        return (number, self.stamp, self.stamp + (number - 1) * self._period) if number > 0 else (0, NEVER, NEVER)
+
     def skip(self, stamp: int) -> range:
         """Leaves out the ticks from the next one, which is confirmed, to `stamp`; they are what it returns."""
         skipped = range(self.stamp, min(stamp, self.reach + 1), self._period)

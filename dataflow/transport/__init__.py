@@ -1,22 +1,16 @@
 """Envelope codec and the Zenoh bus between hosts."""
 
-from dataflow.transport.bus import Bus, BusError, StreamPublisher, Token
-from dataflow.transport.codec import (
-    DecodeError,
-    Envelope,
-    Head,
-    Kind,
-    Limits,
-    decode,
-    decode_head,
-    encode,
-    encode_into,
-    encode_parts,
-    encoded_size,
-)
-from dataflow.transport.network import NetworkConfig, NetworkError, reserve_endpoints
+from dataflow.transport.bus import Bus, Token
+from dataflow.transport.codec import decode, decode_head, encode, encode_parts
+from dataflow.transport.envelope import DecodeError, Envelope, Head, Kind, Limits
+from dataflow.transport.network import NetworkConfig, NetworkError
+from dataflow.transport.publisher import BusError, StreamPublisher
 from dataflow.transport.registry import RegistryError, RunningGraph, register, running
-from dataflow.transport.taps import TapClient, TapMessage, TapServer, TapWindow
+from dataflow.transport.seal import new_secret
+from dataflow.transport.sockets import Reservation, reserve_endpoints
+from dataflow.transport.tap_client import TapClient, TapMessage
+from dataflow.transport.tap_server import TapServer
+from dataflow.transport.taps import TapWindow
 
 __all__ = [
     "Bus",
@@ -29,6 +23,7 @@ __all__ = [
     "NetworkConfig",
     "NetworkError",
     "RegistryError",
+    "Reservation",
     "RunningGraph",
     "StreamPublisher",
     "TapClient",
@@ -39,9 +34,8 @@ __all__ = [
     "decode",
     "decode_head",
     "encode",
-    "encode_into",
     "encode_parts",
-    "encoded_size",
+    "new_secret",
     "register",
     "reserve_endpoints",
     "running",

@@ -1,4 +1,4 @@
-"""The wire form of everything that travels on a stream: encode, decode, and nothing else (pure, no I/O).
+"""The wire form of envelopes: encode, decode, and nothing else (pure, no I/O).
 
 An envelope is one byte string: a fixed prelude, a msgpack head (which stream, which number, which stamp), for messages
 a msgpack body (schema, header fields, array descriptors), and the arrays' raw bytes, each aligned to 64 bytes. The
@@ -8,10 +8,7 @@ format is specified byte by byte in `docs/wire-format.md`.
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import IntEnum
+from collections.abc import Callable, Sequence
 from typing import Any, Final
 
 import msgpack
@@ -19,95 +16,32 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.base import ArrayField, Message, MessageError, ScalarField, message_type
+from dataflow.transport.envelope import (
+    ALIGNMENT,
+    DEFAULT_LIMITS,
+    MAGIC,
+    PRELUDE,
+    VERSION,
+    Buffer,
+    DecodeError,
+    Envelope,
+    Head,
+    Kind,
+    Limits,
+)
 
-MAGIC: Final = b"\x9cDFE"
-VERSION: Final = 1
-ALIGNMENT: Final = 64
-PRELUDE: Final = struct.Struct("<4sBBHI")  # magic, version, kind, head bytes, body bytes
-
-Buffer = bytes | bytearray | memoryview
+TypeOf = Callable[[str], type[Message]]
+"""The message class of a schema name; raises `MessageError` for an unknown one."""
 
 _INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
 _PADDING = bytes(ALIGNMENT)
 _NIL = 0xC0
 _HEAD_FIELDS: Final = 6
-
-
-class DecodeError(ValueError):
-    """Bytes that are no envelope: says what is wrong and where."""
-
-
-class Kind(IntEnum):
-    """What an envelope says about its stream."""
-
-    MESSAGE = 1
-    """A message; `stamp` is the message's. It implies the frontier `stamp`."""
-    FRONTIER = 2
-    """No later message has a stamp ≤ `stamp`. `seq` is the next message's."""
-    END = 3
-    """Nothing follows in this incarnation: `stamp` is the final stamp, `reason` says why, `seq` counts the messages."""
-    RESET = 4
-    """A new incarnation begins (`incarnation` is the new number) because of `reason`; `seq` starts at 0 again."""
-    PROBE = 5
-    """Start barrier: carries no data. `seq` is the probe's number."""
-    REFERENCE = 6
-    """A message that lies in shared memory: resolved by the bus, never seen by its users."""
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What a decoder accepts at most. Anything larger is a `DecodeError` before memory is taken for it."""
-
-    head_bytes: int = 4096
-    body_bytes: int = 1 << 20
-    payload_bytes: int = 1 << 30
-    dimensions: int = 8
-    string_bytes: int = 1 << 16
-    strings: int = 1 << 16
-
-
-DEFAULT_LIMITS: Final = Limits()
-
-
-@dataclass(frozen=True, slots=True)
-class Head:
-    """What every envelope says before its content: enough for rates, lag and routing."""
-
-    kind: Kind
-    stream: str
-    incarnation: int
-    seq: int
-    stamp: int
-    wall: int
-    """Wall time of the publication, ns since the epoch. For showing lag only, never compared."""
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
-class Envelope:
-    """One thing that happens on a stream.
-
-    `stamp` is the message's stamp, the frontier, or the final stamp (ns since the epoch), by `kind`. `wall` is the wall
-    time of the publication (ns), for showing lag only.
-    """
-
-    kind: Kind
-    stream: str
-    incarnation: int
-    seq: int
-    stamp: int
-    message: Message | None = None
-    reason: str = ""
-    wall: int = 0
-
-    @staticmethod
-    def of(message: Message, stream: str, seq: int, incarnation: int = 0, wall: int = 0) -> Envelope:
-        """The envelope that carries `message`."""
-        return Envelope(Kind.MESSAGE, stream, incarnation, seq, message.stamp, message, "", wall)
+_KINDS: Final = frozenset(Kind)
 
 
 def encode_head(envelope: Envelope) -> bytes:
-    """The msgpack head alone; raises `ValueError` when it is longer than the prelude can say."""
+    """Returns the msgpack head alone; raises `ValueError` when it is longer than the prelude can say."""
     head: bytes = msgpack.packb(
         (envelope.stream, envelope.incarnation, envelope.seq, envelope.stamp, envelope.wall, envelope.reason)
     )
@@ -117,7 +51,7 @@ def encode_head(envelope: Envelope) -> bytes:
 
 
 def encode_parts(envelope: Envelope) -> list[Buffer]:
-    """The envelope as consecutive buffers, arrays by reference: joined, they are the wire form.
+    """Returns the envelope as consecutive buffers, arrays by reference: joined, they are the wire form.
 
     Raises `ValueError` when a head or body exceeds what the prelude can say, or `message` does not fit `kind`.
     """
@@ -146,44 +80,22 @@ def encode_parts(envelope: Envelope) -> list[Buffer]:
 
 
 def encode(envelope: Envelope) -> bytes:
-    """The wire form of `envelope`; copies its arrays once."""
+    """Returns the wire form of `envelope`; copies its arrays once."""
     return b"".join(encode_parts(envelope))
 
 
 def parts_size(parts: Sequence[Buffer]) -> int:
-    """Bytes of the wire form that `parts` make up."""
+    """Returns the bytes of the wire form that `parts` make up."""
     return sum(len(p) for p in parts)
 
 
-def encoded_size(envelope: Envelope) -> int:
-    """Bytes of the wire form of `envelope`."""
-    return parts_size(encode_parts(envelope))
-
-
-def encode_into(envelope: Envelope | Sequence[Buffer], buffer: bytearray | memoryview) -> int:
-    """Writes the wire form (of an envelope, or of its parts) to the start of `buffer`; returns the bytes written.
-
-    Raises `ValueError` when the buffer is too small, before anything is written.
-    """
-    parts = encode_parts(envelope) if isinstance(envelope, Envelope) else envelope
-    size = parts_size(parts)
-    if size > len(buffer):
-        raise ValueError(f"envelope of {size} bytes does not fit a buffer of {len(buffer)}")
-    target = memoryview(buffer).cast("B")
-    offset = 0
-    for part in parts:
-        target[offset : offset + len(part)] = part
-        offset += len(part)
-    return size
-
-
 def decode_head(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Head:
-    """The head alone: which stream, kind, stamp and number, without looking at the message. Raises `DecodeError`."""
+    """Returns the head alone: stream, kind, stamp and number, without looking at the message. Raises `DecodeError`."""
     return _head(_bytes_view(buffer), limits)[0]
 
 
-def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Envelope:
-    """The envelope in `buffer`, which must hold exactly one.
+def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS, types: TypeOf = message_type) -> Envelope:
+    """Returns the envelope in `buffer`, which must hold exactly one. `types` gives the class of a schema name.
 
     The message's arrays are read-only views of `buffer`: nobody may write to it afterwards. Raises only `DecodeError`.
     """
@@ -197,7 +109,7 @@ def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS) -> Envelope:
             raise DecodeError(f"{_where(head)}: {len(view) - body_start} bytes after the head, expected none")
         message = None
     else:
-        message = _message(view, head, body_start, body_end, limits)
+        message = _message(view, head, body_start, body_end, limits, types)
     return Envelope(head.kind, head.stream, head.incarnation, head.seq, head.stamp, message, head.reason, head.wall)
 
 
@@ -217,7 +129,7 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
         raise DecodeError(f"prelude: magic {magic.hex()}, expected {MAGIC.hex()}")
     if version != VERSION:
         raise DecodeError(f"prelude: version {version}, this decoder knows {VERSION}")
-    if not Kind.MESSAGE <= kind <= Kind.REFERENCE:
+    if kind not in _KINDS:
         raise DecodeError(f"prelude: kind {kind}, known are {', '.join(f'{k.value} ({k.name})' for k in Kind)}")
     for name, size, most in (("head", head_bytes, limits.head_bytes), ("body", body_bytes, limits.body_bytes)):
         if size > most:
@@ -256,14 +168,14 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
     return Head(Kind(kind), stream, incarnation, seq, stamp, wall, reason), body_start, body_bytes
 
 
-def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits) -> Message:
+def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits, types: TypeOf) -> Message:
     body = _Body(view[start:end], head, limits)
     body.array("body", 3)
     schema = body.value("schema")
     if type(schema) is not str:
         raise DecodeError(f"{_where(head)}: schema must be a string, got {_short(schema)}")
     try:
-        cls = message_type(schema)
+        cls = types(schema)
     except MessageError as error:
         raise DecodeError(f"{_where(head)}: {_short(error)}") from None
     body.array("header", len(cls.SCALARS))

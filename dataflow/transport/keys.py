@@ -24,6 +24,11 @@ def stream_of_static(key: str) -> str:
     return key.removesuffix(f"/{RUNTIME}/static")
 
 
+def statics_key(namespace: str, bus: str) -> str:
+    """Where a process answers which static streams it holds; `*` for all processes."""
+    return runtime_key(namespace, "statics", bus)
+
+
 def shared_key(stream: str, machine: str, pid: str, descriptor: str, bus: str) -> str:
     """The liveliness token of a consumer of `stream` that can read shared memory."""
     return "/".join((stream, RUNTIME, "shm", machine, pid, descriptor, bus))
@@ -37,13 +42,3 @@ def tap_key(namespace: str, tap: str, stream: str) -> str:
 def stream_of_tap(namespace: str, tap: str, key: str) -> str:
     """The stream that a `tap_key` is about."""
     return f"{namespace}/{key.removeprefix(runtime_key(namespace, 'tap', tap) + '/')}"
-
-
-def alive_key(namespace: str, operator: str) -> str:
-    """The liveliness token of an operator; `**` for all of them."""
-    return runtime_key(namespace, "alive", operator)
-
-
-def alive_name(namespace: str, key: str) -> str:
-    """The operator that an `alive_key` is about."""
-    return key.removeprefix(alive_key(namespace, ""))

@@ -1,15 +1,13 @@
-"""Where a bus listens and connects, and how that becomes a Zenoh configuration. Loopback only unless told otherwise."""
+"""Where a bus listens and connects, and how that becomes a Zenoh configuration. This machine only unless told so."""
 
 from __future__ import annotations
 
 import ipaddress
 import json
 import re
-import socket
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from zenoh import Config, ZError
 
@@ -25,11 +23,14 @@ class NetworkError(ValueError):
 class NetworkConfig:
     """How one process takes part in the network.
 
-    `listen` and `connect` are Zenoh endpoints such as `"tcp/127.0.0.1:7447"`. Peers that are not up yet are tried again
-    in the background until the bus is closed. An endpoint beyond this machine is refused in `listen` unless
-    `exposed` is set: it stands for "the graph's `network:` section says so". `shared_memory` lets large messages
-    between hosts of one machine go through shared memory, in a pool of `pool_bytes` for each publishing host. `zenoh`
-    holds further settings of Zenoh's own configuration by path: `{"transport/link/tls": {...}, "access_control": {}}`.
+    `listen` and `connect` are Zenoh endpoints such as `"unixsock-stream//run/user/1000/a"` or `"tcp/127.0.0.1:7447"`.
+    Peers that are not up yet are tried again in the background until the bus is closed. An endpoint beyond this machine
+    is refused in `listen` unless `exposed` is set: it stands for "the graph's `network:` section says so".
+    `shared_memory` lets large messages between processes of one machine go through shared memory, in a pool of
+    `pool_bytes` for each publishing process. `secret` is the run's (`seal.new_secret`): buses with another one neither
+    take our publications nor we theirs. `blocked`: seconds that a publication waits for a subscriber that takes
+    nothing; then its link is closed, and it misses messages until it has connected again. `zenoh` holds further
+    settings of Zenoh's own configuration by path: `{"transport/link/tls": {...}, "access_control": {}}`.
     """
 
     listen: tuple[str, ...] = ()
@@ -37,6 +38,8 @@ class NetworkConfig:
     shared_memory: bool = True
     exposed: bool = False
     pool_bytes: int = 256 << 20
+    secret: str = field(default="", repr=False)
+    blocked: float = 30.0
     zenoh: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -56,13 +59,15 @@ class NetworkConfig:
     def zenoh_config(self) -> Config:
         """The Zenoh configuration; raises `NetworkError` for a setting that Zenoh does not take."""
         config = Config()
-        for path, value in (_BASE | dict(self.zenoh)).items():
+        closing = {f"{_BLOCK}/wait_before_close": round(self.blocked * 1e6)}
+        for path, value in (_BASE | closing | dict(self.zenoh)).items():
             _insert(config, path, value)
         _insert(config, "listen/endpoints", list(self.listen))
         _insert(config, "connect/endpoints", list(self.connect))
         return config
 
 
+_BLOCK = "transport/link/tx/queue/congestion_control/block"
 _BASE: dict[str, Any] = {
     "mode": "peer",
     "scouting/multicast/enabled": False,
@@ -77,7 +82,6 @@ _BASE: dict[str, Any] = {
     # because its sockets close.
     "transport/link/tx/lease": 30_000,
     "transport/link/tx/keep_alive": 12,
-    "transport/link/tx/queue/congestion_control/block/wait_before_close": 30_000_000,
     # Large messages are cut into pieces of 64 KB; Zenoh's default queue is two pieces (benchmarks/transport.md).
     "transport/link/tx/queue/size/data": 16,
     "transport/link/rx/buffer_size": 1 << 20,
@@ -109,41 +113,3 @@ def is_local(endpoint: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
-
-
-class Reservation:
-    """Free TCP endpoints on 127.0.0.1, held for the hosts that will listen on them.
-
-    The ports stay bound (not listening) until `close`: the system gives them to nobody else meanwhile, while a Zenoh
-    session can listen on them already. Close it once all hosts have joined.
-    """
-
-    def __init__(self, count: int) -> None:
-        self._sockets: list[socket.socket] = []
-        try:
-            for _ in range(count):
-                held = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-                self._sockets.append(held)
-                held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                held.bind(("127.0.0.1", 0))
-        except OSError:
-            self.close()
-            raise
-        self.endpoints = tuple(f"tcp/127.0.0.1:{s.getsockname()[1]}" for s in self._sockets)
-
-    def close(self) -> None:
-        for held in self._sockets:
-            held.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
-
-def reserve_endpoints(count: int) -> Reservation:
-    """`count` free loopback endpoints, no two alike, nobody else's until the reservation is closed."""
-    return Reservation(count)

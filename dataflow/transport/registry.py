@@ -1,6 +1,6 @@
-"""How a tool finds the graphs that run on this machine: one small file for each, in a folder of this user alone.
+"""The graphs that run on this machine, for tools to find: one small file for each, in a folder of this user alone.
 
-A file whose process is gone is removed by whoever looks next.
+The sockets of their processes lie in the same folder. What a dead process left is removed by whoever looks next.
 """
 
 from __future__ import annotations
@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import secrets
+import shutil
 import stat
 import tempfile
 import time
@@ -30,7 +31,8 @@ class RegistryError(RuntimeError):
 class RunningGraph:
     """A graph that runs on this machine.
 
-    `endpoints` are the Zenoh endpoints of all its hosts: a tool connects to every one. `started` is the wall time
+    `endpoints` are the Zenoh endpoints of all its hosts, sockets that only this user can open: a tool connects to every
+    one. `started` is the wall time
     (seconds since the epoch) at which the graph was registered. `graph` is the resolved graph as JSON values.
     """
 
@@ -45,13 +47,22 @@ class RunningGraph:
 
 
 def registry_folder() -> Path:
-    """The folder, made on first use: `$XDG_RUNTIME_DIR/dataflow`, else one in the temporary folder.
+    """Returns `$XDG_RUNTIME_DIR/dataflow`, else a folder in the temporary one; makes it on first use.
 
     Raises `RegistryError` when it exists but is another user's, or open to others.
     """
     runtime = os.environ.get("XDG_RUNTIME_DIR")
+    return private_folder(Path(runtime) / "dataflow") if runtime else temporary_folder()
+
+
+def temporary_folder() -> Path:
+    """Returns this user's folder in the temporary one; as `registry_folder`."""
     user = os.getuid() if hasattr(os, "getuid") else os.environ.get("USERNAME", "user")
-    folder = Path(runtime) / "dataflow" if runtime else Path(tempfile.gettempdir()) / f"dataflow-{user}"
+    return private_folder(Path(tempfile.gettempdir()) / f"dataflow-{user}")
+
+
+def private_folder(folder: Path) -> Path:
+    """Makes a folder that only this user can enter; raises `RegistryError` when there is another one in its place."""
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         status = folder.lstat()
@@ -85,7 +96,8 @@ def register(
     )
     path = registry_folder() / f"{pid}-{secrets.token_hex(4)}.json"
     written = path.with_suffix(".new")
-    written.write_text(json.dumps(asdict(entry)))
+    with open(os.open(written, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
+        file.write(json.dumps(asdict(entry)))
     written.rename(path)
     try:
         yield entry
@@ -94,14 +106,14 @@ def register(
 
 
 def running() -> list[RunningGraph]:
-    """The graphs that run on this machine for this user, the oldest first. Removes what dead processes left."""
+    """Returns this user's graphs that run on this machine, the oldest first. Removes what dead processes left."""
     found = []
     for path in registry_folder().iterdir():
         entry = _read(path)
         if entry is not None and _lives(entry.pid, entry.process_started):
             found.append(entry)
-        elif entry is not None or _is_abandoned(path):
-            path.unlink(missing_ok=True)
+        elif entry is not None or is_abandoned(path):
+            remove(path)
     return sorted(found, key=lambda g: (g.started, g.pid))
 
 
@@ -124,7 +136,7 @@ def _read(path: Path) -> RunningGraph | None:
 
 
 def _lives(pid: int, process_started: float) -> bool:
-    """Whether that very process still runs; a later process with the same id began at another time."""
+    """Returns whether that very process still runs; a later process with the same id began at another time."""
     try:
         process = psutil.Process(pid)
         same = abs(process.create_time() - process_started) < START_TOLERANCE
@@ -133,7 +145,15 @@ def _lives(pid: int, process_started: float) -> bool:
         return False
 
 
-def _is_abandoned(path: Path) -> bool:
-    """A file that is no entry: left by a process that died while writing it."""
+def is_abandoned(path: Path) -> bool:
+    """Returns whether the process that a file or folder `<process>-...` belongs to is gone."""
     pid = path.name.partition("-")[0]
     return pid.isdigit() and not psutil.pid_exists(int(pid))
+
+
+def remove(path: Path) -> None:
+    """Removes a file, or a folder with what is in it; one that is gone is left so."""
+    if path.is_dir():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,35 +1,30 @@
-"""Compares what operators make now with the recorded messages themselves, field by field.
-
-Every operator is given the recorded inputs, where they were recorded: a difference is its own, and none is handed on.
-"""
+"""Compares what operators make now with the recorded messages themselves, field by field, while it is made."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
 from dataflow.messages.base import Message
 from dataflow.recording import Recording
 from dataflow.recording.diff import FieldDifference, differences
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.engine import Recomputation, plan_feeding
-from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.records.reading import FiringLog, Place
 from dataflow.sync import Entry
-from dataflow.verification.worker import Tell, apart
 
 NOT_STORED = "the recording does not hold this message"
 
 
 @dataclass(frozen=True, slots=True)
 class OutputDifference:
-    """One message that came out otherwise than recorded.
+    """One message that differs from the recorded one.
 
     `index`, `kind` and `firing`: of the firing record and its stamp; `seq`, `incarnation`: the place in the stream.
     `fields` are the fields that differ (beyond the tolerance, where there is one): empty, with the reason in `note`,
-    where the recorded message is not to be had.
+    where the recorded message is unavailable.
     """
 
     stream: str
@@ -59,33 +54,29 @@ class OutputDifference:
 
 @dataclass(slots=True)
 class OutputComparison:
-    """How the messages of one operator compare with the recorded ones.
+    """The comparison of one operator's messages with the recorded ones.
 
     `equal` have the recorded digest, `within` differ by no more than the tolerance, `beyond` by more or in what no
-    tolerance applies to. `otherwise` counts what is no pair of messages: nothing where there was a message, a message
-    where there was nothing, an error. `unverifiable` firings could not be made. `own`: the first difference came while
-    all that the operator had been given was as recorded. `first` are the outputs of the first
-    firing that differs beyond the tolerance. `got` is the digest of the first that differs at all, in firing `index`.
-    `note` says why nothing was compared.
+    tolerance applies to; without a tolerance, all that differ are beyond it. `unpaired` counts what is no pair of
+    messages: nothing where there was a message, a message where there was nothing, an error. `unverifiable` firings
+    could not be made. `own`: the first difference came while all that the operator had been given was as recorded.
+    `first` are the outputs of the first firing that differs beyond the tolerance.
     """
 
     operator: str
     equal: int = 0
     within: int = 0
     beyond: int = 0
-    otherwise: int = 0
+    unpaired: int = 0
     unverifiable: int = 0
     own: bool = True
     max_difference: float = 0.0
     first: list[OutputDifference] = field(default_factory=list)
-    index: int | None = None
-    got: str = ""
-    note: str = ""
 
     @property
     def tolerated(self) -> bool:
         """Every output is there and lies within the tolerance."""
-        return not (self.beyond or self.otherwise or self.unverifiable or self.note)
+        return not (self.beyond or self.unpaired or self.unverifiable)
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self) | {"first": [d.as_json() for d in self.first], "tolerated": self.tolerated}
@@ -95,136 +86,104 @@ class OutputComparison:
         return OutputComparison(**{**values, "first": [OutputDifference.from_wire(d) for d in values["first"]]})
 
 
-def compare_outputs(
-    path: Path,
-    graph: Graph,
-    operators: Collection[str],
-    *,
-    tolerance: float | None = None,
-    told: Tell | None = None,
-    stall_timeout: float = 120.0,
-) -> dict[str, OutputComparison]:
-    """Runs operators again, by their records, and compares their messages with the recorded ones.
+class Comparer:
+    """Compares messages as they are made, by digest; those that differ field by field, where that is of use.
 
-    Without `tolerance` only until each has made a firing that differs. In a process of its own. Operators that cannot
-    be given what they took have a `note` instead. Raises `RunFailed`.
+    That is with a `tolerance`, and else for the first firing of an operator that differs: the recorded message is then
+    looked up in the file.
     """
-    request = {
-        "path": str(path),
-        "graph": graph.to_json(),
-        "operators": sorted(operators),
-        "tolerance": tolerance,
-    }
-    found = apart(f"{__name__}:answer", request, threads=graph.threads, told=told, stall_timeout=stall_timeout)
-    return {name: OutputComparison.from_wire(values) for name, values in found.items()}
 
-
-def answer(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
-    """`compare_outputs`, in the process that does it."""
-    graph = Graph.from_json(request["graph"])
-    with Recording(request["path"]) as recording:
-        able, found = [], {}
-        for name in request["operators"]:
-            try:
-                plan_feeding(recording, graph, [name])
-            except ReplayError as error:
-                found[name] = OutputComparison(name, note=str(error))
-            else:
-                able.append(name)
-        if able:
-            found |= _Comparer(recording, graph, able, request["tolerance"]).run(tell)
-        return {name: asdict(comparison) for name, comparison in found.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class _Expected:
-    record: FiringRecord
-    port: str
-    stamp: int
-    digest: bytes
-
-
-class _Comparer:
-    def __init__(self, recording: Recording, graph: Graph, operators: Collection[str], tolerance: float | None) -> None:
-        self.recording, self.graph, self.tolerance = recording, graph, tolerance
+    def __init__(
+        self,
+        recording: Recording,
+        graph: Graph,
+        log: FiringLog,
+        operators: Collection[str],
+        tolerance: float | None,
+    ) -> None:
+        self._recording, self._graph, self._log, self._tolerance = recording, graph, log, tolerance
         self.found = {name: OutputComparison(name) for name in operators}
-        feeding = plan_feeding(recording, graph, operators)
-        self.work = Recomputation(recording, graph, feeding, made=self._made)
-        self._expected = {name: self._emissions(name) for name in operators}
-        self._firings = 0
+        makers = [graph.nodes[name] for name in operators]
+        self._digests = log.digests(makers, {stream for maker in makers for stream in maker.outputs.values()})
+        self._records: dict[str, Mapping[Place, FiringRecord]] = {}
 
-    def _emissions(self, operator: str) -> dict[tuple[str, int, int], _Expected]:
-        """Stream, incarnation, seq → what was emitted there."""
-        ports = self.graph.nodes[operator].outputs
-        return {
-            (ports[port], record.incarnation, emission.seq): _Expected(record, port, emission.stamp, emission.digest)
-            for record in self.work.records[operator]
-            for port, emission in zip(ports, record.outputs, strict=False)
-            if emission is not None
-        }
-
-    def run(self, tell: Tell) -> Mapping[str, OutputComparison]:
-        results = self.work.run(until=self._until(tell))
-        for name, comparison in self.found.items():
-            result = results[name]
-            comparison.otherwise = result.differing - result.states - comparison.within - comparison.beyond
-            comparison.unverifiable = result.unverifiable + result.lost_records
-            comparison.own = result.first is None or result.own_fault
-            if result.first is not None:
-                comparison.index, comparison.got = result.first.index, result.first.got
-        return self.found
-
-    def _until(self, tell: Tell) -> Callable[[], bool]:
-        results = self.work.results()
-
-        def enough() -> bool:
-            tell({"firings": {name: runner.firings for name, runner in self.work.runners.items()}})
-            return self.tolerance is None and all(results[name].first is not None for name in self.found)
-
-        return enough
-
-    def _made(self, stream: str, entry: Entry) -> None:
-        comparison = self.found.get(self.graph.streams[stream].node)
-        if comparison is None:
-            return
-        expected = self._expected[comparison.operator].get((stream, entry.incarnation, entry.seq))
+    def made(self, stream: str, entry: Entry) -> None:
+        """Takes a message that an operator has made under the number of a recorded one."""
+        comparison = self.found[self._graph.streams[stream].node]
+        place = (entry.incarnation, entry.seq)
+        expected = self._digests[stream].get(place)
         if expected is None:
             return
-        if expected.digest == entry.digest:
+        if expected == entry.digest:
             comparison.equal += 1
             return
-        recorded = self._recorded(stream, expected.stamp, entry)
-        fields: list[FieldDifference] = []
+        if self._tolerance is None and comparison.first and not self._is_of_the_first(comparison, stream, place):
+            comparison.beyond += 1
+            return
+        recorded = self._recorded(stream, entry)
+        fields: Sequence[FieldDifference] = ()
         if recorded is not None:
-            fields, largest = differences(recorded, entry.value, self.tolerance)
+            fields, largest = differences(recorded, entry.value, self._tolerance)
             comparison.max_difference = max(comparison.max_difference, largest)
-            if not fields:
+            if self._tolerance is not None and not fields:
                 comparison.within += 1
                 return
         comparison.beyond += 1
-        place = (entry.incarnation, expected.record.index)
-        if not comparison.first or (comparison.first[0].incarnation, comparison.first[0].index) == place:
-            comparison.first.append(
-                OutputDifference(
-                    stream=stream,
-                    port=expected.port,
-                    index=expected.record.index,
-                    kind=expected.record.kind,
-                    firing=expected.record.stamp,
-                    seq=entry.seq,
-                    incarnation=entry.incarnation,
-                    recorded=expected.digest.hex(),
-                    here=entry.digest.hex(),
-                    fields=tuple(fields),
-                    note="" if recorded is not None else NOT_STORED,
-                )
+        if comparison.first and not self._is_of_the_first(comparison, stream, place):
+            return
+        record = self._record(stream, place)
+        ports = self._graph.nodes[comparison.operator].outputs
+        comparison.first.append(
+            OutputDifference(
+                stream=stream,
+                port=next(port for port, name in ports.items() if name == stream),
+                index=record.index,
+                kind=record.kind,
+                firing=record.stamp,
+                seq=entry.seq,
+                incarnation=entry.incarnation,
+                recorded=expected.hex(),
+                here=entry.digest.hex(),
+                fields=tuple(fields),
+                note="" if recorded is not None else NOT_STORED,
             )
+        )
 
-    def _recorded(self, stream: str, stamp: int, entry: Entry) -> Message | None:
-        info = self.recording.streams.get(stream)
+    def close(self, results: Mapping[str, Verification]) -> Mapping[str, OutputComparison]:
+        """The comparisons of the operators that differ, with what their verifications know."""
+        for name, comparison in self.found.items():
+            result = results[name]
+            comparison.unpaired = result.differing - result.states - comparison.within - comparison.beyond
+            comparison.unverifiable = result.unverifiable + result.lost_records
+            comparison.own = result.first is None or result.own_fault
+        return {name: found for name, found in self.found.items() if results[name].first is not None}
+
+    def _is_of_the_first(self, comparison: OutputComparison, stream: str, place: Place) -> bool:
+        first, record = comparison.first[0], self._record(stream, place)
+        return (first.incarnation, first.index) == (record.incarnation, record.index)
+
+    def _record(self, stream: str, place: Place) -> FiringRecord:
+        """The record of the call that emitted a message."""
+        if stream not in self._records:
+            node = self._graph.nodes[self._graph.streams[stream].node]
+            port = list(node.outputs.values()).index(stream)
+            self._records[stream] = {
+                (record.incarnation, emission.seq): record
+                for record in self._log.of(node.name)
+                if record.outputs and (emission := record.outputs[port]) is not None
+            }
+        return self._records[stream][place]
+
+    def _recorded(self, stream: str, entry: Entry) -> Message | None:
+        """The recorded message in whose place `entry` was made; it may have another stamp."""
+        info = self._recording.streams.get(stream)
         if info is None or info.message_type is None:
             return None
-        for found in self.recording.messages([stream], start=stamp, end=stamp):
-            if (found.incarnation, found.seq) == (entry.incarnation, entry.seq):
+        place = (entry.incarnation, entry.seq)
+        outputs = list(self._graph.nodes[self._graph.streams[stream].node].outputs.values())
+        emission = self._record(stream, place).outputs[outputs.index(stream)]
+        assert emission is not None
+        for found in self._recording.messages([stream], start=emission.stamp, end=emission.stamp):
+            if (found.incarnation, found.seq) == place:
                 return found.message
         return None

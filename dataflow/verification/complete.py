@@ -19,24 +19,23 @@ from dataflow.graph.model import Graph
 from dataflow.process.recorder import RecorderSink
 from dataflow.recording import Recording
 from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
+from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Feeding, Recomputation
-from dataflow.reexecution.recorded import Verification
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import OperatorCounts, Status
 from dataflow.supervision.run import Watch
 from dataflow.sync import Entry
+from dataflow.verification.board import Board
 from dataflow.verification.ledger import read_ledger
+from dataflow.verification.processes import Call, call_workers
 from dataflow.verification.verify import require_records
-from dataflow.verification.worker import Tell, apart
-
-"""Metadata of a completed recording: what it was completed from, and by which version."""
 
 
 @dataclass(frozen=True, slots=True)
 class Completion:
-    """What completing a recording came to.
+    """The result of completing a recording.
 
     `added`: streams that the thin recording did not hold. `messages` of all streams; `kept` of them were recorded, but
     no firing could be made again that made them, so they were taken over. Nothing is left at `path` when an operator
@@ -87,12 +86,12 @@ def complete(
     """
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
-        _plan(recording, played)  # refuses here what would fail there
+        feeding = _plan(recording, played, FiringLog.read(recording))  # refuses here what would fail there
     part = out.with_name(f"{out.name}.part")
     request = {"path": str(path), "part": str(part), "graph": played.to_json()}
-    status = Status(phase="running")
+    call = Call(f"{__name__}:{complete_part.__name__}", request, feeding.operators)
     try:
-        found = apart(f"{__name__}:answer", request, threads=played.threads, told=_shows(status, watch))
+        [found] = call_workers([call], threads=played.threads, watch=watch)
         made = Completion(
             path=out,
             operators=tuple(Verification.from_wire(v) for v in found["operators"]),
@@ -111,41 +110,34 @@ def complete(
         part.unlink(missing_ok=True)
 
 
-def _plan(recording: Recording, graph: Graph) -> Feeding:
+def _plan(recording: Recording, graph: Graph, log: FiringLog) -> Feeding:
     again = [name for name, node in graph.nodes.items() if not node.source and not node.external]
-    require_records(recording, again)
+    require_records(recording, log, again)
     replaced = set(graph.nodes) - set(again)
     return Feeding(tuple(again), plan_replay(recording, graph, replaced=replaced).streams)
 
 
-def _shows(status: Status, watch: Watch | None) -> Tell | None:
-    if watch is None:
-        return None
-
-    def told(fields: Mapping[str, Any]) -> None:
-        status.operators = {name: OperatorCounts(*counts) for name, counts in fields["counts"].items()}
-        watch(status)
-
-    return told
-
-
-def answer(request: Mapping[str, Any], tell: Tell) -> dict[str, Any]:
-    """`complete`, in the process that does it."""
+def complete_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
+    """Writes the new recording. Runs in a worker."""
     graph = Graph.from_json(request["graph"])
     part = Path(request["part"])
     started = time.monotonic()
     with Recording(request["path"]) as recording:
-        feeding = _plan(recording, graph)
+        log = FiringLog.read(recording)
+        feeding = _plan(recording, graph, log)
         store = _Store(recording, graph, feeding, part)
-        work = Recomputation(recording, graph, feeding, made=store.take, read=store.take, ended=store.sink.end)
-
-        def progress() -> bool:
-            counts = {n: [r.firings, r.ports.emitted, 0, r.busy_ns, r.done] for n, r in work.runners.items()}
-            tell({"counts": counts})
-            return any(runner.result.first for runner in work.runners.values())
-
-        results = work.run(until=progress)
-        ledger = read_ledger(recording, graph, feeding.operators)
+        work = Recomputation(
+            recording,
+            graph,
+            feeding,
+            log,
+            made=store.take,
+            read=store.take,
+            ended=store.sink.end,
+            watcher=board,
+        )
+        results = work.run(until=lambda: any(runner.result.first for runner in work.runners.values()))
+        ledger = read_ledger(recording, graph, log, feeding.operators)
         for result in results.values():
             ledger.enter(result)
         kept = store.keep(recording)
@@ -180,8 +172,10 @@ class _Store:
             self.sink.end(stream, known["final"], known["reason"])
         for event in recording.events():
             self.sink.writer.write_event(event.name, event.stamp, event.data)
-        for operator, payload in recording.firings():
-            self.sink.firings(operator, decode_batch(payload).records[-1].stamp, payload)
+        first = min((info.first for info in recording.streams.values() if info.first), default=0)
+        for operator, payload in recording.firings():  # those of setup() have no stamp, and keep their place
+            stamp = decode_batch(payload).records[-1].stamp
+            self.sink.firings(operator, stamp if stamp > 0 else first, payload)
         self._copied = 0
         self._taken: dict[str, set[tuple[int, int]]] = {stream: set() for stream in self.streams}
         for stream in sorted(recording.streams.keys() - graph.streams.keys()):

@@ -11,20 +11,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
+from dataflow.graph import GraphError
 from dataflow.graph.model import Graph
 from dataflow.messages import MessageError
 from dataflow.operator import ParameterError
 from dataflow.recording import Recording, RecordingError
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import FiringRecordError
-from dataflow.reexecution.recorded import Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
-from dataflow.verification.verify import VerifyReport
+from dataflow.verification.report import StandIn, VerifyReport
 
 FORMAT = 1
 
 OperatorVerdict = Literal[
-    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "unverifiable"
+    "identical", "within tolerance", "accepted", "culprit", "downstream", "not as accepted", "changed", "unverifiable"
 ]
 RecordingVerdict = Literal[
     "identical",
@@ -33,6 +34,7 @@ RecordingVerdict = Literal[
     "accepted",
     "different",
     "not wholly verified",
+    "nothing verified",
     "could not run",
 ]
 PASSES = ("identical", "identical up to the cut", "within tolerance", "accepted")
@@ -50,8 +52,9 @@ class BaselineError(ValueError):
 class Judged:
     """One operator of one recording, measured by what is expected of it: the recording, or the accepted outcome.
 
-    `firm`: every call was repeated, and neither it nor what it depends on came out otherwise when run again. Only that
-    can be accepted.
+    Sources and other stand-ins are judged only where their records and their stored messages do not agree.
+    `firm`: every call was repeated, and neither it nor what it depends on differed again when run a second time. Only
+    that can be accepted.
     """
 
     operator: str
@@ -87,8 +90,10 @@ class Checked:
         found = {j.verdict for j in self.judged}
         if self.report is None:
             return "could not run"
-        if found & {"culprit", "downstream", "not as accepted"}:
+        if found & {"culprit", "downstream", "not as accepted", "changed"}:
             return "different"
+        if self.report.empty:
+            return "nothing verified"
         if "unverifiable" in found:
             return "not wholly verified"
         if "accepted" in found:
@@ -106,15 +111,22 @@ class Checked:
         """The operators to look at."""
         return tuple(j.operator for j in self.judged if j.verdict in ("culprit", "not as accepted"))
 
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """The first of the stored messages that are not what was recorded, by stream and number."""
+        found = () if self.report is None else self.report.changed
+        return tuple(f"{s.stream} #{s.first_changed[1]}" for s in found if s.first_changed is not None)
+
     def as_json(self) -> dict[str, Any]:
         value = {"recording": self.name, "verdict": self.verdict, "passed": self.passed, "total_wall_s": self.wall}
         if self.report is None:
             return value | {"error": self.error}
         report = self.report.as_json()
         verdicts = {j.operator: j.verdict for j in self.judged}
-        for operator in report["operators"]:
-            operator["verdict"] = verdicts[operator["operator"]]
-        return value | report | {"culprits": list(self.culprits), "not_in_graph": list(self.not_in_graph)}
+        for node in [*report["operators"], *report["sources"]]:
+            node["verdict"] = verdicts.get(node["operator"], "identical")
+        more = {"culprits": list(self.culprits), "changed": list(self.changed), "not_in_graph": list(self.not_in_graph)}
+        return value | report | more
 
 
 @dataclass(slots=True)
@@ -223,8 +235,8 @@ def check(
         if failure.interrupted:
             raise
         return could_not(str(failure), failure.details, internal=failure.internal)
-    except (RecordingError, ReplayError, FiringRecordError, MessageError, ParameterError, OSError) as error:
-        return could_not(str(error))
+    except (RecordingError, ReplayError, FiringRecordError, GraphError, MessageError, ParameterError, OSError) as error:
+        return could_not(str(error).strip())
     except (
         Exception
     ) as error:  # a fault of this program's, met in one file, must not keep the others from being looked at
@@ -241,10 +253,22 @@ def recorded_but_not_in(graph: Graph, path: Path) -> tuple[str, ...]:
 
 
 def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged, ...]:
-    """The verdict on each operator, given what has been accepted.
+    """The verdict on each operator, given what has been accepted, and on each source whose books are not in order.
 
-    What differs from the accepted outcome is a *culprit* unless an operator that it depends on is one as well. Where
-    calls could not be repeated, neither a tolerance nor an accepted outcome lets it pass.
+    The first row that applies, where *here* is what the operator made, *led astray* that it depends on one that differs
+    from what is accepted for it, and *whole* that every call was repeated:
+
+    | here | accepted | | verdict |
+    | --- | --- | --- | --- |
+    | as recorded, or within tolerance | another outcome | whole | not as accepted |
+    | as recorded, or within tolerance | anything | not whole | unverifiable |
+    | as recorded | | a stored message differs from its record | changed |
+    | as recorded, or within tolerance | | | identical, within tolerance |
+    | otherwise | that outcome | whole | accepted |
+    | otherwise | that outcome | not whole | unverifiable |
+    | otherwise, given what was recorded | another, or none | | culprit |
+    | otherwise, given something else | something, for any operator | not led astray | culprit |
+    | otherwise, given something else | | | downstream |
     """
     outcomes = {v.operator: outcome_of(report, v) for v in report.operators}
     unexpected = {
@@ -263,11 +287,20 @@ def judge(report: VerifyReport, accepted: Mapping[str, Outcome]) -> tuple[Judged
             verdict = "accepted"
         elif own == "downstream" and accepted and not _led_astray(v.operator, unexpected, report.producers):
             verdict = "culprit"
-        if verdict in PASSES and not v.whole:
+        if verdict in (*PASSES, "changed") and not v.whole:
             verdict = "unverifiable"
         steady = unsteady.isdisjoint({v.operator} | _upstream(v.operator, report.producers))
         judged.append(Judged(v.operator, verdict, outcome, v.whole and steady))
-    return tuple(judged)
+    return (*judged, *_judged_stand_ins(report, report.stand_ins))
+
+
+def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Iterable[Judged]:
+    changed = {s.maker for s in report.changed}
+    for stand_in in stand_ins:
+        if stand_in.operator in changed:
+            yield Judged(stand_in.operator, "changed", firm=False)
+        elif not stand_in.whole:
+            yield Judged(stand_in.operator, "unverifiable", firm=False)
 
 
 def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | None:

@@ -1,4 +1,4 @@
-"""What a recording can account for: the messages that operators made against the firing records that tell of them.
+"""The books of a recording: the messages that its nodes made against the firing records that tell of them.
 
 A message without a record shows that records were lost, however whole the others look. Where a recording ends before
 its run did (its writer was killed, the run failed), that is a *cut*: what lies after it cannot be verified.
@@ -13,31 +13,32 @@ from dataclasses import dataclass
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import OUTCOME
+from dataflow.records.comparison import Verification
 from dataflow.records.firing import WITHHELD
-from dataflow.reexecution.recorded import Verification, messages_of, recorded_firings
+from dataflow.records.reading import FiringLog, Place, whole
+from dataflow.sync import messages_of
 
 COMPLETE = "complete"
-
-Place = tuple[int, int]
-"""(incarnation, number) of a message in its stream."""
 
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """What the recording says of one operator's messages.
+    """The messages of one node, as its recording tells of them.
 
     `unaccounted` were stored, or taken by another operator, and no firing record made them; `not_stored` were made by a
-    record and are not in a stream that was recorded. `finished`: the last record is that of `finish()`.
+    record and are not in a stream that was recorded. `lost` calls follow a gap in the records. `finished`: the last
+    record is that of `finish()`, but for the `setup()` of a process that was restarted when the node had ended.
     """
 
     unaccounted: int
     not_stored: int
+    lost: int
     finished: bool
 
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """The accounts of operators, and whether the recording tells of its run to the end.
+    """The accounts of nodes, and whether the recording tells of its run to the end.
 
     `ended` is False for a file without a proper end and for a run that failed or was left at once.
     """
@@ -57,16 +58,14 @@ class Ledger:
             verification.unfinished = not account.finished
 
 
-def read_ledger(recording: Recording, graph: Graph, operators: Collection[str]) -> Ledger:
-    """The accounts of `operators`. Raises `FiringRecordError`."""
-    made: dict[str, set[Place]] = {s: set() for name in operators for s in graph.nodes[name].outputs.values()}
+def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Collection[str]) -> Ledger:
+    """The accounts of `nodes`. Raises `RecordingError` for records that cannot be read."""
+    made: dict[str, set[Place]] = {s: set() for name in nodes for s in graph.nodes[name].outputs.values()}
     taken: dict[str, set[Place]] = {s: set() for s in made}
-    finished = dict.fromkeys(operators, False)
+    finished, lost = dict.fromkeys(nodes, False), dict.fromkeys(nodes, 0)
     for name, node in graph.nodes.items():
-        if node.source:
-            continue
         outputs, last = list(node.outputs.values()), (-1, -1)
-        for record in recorded_firings(recording, name):
+        for record in log.of(name):
             for ref in record.inputs.values():
                 for message in messages_of(ref):
                     if message.stream in taken:
@@ -78,8 +77,10 @@ def read_ledger(recording: Recording, graph: Graph, operators: Collection[str]) 
                     made[stream].add((record.incarnation, emission.seq))
             if (record.incarnation, record.index) > last:
                 last = (record.incarnation, record.index)
-                finished[name] = record.kind == "finish"
-    accounts = {name: _account(recording, graph, name, made, taken, finished[name]) for name in operators}
+                finished[name] = record.kind == "finish" or (finished[name] and record.kind == "setup")
+        if name in lost:
+            lost[name] = whole(log.of(name))[1]
+    accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome")
     return Ledger(accounts, not recording.torn and outcome == COMPLETE)
 
@@ -87,17 +88,22 @@ def read_ledger(recording: Recording, graph: Graph, operators: Collection[str]) 
 def _account(
     recording: Recording,
     graph: Graph,
-    operator: str,
+    node: str,
     made: Mapping[str, set[Place]],
     taken: Mapping[str, set[Place]],
+    lost: int,
     finished: bool,
 ) -> Account:
     unaccounted = not_stored = 0
-    for stream in graph.nodes[operator].outputs.values():
+    for stream in graph.nodes[node].outputs.values():
         told = Counter(incarnation for incarnation, _ in made[stream])
         stored = recording.counts(stream)
+        if graph.streams[stream].static:  # recorded once, however often it was made
+            unaccounted += bool(sum(stored.values())) and not told
+            not_stored += stream in recording.streams and not sum(stored.values()) and bool(told)
+            continue
         excess = sum(max(0, count - told[incarnation]) for incarnation, count in stored.items())
         unaccounted += max(excess, len(taken[stream] - made[stream]))
         if stream in recording.streams:
             not_stored += sum(max(0, count - stored.get(incarnation, 0)) for incarnation, count in told.items())
-    return Account(unaccounted, not_stored, finished)
+    return Account(unaccounted, not_stored, lost, finished)

@@ -3,117 +3,51 @@
 from __future__ import annotations
 
 import math
+import os
+import time
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
-from dataflow.reexecution.recorded import Verification, recorded_firings
+from dataflow.recording.layout import OUTCOME
+from dataflow.records.comparison import Verification
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import FiringLog, beginning, whole
+from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
-from dataflow.supervision.plan import RunPlan
-from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import OperatorCounts, RunFailed
-from dataflow.supervision.run import Watch, execute
-from dataflow.verification.compare import OutputComparison, compare_outputs
-from dataflow.verification.later_start import verify_from
-from dataflow.verification.ledger import read_ledger
-
-Verdict = Literal["identical", "within tolerance", "culprit", "downstream", "unverifiable"]
+from dataflow.supervision.report import OperatorCounts
+from dataflow.supervision.run import Watch
+from dataflow.verification import part, partition
+from dataflow.verification.compare import OutputComparison
+from dataflow.verification.ledger import COMPLETE, Ledger, read_ledger
+from dataflow.verification.letters import shared_records
+from dataflow.verification.processes import Call, Locate, call_workers
+from dataflow.verification.report import StandIn, VerifyReport
+from dataflow.verification.stored import StoredStream
 
 
 @dataclass(frozen=True, slots=True)
-class VerifyReport:
-    """What verification came to.
+class _Task:
+    """What is to be verified, and what the recording says of it: all that was read before any worker starts."""
 
-    `stood_in` are the operators whose recorded streams were used instead; `facts` what differs between the machine that
-    recorded and this one: (fact, then, now); `wall` is in seconds, `span` seconds of event time.
-    `comparisons` hold, for culprits (with a `tolerance`: for all that differ), how their messages compare with the
-    recorded ones. `digests` are (messages, stream digest) of what was made here, by stream; `outputs` the streams of
-    each operator, `producers` those that it takes from. `start`: seconds into the recording, where it began there.
-    `torn`: the recording has no proper end, so what is verified is what had been stored.
-    `work` tells how long each operator worked.
-    """
-
-    operators: tuple[Verification, ...]
+    path: Path
+    graph: Graph
+    log: FiringLog
+    ledger: Ledger
+    operators: tuple[str, ...]
     stood_in: tuple[str, ...]
+    stand_ins: tuple[str, ...]
+    parts: tuple[partition.Part, ...]
+    unchecked: tuple[str, ...]
     facts: tuple[tuple[str, str, str], ...]
-    messages: int
-    streams: int
-    wall: float
+    begin: int | None
     span: float
-    tolerance: float | None = None
-    comparisons: Mapping[str, OutputComparison] = field(default_factory=dict)
-    digests: Mapping[str, tuple[int, str]] = field(default_factory=dict)
-    outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
-    start: float | None = None
-    torn: bool = False
-    work: Mapping[str, OperatorCounts] = field(default_factory=dict)
-
-    @property
-    def identical(self) -> bool:
-        """True only when every firing of the run was repeated and every output was the same, bit for bit."""
-        return not self.cut and all(v.verdict == "identical" for v in self.operators)
-
-    @property
-    def cut(self) -> bool:
-        """The recording ends before its run did: what it was verified up to is all that can be said of it."""
-        return any(v.cut for v in self.operators)
-
-    @property
-    def within_tolerance(self) -> bool:
-        """Every operator is identical or, given the recorded inputs, stays within the tolerance."""
-        return all(self.verdict(v) in ("identical", "within tolerance") for v in self.operators)
-
-    @property
-    def culprits(self) -> tuple[str, ...]:
-        return tuple(v.operator for v in self.operators if self.verdict(v) == "culprit")
-
-    def verdict(self, verification: Verification) -> Verdict:
-        """The verdict on an operator: its own, or what the tolerance makes of it."""
-        compared = self.comparisons.get(verification.operator)
-        if self.tolerance is None or verification.first is None or compared is None or compared.note:
-            return verification.verdict
-        return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
-
-    def repeats(self, operator: str) -> bool | None:
-        """Whether an operator that differs did so twice alike; None where it was not run twice."""
-        compared = self.comparisons.get(operator)
-        first = next((v.first for v in self.operators if v.operator == operator), None)
-        verdict = next((v.verdict for v in self.operators if v.operator == operator), None)
-        if compared is None or compared.note or first is None or verdict != "culprit":
-            return None
-        return (compared.index, compared.got) == (first.index, first.got)
-
-    def as_json(self) -> dict[str, Any]:
-        operators = []
-        for v in self.operators:
-            compared = self.comparisons.get(v.operator)
-            operators.append(
-                v.to_wire()
-                | {"verdict": self.verdict(v), "repeats": self.repeats(v.operator)}
-                | {"comparison": None if compared is None else compared.as_json()}
-            )
-        return {
-            "identical": self.identical,
-            "tolerance": self.tolerance,
-            "within_tolerance": None if self.tolerance is None else self.within_tolerance,
-            "culprits": list(self.culprits),
-            "start_s": self.start,
-            "torn": self.torn,
-            "cut": self.cut,
-            "messages": self.messages,
-            "streams": self.streams,
-            "wall_s": self.wall,
-            "real_time_factor": self.span / self.wall if self.wall else None,
-            "operators": operators,
-            "stood_in": list(self.stood_in),
-            "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
-        }
+    torn: bool
 
 
 def verify(
@@ -124,78 +58,219 @@ def verify(
     only: str | None = None,
     tolerance: float | None = None,
     start: float | None = None,
+    jobs: int | None = None,
+    stall_timeout: float = 120.0,
     watch: Watch | None = None,
-    **options: Any,
+    placement: object = None,
 ) -> VerifyReport:
     """Re-executes a recording by its firing records and compares.
 
-    `first`: verify that operator and what follows from it; `only`: that one alone. What feeds them is then taken from
-    the recording, or verified as well where it was not recorded. Operators marked `external` always are taken from it.
-    Operators that differ are run once more, alone and given the recorded inputs, and their messages compared field by
-    field: the culprits as far as the first difference, with a `tolerance` (absolute, in the unit of each floating-point
-    field) all of them to the end.
-    `start` (seconds from the first message) begins in the middle, from recorded states where there are any; see
-    `midway.verify_from`. Further options are the fields of `RunPlan`.
+    `first`: verify that operator and what follows from it; `only`: that one alone. Every operator is fed from the
+    recording; where its inputs were not recorded, those that made them run with it. Operators marked `external` are
+    always taken from it. Stored messages are compared with the digests in the firing records, too.
+    `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, to see whether they
+    differ alike.
+    `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
+    before that moment, one without state begins there, any other is repeated from its beginning.
+    `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
+    `stall_timeout`: seconds allowed without progress. `placement` is deprecated: "one_host" means
+    one job, anything else nothing.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
+    began = time.monotonic()
     if tolerance is not None and not 0 <= tolerance < math.inf:
         raise ReplayError(f"tolerance {tolerance}: expected a finite number, 0 or more")
+    if jobs is not None and jobs < 1:
+        raise ReplayError(f"{jobs} jobs: expected 1 or more")
+    if placement == "one_host":
+        jobs = 1
+    task = _prepare(path, graph, first, only, start, jobs)
+    options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
+    with shared_records(task.log) as (descriptor, batches):
+        options |= {"descriptors": (descriptor,), "locate": _locate(task)}
+        request = {
+            "path": str(path),
+            "graph": task.graph.to_json(),
+            "records": descriptor,
+            "batches": batches,
+            "begin": task.begin,
+            "tolerance": tolerance,
+        }
+        calls = [
+            Call(
+                f"{part.__name__}:{part.verify_part.__name__}",
+                request | {"operators": list(one.operators), "checks": list(one.checks)},
+                one.operators,
+            )
+            for one in task.parts
+        ]
+        answers = call_workers(calls, **options)
+        report = _report(task, answers, tolerance, start)
+        repeated = _repeat(task, report, request, options)
+    return replace(report, repeated=repeated, total=time.monotonic() - began)
+
+
+def _prepare(
+    path: Path, graph: Graph | None, first: str | None, only: str | None, start: float | None, jobs: int | None
+) -> _Task:
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
         chosen = _with_makers(recording, played, _chosen(played, first, only))
-        require_records(recording, sorted(chosen))
-        require_ports(recording, played, sorted(chosen))
-        ledger = read_ledger(recording, played, sorted(chosen))
+        operators = tuple(name for name in played.nodes if name in chosen)
+        log = FiringLog.read(recording)
+        require_records(recording, log, operators)
+        require_ports(recording, played, log, operators)
+        plan_feeding(recording, played, operators)
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
-        log = None if start is not None else plan_replay(recording, played, replaced=feeding)
-        facts = _differing_facts(recording.metadata, played)
+        sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
+        stand_ins = [n for n in played.nodes if n in feeding | sources and _accountable(recording, played, log, n)]
+        checks, unchecked = _checks(recording, played, log, [*operators, *stand_ins])
+        groups = partition.units(played, recording.streams, operators)
+        work = {n: sum(r.duration + partition.PER_FIRING_NS for r in log.of(n)) for n in operators}
+        jobs = jobs or partition.jobs_for(work, len(os.sched_getaffinity(0)))
         begin, last = _span(recording, start)
-        torn = recording.torn
-    if start is not None:
-        results, wall = verify_from(path, played, chosen, begin)
-        for result in results:
-            ledger.enter(result)
-        return VerifyReport(
-            operators=tuple(results),
-            stood_in=tuple(name for name in played.nodes if name not in chosen or name in feeding),
-            facts=facts,
-            messages=sum(v.outputs for v in results),
-            streams=sum(len(played.nodes[v.operator].outputs) for v in results),
-            wall=wall,
+        return _Task(
+            path=path,
+            graph=played,
+            log=log,
+            ledger=read_ledger(recording, played, log, [*operators, *stand_ins]),
+            operators=operators,
+            stood_in=tuple(name for name in played.nodes if name in feeding),
+            stand_ins=tuple(stand_ins),
+            parts=tuple(partition.with_checks(played, partition.balanced(groups, work, jobs), checks)),
+            unchecked=unchecked,
+            facts=_differing_facts(recording.metadata, played),
+            begin=None if start is None else begin,
             span=(last - begin) * 1e-9,
-            start=start,
-            torn=torn,
+            torn=recording.torn,
         )
-    report = execute(RunPlan(played, log=log, verify=frozenset(chosen), **options), mode="verify", watch=watch)
-    found = {v["operator"]: Verification.from_wire(v) for v in report.verifications}
-    compared = [found[name] for name in played.nodes if name in found]
-    for verification in compared:
-        ledger.enter(verification)
-    span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
-    differing = [v.operator for v in compared if v.first and (tolerance is not None or v.verdict == "culprit")]
+
+
+def _accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -> bool:
+    """Whether the records of a node can be held against its streams.
+
+    Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
+    jumped: its records count one incarnation, its messages several.
+    """
+    node = graph.nodes[name]
+    streams = [s for s in node.outputs.values() if s in recording.streams]
+    makers = {recording.streams[s].metadata.get("operator", name) for s in streams}
+    records = log.of(name)
+    replayed = bool(records) and bool(records[0].detail.get("replayed"))
+    jumped = any(len(recording.counts(s)) > 1 for s in streams)
+    return makers == {name} and not (replayed and jumped) and _same_ports(records, node.outputs)
+
+
+def _same_ports(records: Iterable[FiringRecord], outputs: Collection[str]) -> bool:
+    record = next((r for r in records if r.outcome == "ok" and r.outputs), None)
+    return record is None or len(record.outputs) == len(outputs)
+
+
+def _checks(
+    recording: Recording, graph: Graph, log: FiringLog, nodes: Iterable[str]
+) -> tuple[list[str], tuple[str, ...]]:
+    """The recorded streams of `nodes` that can be compared with their records, and those that cannot be read as the
+    messages that they were."""
+    able: list[str] = []
+    unable: list[str] = []
+    for name in nodes:
+        if not log.of(name):
+            continue
+        for stream in graph.nodes[name].outputs.values():
+            info = recording.streams.get(stream)
+            if info is not None:
+                (able if info.message_type is not None and not info.declared_otherwise else unable).append(stream)
+    return able, tuple(unable)
+
+
+def _locate(task: _Task) -> Locate:
+    """Names the call that an operator is at, from the number of calls that it has repeated."""
+
+    def located(operator: str, repeated: int) -> str:
+        node = task.graph.nodes[operator]
+        kept, _ = whole(task.log.of(operator))
+        _, ahead, _ = beginning(kept, task.begin, stateless=node.operator.stateless)
+        calls = [record for record in ahead if record.kind in CALLS]
+        if repeated >= len(calls):
+            return "its end"
+        record = calls[repeated]
+        return f"firing {record.index} ({record.kind}) at stamp {record.stamp}"
+
+    return located
+
+
+def _report(
+    task: _Task, answers: Iterable[Mapping[str, Any]], tolerance: float | None, start: float | None
+) -> VerifyReport:
+    answers = list(answers)
+    found = {v["operator"]: Verification.from_wire(v) for answer in answers for v in answer["operators"]}
+    counts = {name: OperatorCounts(*values) for answer in answers for name, values in answer["work"].items()}
+    stored = [StoredStream.from_wire(s) for answer in answers for s in answer["stored"]]
+    operators = tuple(found[name] for name in task.operators)
+    for verification in operators:
+        task.ledger.enter(verification)
+    nodes = task.graph.nodes
     return VerifyReport(
-        operators=tuple(compared),
-        stood_in=tuple(name for name in played.nodes if name in feeding),
-        facts=facts,
-        messages=sum(v.outputs for v in compared),
-        streams=sum(len(played.nodes[v.operator].outputs) for v in compared),
-        wall=report.wall,
-        span=span,
+        operators=operators,
+        stood_in=task.stood_in,
+        facts=task.facts,
+        messages=sum(v.outputs for v in operators),
+        streams=sum(len(nodes[name].outputs) for name in task.operators),
+        wall=max(answer["wall"] for answer in answers),
+        span=task.span,
+        stand_ins=tuple(_stand_in(task, name, stored) for name in task.stand_ins),
+        stored=tuple(sorted(stored, key=lambda s: s.stream)),
+        unchecked=task.unchecked,
         tolerance=tolerance,
-        comparisons=_compare(path, played, differing, tolerance),
-        digests=report.streams,
-        work={v.operator: report.operators[v.operator] for v in compared},
-        torn=torn,
-        outputs={v.operator: tuple(played.nodes[v.operator].outputs.values()) for v in compared},
-        producers={
-            v.operator: frozenset(
-                played.streams[s].node for taken in played.nodes[v.operator].inputs.values() for s in taken
-            )
-            for v in compared
+        comparisons={
+            name: OutputComparison.from_wire(values)
+            for answer in answers
+            for name, values in answer["comparisons"].items()
         },
+        digests={s: (count, digest) for answer in answers for s, (count, digest) in answer["digests"].items()},
+        outputs={name: tuple(nodes[name].outputs.values()) for name in task.operators},
+        producers={
+            name: frozenset(task.graph.streams[s].node for taken in nodes[name].inputs.values() for s in taken)
+            for name in task.operators
+        },
+        start=start,
+        torn=task.torn,
+        work=counts,
     )
+
+
+def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
+    """The books of a stand-in, with what reading its messages has shown."""
+    made = StandIn.of(name, task.ledger.accounts[name], ended=task.ledger.ended)
+    read = [s for s in stored if s.maker == name]
+    return replace(
+        made,
+        unaccounted=max(made.unaccounted, sum(s.uncalled for s in read)),
+        missing=max(made.missing, sum(s.missing for s in read)),
+    )
+
+
+def _repeat(
+    task: _Task, report: VerifyReport, request: Mapping[str, Any], options: Mapping[str, Any]
+) -> Mapping[str, bool]:
+    """Runs the culprits once more, to the first difference of each: did they differ alike?"""
+    culprits = report.culprits
+    if not culprits:
+        return {}
+    calls = [
+        Call(
+            f"{part.__name__}:{part.repeat_part.__name__}",
+            {**request, "operators": [name for name in one.operators if name in culprits]},
+            one.operators,
+        )
+        for one in task.parts
+        if not set(culprits).isdisjoint(one.operators)
+    ]
+    again = {name: first for answer in call_workers(calls, **options) for name, first in answer.items()}
+    before = {v.operator: v.first for v in report.operators if v.first is not None}
+    return {name: again[name] == [before[name].incarnation, before[name].index, before[name].got] for name in culprits}
 
 
 def _span(recording: Recording, start: float | None) -> tuple[int, int]:
@@ -209,39 +284,35 @@ def _span(recording: Recording, start: float | None) -> tuple[int, int]:
     return begin, last
 
 
-def require_records(recording: Recording, operators: Iterable[str]) -> None:
+def require_records(recording: Recording, log: FiringLog, operators: Iterable[str]) -> None:
     """Raises `ReplayError` for the first operator without firing records."""
+    outcome = recording.metadata.get(OUTCOME, {}).get("outcome", "")
     for name in operators:
-        if next(recorded_firings(recording, name), None) is None:
+        if log.batches(name):
+            continue
+        if recording.torn or outcome not in ("", COMPLETE):
+            why = "the recording has no proper end" if recording.torn else f"it {outcome}"
             raise ReplayError(
-                f"{recording.path}: operator {name!r} left no firing records there; "
-                "name the graph that made the recording with --graph, or record with --record"
+                f"{recording.path}: the recorded run ended before operator {name!r} began ({why}): "
+                "there is nothing to verify"
             )
+        raise ReplayError(
+            f"{recording.path}: operator {name!r} left no firing records there; "
+            "name the graph that made the recording with --graph, or record with --record"
+        )
 
 
-def require_ports(recording: Recording, graph: Graph, operators: Iterable[str]) -> None:
+def require_ports(recording: Recording, graph: Graph, log: FiringLog, operators: Iterable[str]) -> None:
     """Raises `ReplayError` for the first operator whose outputs are not those it was recorded with."""
     for name in operators:
         node = graph.nodes[name]
-        record = next((r for r in recorded_firings(recording, name) if r.outcome == "ok" and r.outputs), None)
-        if record is not None and len(record.outputs) != len(node.outputs):
+        if not _same_ports(log.of(name), node.outputs):
+            recorded = next(len(r.outputs) for r in log.of(name) if r.outcome == "ok" and r.outputs)
             raise ReplayError(
-                f"{recording.path}: operator {name!r} was recorded with {len(record.outputs)} output ports and has "
+                f"{recording.path}: operator {name!r} was recorded with {recorded} output ports and has "
                 f"{len(node.outputs)} now ({', '.join(node.outputs)}), so its firings cannot be compared: verify with "
                 f"the operator as it was, or record anew"
             )
-
-
-def _compare(
-    path: Path, graph: Graph, operators: Collection[str], tolerance: float | None
-) -> Mapping[str, OutputComparison]:
-    """The messages of operators that differ against the recorded ones; what prevents that is said in their `note`."""
-    if not operators:
-        return {}
-    try:
-        return compare_outputs(path, graph, operators, tolerance=tolerance)
-    except RunFailed as failure:
-        return {name: OutputComparison(name, note=f"not compared field by field: {failure}") for name in operators}
 
 
 def _chosen(graph: Graph, first: str | None, only: str | None) -> set[str]:

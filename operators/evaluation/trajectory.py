@@ -1,20 +1,26 @@
-"""Absolute and relative errors of a trajectory, by evo (Grupp 2017), as Sturm et al. (IROS 2012) define them."""
+"""Absolute and relative errors of a trajectory, as Sturm et al. (IROS 2012) define them.
+
+The tests hold them equal to those of evo (Grupp 2017).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from operators.association import mutually_nearest
 
-if TYPE_CHECKING:
-    from evo.core.trajectory import PoseTrajectory3D
-
 Alignment = Literal["se3", "sim3", "none"]
+Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
+"""Indices of the first and of the second pose of each pair."""
+
+SPAN_TOLERANCE = 0.1
+"""How far the path between two poses may be from the span that is asked for, as a share of it."""
 
 
 @dataclass(eq=False)
@@ -74,30 +80,46 @@ def match(estimate: Trajectory, truth: Trajectory, tolerance: int) -> Matches:
     )
 
 
+def align(
+    points: NDArray[np.float64], onto: NDArray[np.float64], *, scaled: bool
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """R (3, 3), t (3,) and s that minimise Σ |ontoᵢ − (s R pointsᵢ + t)|² (Umeyama, PAMI 1991).
+
+    `points`, `onto`: (N, 3) in metres. s is 1 unless `scaled`. Raises ValueError where the points of either lie on a
+    line or in one place, so that no one rotation is best.
+    """
+    middle, target = points.mean(axis=0), onto.mean(axis=0)
+    spread = points - middle
+    U, singular, Vt = np.linalg.svd((onto - target).T @ spread / len(points))
+    if np.count_nonzero(singular > np.finfo(np.float64).eps) < 2:
+        raise ValueError("the positions lie on a line or in one place")
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(U) * np.linalg.det(Vt))])  # a rotation, never a reflection
+    R = (U * signs) @ Vt
+    s = float(singular @ signs / np.square(spread).sum(axis=1).mean()) if scaled else 1.0
+    return R, target - s * (R @ middle), s
+
+
 def absolute_error(matches: Matches, alignment: Alignment) -> dict[str, float]:
     """ATE: `ate_rmse_m`, `ate_median_m`, `ate_max_m` of the positions, after aligning the estimate to the truth.
 
-    Needs one pair without alignment, otherwise three that are not all in one place. Raises ValueError.
+    Needs one pair without alignment, otherwise three that are not on one line. Raises ValueError.
     """
-    from evo.core.geometry import GeometryException
-    from evo.core.metrics import APE, PoseRelation
-
     needed = 1 if alignment == "none" else 3
     if len(matches.estimate) < needed:
         raise ValueError(f"the absolute error with alignment {alignment!r} needs {needed} matched poses or more")
-    estimate, truth = _evo(matches.estimate), _evo(matches.truth)
+    estimate, truth = np.array(matches.estimate.positions), np.array(matches.truth.positions)
     figures = {}
     if alignment != "none":
         try:
-            _, _, scale = estimate.align(truth, correct_scale=alignment == "sim3")
-        except GeometryException as error:
+            R, t, scale = align(estimate, truth, scaled=alignment == "sim3")
+        except ValueError as error:
             raise ValueError(f"the estimate cannot be aligned to the truth by {alignment!r}: {error}") from None
+        estimate = scale * estimate @ R.T + t
         if alignment == "sim3":
-            figures["ate_scale"] = float(scale)
-    metric = APE(PoseRelation.translation_part)
-    metric.process_data((truth, estimate))
-    statistics = metric.get_all_statistics()
-    return {f"ate_{name}_m": float(statistics[name]) for name in ("rmse", "median", "max")} | figures
+            figures["ate_scale"] = scale
+    errors = np.linalg.norm(estimate - truth, axis=1)
+    statistics = {"rmse": _rmse(errors), "median": float(np.median(errors)), "max": float(errors.max())}
+    return {f"ate_{name}_m": value for name, value in statistics.items()} | figures
 
 
 def relative_errors(matches: Matches, seconds: float, metres: float) -> dict[str, float]:
@@ -105,26 +127,61 @@ def relative_errors(matches: Matches, seconds: float, metres: float) -> dict[str
 
     A span that the trajectory does not contain is left out. Time is counted in frames of the median interval.
     """
-    from evo.core.filters import FilterException
-    from evo.core.metrics import RPE, PoseRelation, Unit
-
-    figures: dict[str, float] = {}
-    if len(matches.estimate) < 2:
-        return figures
-    estimate, truth = _evo(matches.estimate), _evo(matches.truth)
+    count = len(matches.estimate)
+    if count < 2:
+        return {}
     interval = float(np.median(np.diff(matches.estimate.stamps))) * 1e-9
     frames = max(1, round(seconds / interval))
-    spans = ((f"{seconds:g}s", frames, Unit.frames), (f"{metres:g}m", metres, Unit.meters))
-    for name, delta, unit in spans:
-        relations = ((PoseRelation.translation_part, "m"), (PoseRelation.rotation_angle_deg, "deg"))
-        for relation, symbol in relations:
-            metric = RPE(relation, delta, unit, all_pairs=True, pairs_from_reference=True)
-            try:
-                metric.process_data((truth, estimate))
-            except FilterException:  # evo's word for: no two poses are so far apart
-                continue
-            figures[f"rpe_{name}_rmse_{symbol}"] = float(metric.get_all_statistics()["rmse"])
+    figures: dict[str, float] = {}
+    spans = ((f"{seconds:g}s", frames_apart(count, frames)), (f"{metres:g}m", metres_apart(matches.truth, metres)))
+    for name, pairs in spans:
+        if not len(pairs[0]):
+            continue
+        translations, rotations = _relative_error(matches, pairs)
+        figures[f"rpe_{name}_rmse_m"] = _rmse(translations)
+        figures[f"rpe_{name}_rmse_deg"] = _rmse(rotations)
     return figures
+
+
+def frames_apart(count: int, frames: int) -> Pairs:
+    """All pairs of `count` poses that are so many frames apart."""
+    first = np.arange(max(0, count - frames))
+    return first, first + frames
+
+
+def metres_apart(trajectory: Trajectory, metres: float) -> Pairs:
+    """For each pose the later one at `metres` along the path, as near as there is within `SPAN_TOLERANCE` of it."""
+    steps = np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1)
+    travelled = np.concatenate(([0.0], np.cumsum(steps)))
+    first, second = [], []
+    for i in range(len(travelled) - 1):
+        distances = travelled[i + 1 :] - travelled[i]
+        nearest = int(np.argmin(np.abs(distances - metres)))
+        if abs(distances[nearest] - metres) <= metres * SPAN_TOLERANCE:
+            first.append(i)
+            second.append(i + 1 + nearest)
+    return np.array(first, np.intp), np.array(second, np.intp)
+
+
+def _relative_error(matches: Matches, pairs: Pairs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Length (m) and angle (deg) of (Q₁⁻¹ Q₂)⁻¹ (P₁⁻¹ P₂) for each pair of the truth Q and the estimate P."""
+    turned, moved = _motions(matches.estimate, pairs)
+    truly_turned, truly_moved = _motions(matches.truth, pairs)
+    translations = np.linalg.norm(moved - truly_moved, axis=1)  # a rotation before it changes no length
+    return translations, np.degrees((truly_turned.inv() * turned).magnitude())
+
+
+def _motions(trajectory: Trajectory, pairs: Pairs) -> tuple[Rotation, NDArray[np.float64]]:
+    """Rotation and translation from the first to the second pose of each pair, in the first's own frame."""
+    first, second = pairs
+    positions = np.array(trajectory.positions)
+    rotations = Rotation.from_quat(np.array(trajectory.orientations))
+    back = rotations[first].inv()
+    return back * rotations[second], back.apply(positions[second] - positions[first])
+
+
+def _rmse(errors: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.square(errors).mean()))
 
 
 def path_length(trajectory: Trajectory) -> float:
@@ -132,14 +189,3 @@ def path_length(trajectory: Trajectory) -> float:
     if len(trajectory) < 2:
         return 0.0
     return float(np.linalg.norm(np.diff(trajectory.positions, axis=0), axis=1).sum())
-
-
-def _evo(trajectory: Trajectory) -> PoseTrajectory3D:
-    from evo.core.trajectory import PoseTrajectory3D
-
-    start = trajectory.stamps[0]
-    return PoseTrajectory3D(
-        positions_xyz=np.array(trajectory.positions),
-        orientations_quat_wxyz=np.roll(np.array(trajectory.orientations), 1, axis=1),
-        timestamps=np.array([(stamp - start) * 1e-9 for stamp in trajectory.stamps]),
-    )

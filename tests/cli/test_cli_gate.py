@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 from xml.etree import ElementTree
@@ -58,6 +59,13 @@ def test_a_folder_of_recordings_passes_with_a_row_each(dataflow, folder: Path) -
     assert "2 of 2 recordings passed" in told
     for name in ("first.mcap", "deep/second.mcap"):
         assert any(line.split()[:2] == [name, "identical"] for line in told.splitlines())
+
+
+def test_both_times_are_told_and_options_that_are_gone_are_noted(dataflow, folder: Path) -> None:
+    outcome = dataflow("verify", folder / "recordings" / "first.mcap", "--process-each", "-q")
+
+    assert re.search(r"× real time \([\d.]+ s in all\)", " ".join(outcome.stdout.split()))
+    assert "--process-each is deprecated" in outcome.stderr
 
 
 def test_a_broken_file_ends_with_2_and_the_others_are_verified_all_the_same(
@@ -243,6 +251,10 @@ def test_a_recording_of_sources_alone_holds_nothing_to_verify(
         (["--baseline", "b.yaml"], "ends in .json"),
         (["--junit", "v.txt"], "ends in .xml"),
         (["--tolerance", "-1"], "0 or more"),
+        (["--jobs", "0"], "--jobs 0: expected 1 to"),
+        (["--jobs", "2"], "--jobs 2: expected 1 to 1024, without --one-process"),
+        (["--process-each"], "--one-process and --process-each exclude each other"),
+        (["--start", "1", "--baseline", "b.json"], "--start and --baseline exclude each other"),
         (["--start", "nan"], "--start nan: expected seconds"),
         (["--start", "inf"], "--start inf: expected seconds"),
         (["--start", "-1"], "--start -1: expected seconds"),

@@ -146,7 +146,6 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
         drops={"camera": (("", "past", 7),), "trajectory_metrics": (("ground_truth", "unmatched", 1_000),)},
         summaries={"trajectory_metrics": {"ate_rmse_m": 0.0123, "ate": "not computed: " + "too few poses " * 12}},
         transport={},
-        verifications=(),
         files={"@recorder": {"path": "out/run.mcap", "messages": 1, "bytes": 5_000_000}},
         first=0,
         last=10**10,

@@ -158,9 +158,9 @@ def test_files_that_are_no_recordings_are_refused_with_the_reason(dataflow, smal
 
 @pytest.fixture(scope="module")
 def damaged(recorded, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording with one wrong byte in a compressed chunk."""
+    """A recording with one wrong byte in a compressed chunk of messages; the first chunk holds firing records."""
     data = bytearray(recorded[0].read_bytes())
-    data[data.index(ZSTD) + 100] ^= 0xFF
+    data[data.index(ZSTD, data.index(ZSTD) + 1) + 100] ^= 0xFF
     path = tmp_path_factory.mktemp("damaged") / "damaged.mcap"
     path.write_bytes(data)
     return path

@@ -18,10 +18,10 @@ from dataflow.client.attach import find_running
 from dataflow.client.processes import HostStatus
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import LiveSupervisor
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
+from dataflow.supervision.supervisor import Supervisor
 from dataflow.sync import NEVER
 
 GRAPH = """\
@@ -43,14 +43,14 @@ class Background:
         path.write_text(GRAPH)
         self.recording = folder / "run.mcap"
         graph = load_graph(path, live=True)
-        self.supervisor = LiveSupervisor(RunPlan(graph, live=True, record=self.recording))
+        self.supervisor = Supervisor(RunPlan(graph, live=True, record=self.recording))
         self.reports: list[RunReport] = []
         self.thread = threading.Thread(target=lambda: self.reports.append(self.supervisor.run()))
         self.thread.start()
         find_running("tunable", wait=30)
 
     def process_of(self, label: str) -> psutil.Process:
-        return psutil.Process(self.supervisor._processes[label].child.pid)
+        return psutil.Process(self.supervisor.pid_of(label))
 
     def end(self) -> RunReport:
         self.supervisor.stop()

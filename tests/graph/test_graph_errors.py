@@ -356,6 +356,21 @@ CASES = {
         "4:20: listen: '192.168.1.2:7447' is no Zenoh endpoint",
         "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447",
     ),
+    "no_port": (
+        HEAD + "network: {listen: [tcp/nohost]}\n",
+        "4:20: listen: 'tcp/nohost' has no port from 0 to 65535",
+        "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447",
+    ),
+    "port_too_large": (
+        HEAD + "network: {connect: ['tcp/robot:99999']}\n",
+        "4:21: connect: 'tcp/robot:99999' has no port from 0 to 65535",
+        "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447",
+    ),
+    "ipv6_without_brackets": (
+        HEAD + "network: {connect: ['tcp/fe80::1:7447']}\n",
+        "4:21: connect: 'tcp/fe80::1:7447' has an IPv6 address without [ ]",
+        "protocol/address:port, such as tcp/192.168.1.2:7447 or tls/robot1.local:7447",
+    ),
     "zenoh_refuses": (
         HEAD + "network: {tls: {listen_certificat: a}}\n",
         "4:16: tls: Zenoh refuses it: unknown field `listen_certificat`",

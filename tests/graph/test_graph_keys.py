@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
+from pathlib import Path
 
 import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.graph.keys import canonical, key_fault, matching, name_fault
+from dataflow.graph.keys import canonical, intersect, key_fault, matching, may_reach, name_fault
 
 CHUNKS = st.sampled_from(["a", "b", "ab", "ba", "*", "**", "$*", "a$*", "$*b", "a$*b", "$*a$*"])
 PATTERNS = st.lists(CHUNKS, min_size=1, max_size=4).map("/".join)
+# Zenoh itself panics over a part such as "a$*$*b".
+ANY_PATTERNS = st.lists(CHUNKS | st.sampled_from(["$*$*", "$*a$*b$*", "@", "@a", "aa"]), min_size=1, max_size=6).map(
+    "/".join
+)
 KEYS = st.lists(st.sampled_from(["a", "b", "ab", "aab", "ba", "@"]), min_size=1, max_size=4).map("/".join)
 
 
@@ -36,6 +43,27 @@ def brute_force(pattern: str, key: str) -> bool:
 def test_matching_is_by_definition_of_the_wildcards(pattern: str, keys: list[str]) -> None:
     assert key_fault(pattern) is None
     assert matching(canonical(pattern), keys) == sorted(key for key in keys if brute_force(pattern, key))
+
+
+@settings(max_examples=800, deadline=None)
+@given(ANY_PATTERNS, ANY_PATTERNS)
+def test_two_expressions_meet_and_are_spelled_as_zenoh_says(one: str, other: str) -> None:
+    theirs = [zenoh.KeyExpr.autocanonize(key) for key in (one, other)]
+    assert [canonical(one), canonical(other)] == [str(key) for key in theirs]
+    assert intersect(canonical(one), canonical(other)) == theirs[0].intersects(theirs[1])
+    assert may_reach(canonical(one), "a/b") == theirs[0].intersects(zenoh.KeyExpr("a/b/**"))
+
+
+def test_a_graph_loads_without_the_network_library() -> None:
+    graph = (
+        "graph: g\nrecord: {topics: ['*/image']}\noperators: {camera: {use: graph_operators:Camera}}\n"
+        "network: {listen: ['tcp/127.0.0.1:7447']}\n"
+    )
+    program = (
+        f"import sys; sys.path.insert(0, {str(Path(__file__).parent)!r}); from dataflow.graph import load_text; "
+        f"load_text({graph!r}); assert 'zenoh' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @settings(max_examples=400, deadline=None)

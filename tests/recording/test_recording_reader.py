@@ -19,9 +19,10 @@ from mcap.writer import CompressionType, IndexType, Writer
 
 from dataflow.messages import CompressedImage, DepthImage, Image, Pose, Transforms
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, index, register_decoder
+from dataflow.recording import ForeignDecoder, Recording, RecordingError, RecordingWriter, chunks, register_decoder
 from dataflow.recording.codecs import SchemaText, build
 from dataflow.recording.foxglove import file_descriptor_set
+from dataflow.recording.layout import DIGESTS
 
 once = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 
@@ -116,7 +117,7 @@ def test_digests_are_over_the_message_digests_in_stream_order(
     for message in messages:
         expected.update(message.digest())
     with Recording(record([("a", m) for m in messages])) as recording:
-        assert recording.digests() == recording.written_digests() == {"a": expected.hexdigest()}
+        assert recording.digests() == recording.metadata[DIGESTS] == {"a": expected.hexdigest()}
     with Recording(record([("a", m) for m in messages[:-1]])) as recording:
         assert recording.digests()["a"] != expected.hexdigest()
 
@@ -127,7 +128,7 @@ def test_chunks_that_do_not_stay_in_memory_are_read_again(
     """Streams written one after the other: the merge goes to and fro between distant chunks."""
     rows = [(n, Image(stamp=i, frame=n, data=noise(i, 20, 20))) for n in "abcd" for i in range(12)]
     path = record(rows, chunk_bytes=1000)
-    monkeypatch.setattr(index, "CACHE_BYTES", 2500)
+    monkeypatch.setattr(chunks, "CACHE_BYTES", 2500)
     with Recording(path) as recording:
         got = [(m.stamp, m.stream, m.message) for m in recording.messages()]
     assert got == sorted(((m.stamp, n, m) for n, m in rows), key=lambda row: row[:2])

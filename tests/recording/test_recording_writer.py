@@ -16,7 +16,7 @@ import pytest
 from mcap.reader import make_reader
 
 from dataflow.messages import Image, Pose
-from dataflow.recording import Recording, RecordingError, RecordingWriter
+from dataflow.recording import Recording, RecordingError, RecordingWriter, container
 
 WRITE_UNTIL_KILLED = """
 import sys, numpy as np
@@ -255,6 +255,71 @@ def test_firings_events_and_metadata_come_back(tmp_path: Path, pose: Callable[..
     with path.open("rb") as file:
         topics = {c.topic for _, c, _ in make_reader(file).iter_messages()}
     assert topics == {"robot1/a/pose", "robot1/@/firings/a", "robot1/@/firings/b", "robot1/@/events"}
+
+
+def test_firing_records_and_events_lie_apart_from_the_messages(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={}, chunk_bytes=500) as writer:
+        writer.add_stream("a/out/pose", Pose)
+        for seq in range(40):
+            writer.write("a/out/pose", pose(seq + 1), seq=seq)
+            writer.write_firings(f"op{seq % 3}", seq + 1, bytes([seq]))
+            if seq % 10 == 0:
+                writer.write_event("gap", seq + 1, {})
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    kinds = {c.id: c.metadata["kind"] for c in summary.channels.values()}
+    held = [{kinds[channel] for channel in index.message_index_offsets} for index in summary.chunk_indexes]
+    assert len(held) > 6
+    assert all(kinds == {"stream"} or kinds <= {"firings", "events"} for kinds in held)
+    data = bytearray(path.read_bytes())
+    for index, kinds_of_chunk in zip(summary.chunk_indexes, held, strict=True):
+        if kinds_of_chunk == {"stream"}:
+            data[index.chunk_start_offset + index.chunk_length - 1] ^= 1
+    path.write_bytes(data)
+    with Recording(path) as recording:  # read without the chunks of messages, which are destroyed
+        assert list(recording.firings()) == [(f"op{seq % 3}", bytes([seq])) for seq in range(40)]
+        assert [e.stamp for e in recording.events()] == [1, 11, 21, 31]
+        with pytest.raises(RecordingError, match="chunk"):
+            list(recording.messages())
+
+
+def test_a_recording_cut_anywhere_holds_no_message_without_the_record_before_it(
+    tmp_path: Path, pose: Callable[..., Pose]
+) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={}, chunk_bytes=600) as writer:
+        writer.add_stream("a/out/pose", Pose)
+        for seq in range(60):
+            writer.write_firings("a", seq + 1, bytes([seq]))
+            writer.write("a/out/pose", pose(seq + 1), seq=seq)
+    whole = path.read_bytes()
+    for cut in range(8, len(whole), 97):
+        path.write_bytes(whole[:cut])
+        with Recording(path) as recording:
+            records = [payload[0] for _, payload in recording.firings()]
+            messages = [m.seq for m in recording.messages()]
+        assert records == list(range(len(records)))
+        assert messages == list(range(len(messages)))
+        assert len(messages) <= len(records)
+
+
+def test_a_message_that_readers_would_refuse_is_refused(
+    tmp_path: Path, noise: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(container, "MAX_CHUNK_BYTES", 10_000)
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, metadata={}) as writer:
+        writer.add_stream("a", Image)
+        for seq in range(9):
+            writer.write("a", Image(stamp=seq, frame="c", data=noise(seq, 60, 60)), seq=seq)
+        with pytest.raises(RecordingError, match=r"a message of \d+ bytes; at most 10000 are recorded"):
+            writer.write("a", Image(stamp=10, frame="c", data=noise(0, 200, 200)), seq=10)
+        writer.write("a", Image(stamp=11, frame="c", data=noise(0, 60, 60)), seq=11)
+    with Recording(path) as recording:
+        assert [m.seq for m in recording.messages()] == [*range(9), 11]
+    with path.open("rb") as file:
+        assert max(index.uncompressed_size for index in make_reader(file).get_summary().chunk_indexes) <= 10_000
 
 
 def test_the_same_calls_write_the_same_bytes(record: Callable[..., Path], pose: Callable[..., Pose]) -> None:

@@ -19,7 +19,7 @@ sys.path.append(str(HERE))
 def _no_orphans() -> Iterator[None]:
     """Fails a test after which a child process is left."""
     yield
-    left = [p for p in psutil.Process().children(recursive=True) if "dataflow.supervision" in " ".join(p.cmdline())]
+    left = [p for p in psutil.Process().children(recursive=True) if "-m dataflow." in " ".join(p.cmdline())]
     for process in left:
         process.kill()
     assert not left

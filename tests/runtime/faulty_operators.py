@@ -26,6 +26,25 @@ class Device(Source):
             time.sleep(self.period)
 
 
+class Camera(Device):
+    """A device that is unplugged once, and has to be opened anew."""
+
+    constant: Out[FeatureVector] = Out(static=True)
+    lives = 0
+
+    def setup(self) -> None:
+        type(self).lives += 1
+
+    def static_outputs(self) -> Mapping[str, Message]:
+        return {"constant": value(0, 42.0)}
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for k, step in enumerate(super().stream()):
+            if k == 30 and self.lives == 1:
+                raise OSError("no such device")
+            yield step
+
+
 class Resets(Operator):
     """Adds up since the last jump of the clock, and counts the jumps."""
 

@@ -30,6 +30,20 @@ def nap(seconds: float) -> None:
         time.sleep(int.from_bytes(os.urandom(2)) / 65535 * seconds)
 
 
+def daemon() -> None:
+    """Leaves a process in a session of its own, whose parent ends at once; it keeps everything open that this has."""
+    child = os.fork()
+    if child:
+        os.waitpid(child, 0)
+        return
+    os.setsid()
+    if grandchild := os.fork():
+        print(f"left behind: {grandchild}", flush=True)
+        os._exit(0)
+    time.sleep(300)
+    os._exit(0)
+
+
 class Counter(Source):
     """Counts on `fast`; every `ratio`-th step also on `slow`. `padding` numbers make the messages large."""
 
@@ -149,7 +163,7 @@ class Broken(Operator):
     x: In[FeatureVector]
     y: Out[FeatureVector]
     at: int = Param(20, doc="the number at which it fails")
-    how: str = Param("raise", doc="raise, die, hang, stamp, type, mutate, chatter, exit or children")
+    how: str = Param("raise", doc="raise, die, hang, stamp, type, mutate, chatter, exit, children or daemon")
 
     def process(self, x: FeatureVector) -> FeatureVector:
         if number(x) == self.at:
@@ -174,6 +188,8 @@ class Broken(Operator):
                 case "children":
                     left = subprocess.Popen(["sleep", "300"])
                     print(f"left behind: {left.pid}", flush=True)
+                case "daemon":
+                    daemon()
         return value(x.stamp, number(x))
 
 

@@ -11,7 +11,7 @@ from dataflow.graph import load_graph
 from dataflow.messages import Diagnostics
 from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
 

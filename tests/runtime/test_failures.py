@@ -16,8 +16,7 @@ from tests_runtime_graphs import chain
 
 from dataflow.graph import Graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import supervisor_of
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.supervisor import Supervisor
@@ -79,6 +78,18 @@ def test_what_operators_start_ends_with_their_host_and_holds_nobody_up() -> None
     while psutil.pid_exists(left) and psutil.Process(left).status() != psutil.STATUS_ZOMBIE:
         assert time.monotonic() < deadline, "a child of an operator outlived the run"
         time.sleep(0.02)
+
+
+def test_a_daemon_that_an_operator_leaves_is_named_and_ends_with_its_host() -> None:
+    lines: list[str] = []
+
+    report = Supervisor(RunPlan(broken("daemon")), on_output=lambda label, line: lines.append(line)).run()
+
+    left = int(next(line for line in lines if "left behind" in line).rpartition(" ")[2])
+    (note,) = report.notes
+    assert note.startswith("host 'bad' left processes behind, which were killed: ")
+    assert note.endswith(f"(process {left})")
+    assert not psutil.pid_exists(left)
 
 
 def test_a_source_that_is_stopped_runs_its_finally(tmp_path: Path) -> None:
@@ -160,7 +171,7 @@ def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: st
     )
 
     with pytest.raises(RunFailed):
-        supervisor_of(RunPlan(graph, record=path, placement="host_each", live=live)).run()
+        Supervisor(RunPlan(graph, record=path, placement="host_each", live=live)).run()
 
     lost = unexplained(path)
     assert {"test/left/fast", "test/bad/y", "test/smooth/mean", "test/merge/seen"} <= set(lost)
@@ -182,7 +193,11 @@ class Running:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "dataflow.cli.main", *arguments],
             cwd=cwd,
-            env={**os.environ, "PYTHONPATH": str(HERE), "XDG_RUNTIME_DIR": str(cwd)},
+            env={
+                **os.environ,
+                "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent.parent)]),
+                "XDG_RUNTIME_DIR": str(cwd),
+            },
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -14,8 +14,8 @@ from dataflow.graph import Graph, load_graph
 from dataflow.messages import Diagnostics
 from dataflow.names import diagnostics_key
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision import live
+from dataflow.records.reading import recorded_firings
+from dataflow.supervision import heartbeats
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import run
 from dataflow.verification.verify import verify
@@ -192,7 +192,7 @@ SMALL = {"window": (8, 64 << 20)}
 def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
     placement: str, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     graph = robot(HANGS.format("queue: newest, size: 1"), count=1000)
 
     with pytest.raises(
@@ -206,7 +206,7 @@ def test_a_hang_without_a_deadline_ends_the_run_when_too_much_waits_for_it(
 
 
 def test_a_hang_without_a_deadline_is_ended_by_its_restart_policy(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live, "HUNG_AFTER", 1.0)
+    monkeypatch.setattr(heartbeats, "HUNG_AFTER", 1.0)
     ran = Ran(robot(HANGS.format(f"queue: newest, size: 1, {AGAIN}"), count=400), path, **SMALL)
 
     assert ran.report.restarts == {"bad": 1}
@@ -332,6 +332,20 @@ def test_what_a_process_dropped_before_it_was_killed_stays_counted(path: Path) -
     assert ran.is_repeated()
 
 
+def test_a_source_slower_than_the_clock_is_said_at_once_and_at_the_end(path: Path) -> None:
+    graph = graph_of(
+        "left: {use: runtime_operators:Counter, params: {count: 40, sleep: 0.15}}",
+        "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {size: 1000}}",
+    )
+
+    ran = Ran(graph, path)
+
+    (event,) = ran.events("behind")
+    assert event.startswith("source 'left' has fallen behind the clock: reading it waits")
+    assert ran.report.notes[-1].startswith("source 'left' was ")
+    assert "s behind the clock at the end" in ran.report.notes[-1]
+
+
 def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(path: Path) -> None:
     graph = robot("resets: {use: faulty_operators:Resets, inputs: {x: left/fast}}")
 
@@ -364,10 +378,10 @@ def test_a_message_with_a_stamp_in_the_past_is_dropped_and_counted(path: Path) -
     assert ran.is_repeated()
 
 
-def test_a_malformed_message_on_a_key_is_dropped_and_counted(path: Path) -> None:
+def test_a_malformed_message_from_outside_is_dropped_and_counted(path: Path) -> None:
     ran = Ran(robot(SMOOTH), path, {"kind": "malformed", "operator": "left", "at": "300ms"})
 
-    assert ran.report.transport["smooth"]["malformed"] >= 1
+    assert ran.report.transport["smooth"]["foreign"] >= 1
     assert len(ran.numbers("test/left/fast")) == 100
     assert ran.is_repeated()
 
@@ -383,3 +397,30 @@ def test_a_device_runs_by_the_clock_and_is_repeated(path: Path) -> None:
     assert ran.report.restarts == {"device": 1}
     assert [i for i, kind in ran.kinds("device") if kind == "setup"] == [0, 1]
     assert ran.is_repeated()
+
+
+def test_a_source_that_raises_is_made_anew_in_the_same_process(path: Path) -> None:
+    graph = graph_of(
+        f"camera: {{use: faulty_operators:Camera, live: {{{AGAIN}}}}}",
+        "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}",
+        "other: {use: faulty_operators:Fallback, inputs: {x: camera/count, other: camera/constant}}",
+    )
+
+    ran = Ran(graph, path)
+
+    assert ran.report.restarts == {"camera": 1}
+    assert "operator 'camera' failed in stream() after stamp " in ran.events("restart")[0]
+    assert "OSError: no such device; made anew in 0.02 s" in ran.events("restart")[0]
+    assert [i for i, kind in ran.kinds("camera") if kind == "setup"] == [0, 1]
+    assert len(ran.numbers("test/resets/y")) == 130
+    assert {row[1] for row in ran.numbers("test/other/y")} == {42.0}
+    assert ran.is_repeated()
+
+
+def test_without_a_policy_a_source_that_raises_ends_the_run(path: Path) -> None:
+    graph = graph_of(
+        "camera: {use: faulty_operators:Camera}", "resets: {use: faulty_operators:Resets, inputs: {x: camera/count}}"
+    )
+
+    with pytest.raises(RunFailed, match=r"'camera' failed in stream\(\) after stamp \d+: OSError: no such device"):
+        Ran(graph, path)

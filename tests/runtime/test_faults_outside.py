@@ -8,7 +8,6 @@ import select
 import shutil
 import signal
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -23,10 +22,10 @@ from background_run import Background
 from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
-from dataflow.supervision.live import LiveSupervisor
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
+from dataflow.supervision.supervisor import Supervisor
 from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
@@ -145,13 +144,14 @@ def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
 
 
 class Link:
-    """A wire between two hosts, for a test to cut: a TCP proxy on loopback in front of `endpoint`."""
+    """A wire between two hosts, for a test to cut: a proxy in front of `endpoint`, a Unix socket."""
 
     def __init__(self, endpoint: str) -> None:
-        address, _, port = endpoint.removeprefix("tcp/").rpartition(":")
-        self._to = (address, int(port))
-        self._server = socket.create_server(("127.0.0.1", 0))
-        self.endpoint = f"tcp/127.0.0.1:{self._server.getsockname()[1]}"
+        self._to = endpoint.removeprefix("unixsock-stream/")
+        self._server = socket.socket(socket.AF_UNIX)
+        self._server.bind(f"{self._to}.wire")
+        self._server.listen()
+        self.endpoint = f"{endpoint}.wire"
         self.whole = True
         self.carried = 0
         self.cuts = 0
@@ -176,7 +176,8 @@ class Link:
         try:
             if not self.whole:
                 raise ConnectionError("the wire is cut")
-            far = socket.create_connection(self._to, timeout=5)
+            far = socket.socket(socket.AF_UNIX)
+            far.connect(self._to)
         except OSError:  # nobody is there (any more)
             near.close()
         else:
@@ -196,7 +197,6 @@ class Link:
     def _close(self, end: socket.socket) -> None:
         for each in (end, self._pairs.pop(end)):
             self._pairs.pop(each, None)
-            each.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # reset, as a lost peer is
             each.close()
 
     def _drop(self) -> None:
@@ -220,22 +220,12 @@ def links() -> Iterator[list[Link]]:
         link.end()
 
 
-def run_with_a_cut(
-    label: str, graph: Graph, path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
-) -> RunReport:
+def run_with_a_cut(label: str, graph: Graph, path: Path, links: list[Link]) -> RunReport:
     """A live run, a host each, in which every link to the process `label` is cut for half a second."""
-    spawn = LiveSupervisor._spawn
-
-    def through_a_link(
-        self: LiveSupervisor, spawned: str, nodes: tuple[str, ...], kind: str, config: dict[str, Any]
-    ) -> None:
-        if spawned == label:
-            links.extend(Link(endpoint) for endpoint in config["connect"])
-            config = {**config, "connect": [link.endpoint for link in links]}
-        spawn(self, spawned, nodes, kind, config)
-
-    monkeypatch.setattr(LiveSupervisor, "_spawn", through_a_link)
-    supervisor = LiveSupervisor(RunPlan(graph, live=True, placement="host_each", record=path))
+    supervisor = Supervisor(RunPlan(graph, live=True, placement="host_each", record=path))
+    _, config = supervisor.core.run.configs[label]
+    links.extend(Link(endpoint) for endpoint in config["connect"])
+    config["connect"] = [link.endpoint for link in links]
     reports: list[RunReport] = []
     thread = threading.Thread(target=lambda: reports.append(supervisor.run()))
     thread.start()
@@ -260,12 +250,12 @@ def gaps_in(path: Path) -> list[Mapping[str, Any]]:
 
 
 def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor_the_proof(
-    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, links: list[Link]
 ) -> None:
     """The link from `left` to `smooth`; everything else stays connected."""
     graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
 
-    report = run_with_a_cut("smooth", graph, path, links, monkeypatch)
+    report = run_with_a_cut("smooth", graph, path, links)
 
     assert report.summaries["sum"]["count"] == 300  # whose link was whole
     gaps = gaps_in(path)
@@ -277,11 +267,11 @@ def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor
 
 
 def test_a_recorder_that_was_cut_off_has_every_firing_record_and_its_gaps_are_said(
-    tmp_path: Path, links: list[Link], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, links: list[Link]
 ) -> None:
     graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
 
-    run_with_a_cut("@recorder", graph, path, links, monkeypatch)
+    run_with_a_cut("@recorder", graph, path, links)
 
     assert {gap["taker"] for gap in gaps_in(path)} == {"@recorder"}
     with Recording(path) as recording:

@@ -9,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.records.firing import (
-    DropRecord,
     Emission,
     FiringRecord,
     FiringRecordError,
@@ -20,6 +19,7 @@ from dataflow.sync import (
     Aligner,
     AlignSpec,
     BatchSpec,
+    Drop,
     Entry,
     Firing,
     MessageRef,
@@ -47,12 +47,12 @@ emissions = st.one_of(
     st.none(), st.builds(Emission, numbers, st.integers(0, 2**60), st.binary(min_size=16, max_size=16))
 )
 drops = st.builds(
-    DropRecord,
+    Drop,
     names,
     names,
-    st.integers(0, 9),
-    numbers,
     st.integers(0, 2**60),
+    numbers,
+    st.integers(0, 9),
     st.sampled_from(["late", "unused"]),
     names,
 )

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from dataflow.reexecution.recorded import Difference, Verification
+from dataflow.records.comparison import Difference, Verification
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
 from dataflow.verification.compare import OutputComparison
@@ -20,7 +22,8 @@ from dataflow.verification.gate import (
     judge,
     recordings_in,
 )
-from dataflow.verification.verify import VerifyReport
+from dataflow.verification.report import VerifyReport
+from dataflow.verification.stored import StoredStream
 
 Outcomes = dict[str, str | None]
 """Operator → what came out otherwise (any word), None for nothing."""
@@ -36,8 +39,7 @@ def report(outcomes: Outcomes, producers: Mapping[str, set[str]], *, culprits: s
             v.first = Difference(4, "fire", 400, "out", "recorded", got)
             fault = culprits is None or name in culprits
             v.tainted = None if fault else 1
-            if hasattr(v, "own_fault"):
-                v.own_fault = fault
+            v.own_fault = fault
         made.append(v)
     return VerifyReport(
         operators=tuple(made),
@@ -68,6 +70,80 @@ def test_without_a_baseline_the_verdicts_are_those_of_verification() -> None:
     found = judge(report({"a": None, "b": "x", "c": "y"}, CHAIN, culprits={"b"}), {})
 
     assert verdicts(found) == {"a": "identical", "b": "culprit", "c": "downstream"}
+
+
+def table() -> list[tuple[str, str, str, str]]:
+    """The rows of the truth table in the docstring of `judge`: what is here, what is accepted, what else, verdict."""
+    rows = [line.strip().strip("|").split("|") for line in (judge.__doc__ or "").splitlines() if "|" in line]
+    return [(here.strip(), known.strip(), also.strip(), verdict.strip()) for here, known, also, verdict in rows[2:]]
+
+
+Case = dict[str, str | bool]
+
+
+def applies(row: tuple[str, str, str, str], case: Case) -> bool:
+    """Whether a row of the table applies to a case, by its words."""
+    here, known, also, _ = row
+    recorded, made = case["here"] == "as recorded", case["here"]
+    heres = {
+        "as recorded": recorded,
+        "as recorded, or within tolerance": recorded or made == "within tolerance",
+        "otherwise": made in ("own", "led"),
+        "otherwise, given what was recorded": made == "own",
+        "otherwise, given something else": made == "led",
+    }
+    accepts = {
+        "": True,
+        "anything": True,
+        "another outcome": case["accepted"] == "another",
+        "that outcome": case["accepted"] == "that",
+        "another, or none": case["accepted"] in ("another", "nothing"),
+        "something, for any operator": case["accepted"] != "nothing",
+    }
+    others = {
+        "": True,
+        "whole": bool(case["whole"]),
+        "not whole": not case["whole"],
+        "a stored message differs from its record": bool(case["changed"]),
+        "not led astray": not case["astray"],
+    }
+    return heres[here] and accepts[known] and others[also]
+
+
+def test_the_verdict_is_that_of_the_first_row_of_the_table_that_applies() -> None:
+    met = set()
+    for made, known, whole, changed, astray in itertools.product(
+        ("as recorded", "within tolerance", "own", "led"),
+        ("nothing", "another", "that"),
+        (True, False),
+        (True, False),
+        (True, False),
+    ):
+        if known == "that" and made not in ("own", "led"):
+            continue
+        case: Case = {"here": made, "accepted": known, "whole": whole, "changed": changed, "astray": astray}
+        differs = made != "as recorded"
+        outcome = report(
+            {"a": "new" if astray else None, "b": "x" if differs else None},
+            {"b": {"a"}},
+            culprits={"a", "b"} if made == "own" else {"a"},
+        )
+        b = outcome.operators[1]
+        b.unverifiable = 0 if whole else 1
+        if made == "within tolerance":
+            outcome = replace(outcome, tolerance=1.0, comparisons={"b": OutputComparison("b", within=3)})
+        elif changed:
+            outcome = replace(outcome, stored=(StoredStream("b/out", "b", changed=1, first_changed=(0, 4)),))
+        baseline = accepted({"b": "x" if known == "that" else "y"}, {}) if known != "nothing" else {}
+
+        [row, *_] = [row for row in table() if applies(row, case)]
+        expected = made if row[3] == "identical, within tolerance" else row[3]
+        expected = "identical" if expected == "as recorded" else expected
+        found = next(j.verdict for j in judge(outcome, baseline) if j.operator == "b")  # type: ignore[arg-type]
+
+        assert found == expected, (case, row)
+        met.add(row)
+    assert met == set(table())
 
 
 def test_what_was_accepted_passes_and_only_that() -> None:
@@ -148,10 +224,7 @@ def test_an_accepted_outcome_does_not_pass_where_it_could_not_be_repeated_in_par
 
 def test_what_follows_from_an_operator_that_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
     made = report({"a": "x", "b": "y", "c": None}, CHAIN, culprits={"a"})
-    made = VerifyReport(
-        **{name: getattr(made, name) for name in made.__dataclass_fields__ if name != "comparisons"},
-        comparisons={"a": OutputComparison("a", index=4, got="z")},
-    )
+    made = replace(made, repeated={"a": False})
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
 
     assert Baseline(tmp_path / "b.json").accept(one) == ([], ["a", "b"])
@@ -159,10 +232,7 @@ def test_what_follows_from_an_operator_that_is_other_each_time_is_not_accepted(t
 
 def test_what_is_other_each_time_is_not_accepted(tmp_path: Path) -> None:
     made = report({"a": "x"}, {})
-    made = VerifyReport(
-        **{name: getattr(made, name) for name in made.__dataclass_fields__ if name != "comparisons"},
-        comparisons={"a": OutputComparison("a", index=4, got="y")},
-    )
+    made = replace(made, repeated={"a": False})
     one = Checked(tmp_path / "r.mcap", "r", made, judge(made, {}))
 
     assert Baseline(tmp_path / "b.json").accept(one) == ([], ["a"])

@@ -11,12 +11,15 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.layout import OUTCOME, RESERVED_METADATA
-from dataflow.records.firing import FiringRecord, consecutive, encode_batch
-from dataflow.reexecution.recorded import Verification, recorded_firings
-from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.records.comparison import Verification
+from dataflow.records.firing import FiringRecord, Kind, consecutive, encode_batch
+from dataflow.records.reading import FiringLog, recorded_firings
+from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.run import run
 from dataflow.verification.complete import complete
-from dataflow.verification.verify import VerifyReport, verify
+from dataflow.verification.ledger import read_ledger
+from dataflow.verification.report import VerifyReport
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 
@@ -67,7 +70,7 @@ def of(report: VerifyReport, operator: str) -> Verification:
 
 
 def test_a_rewritten_recording_is_as_good_as_the_one_it_was(recorded: Path, tmp_path: Path) -> None:
-    assert verify(rewritten(recorded, tmp_path / "same.mcap"), placement="one_host").identical
+    assert verify(rewritten(recorded, tmp_path / "same.mcap"), jobs=1).identical
 
 
 @pytest.mark.parametrize("thin", [False, True])
@@ -82,7 +85,7 @@ def test_messages_that_no_record_made_show_that_the_last_records_are_lost(
         stored=lambda stream, seq: not thin or stream.startswith(sources),
     )
 
-    report = verify(path, placement="one_host", only=None if thin else "smooth")
+    report = verify(path, jobs=1, only=None if thin else "smooth")
 
     smooth = of(report, "smooth")
     assert not report.identical
@@ -183,7 +186,21 @@ def test_a_sink_is_compared_by_what_it_sums_up(recorded: Path) -> None:
     assert first.kind == "finish"
     assert first.expected.startswith("summary total: ")
     assert fed.culprits == ("merge",)
-    assert of(fed, "sum").verdict == "downstream"
+    assert of(fed, "sum").verdict == "identical"  # given the recorded inputs
+
+
+@pytest.mark.parametrize(("more", "finished"), [(("setup",), True), (("setup", "fire"), False)])
+def test_a_process_that_was_restarted_after_its_operators_had_ended_owes_no_second_end(
+    recorded: Path, more: tuple[Kind, ...], finished: bool
+) -> None:
+    with Recording(recorded) as recording:
+        graph = recorded_graph(recording)
+        known = FiringLog.read(recording)
+        batches = {name: list(known.batches(name)) for name in known.operators}
+        again = [FiringRecord("sum", 1, index, kind, 10**10) for index, kind in enumerate(more)]
+        batches["sum"].append(encode_batch(again))
+        account = read_ledger(recording, graph, FiringLog(batches, "test"), ["sum"]).accounts["sum"]
+    assert account.finished is finished
 
 
 def breaking(folder: Path, use: str, how: str) -> Graph:
@@ -192,7 +209,8 @@ def breaking(folder: Path, use: str, how: str) -> Graph:
     file.write_text(
         "graph: errors\nnamespace: test\noperators:\n"
         "  left: {use: runtime_operators:Counter, params: {count: 40, period: 2000000}}\n"
-        f"  broken: {{use: {use}, params: {{how: {how}}}, inputs: {{x: left/fast}}, live: {{restart: {{max: 3}}}}}}\n"
+        f"  broken: {{use: {use}, params: {{how: {how}}}, inputs: {{x: left/fast}}, "
+        "live: {queue: block, restart: {max: 3}}}\n"
     )
     return load_graph(file, live=True)
 

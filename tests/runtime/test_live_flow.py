@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataflow.feeds.window import Window
 from dataflow.graph import Graph, load_text
-from dataflow.supervision.flow import LiveFlow, sources_upstream, waited_for
+from dataflow.supervision.live_flow import LiveFlow, sources_upstream, waited_for
 from dataflow.sync import FOREVER, NEVER
 
 GRAPH = """

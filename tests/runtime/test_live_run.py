@@ -9,8 +9,9 @@ import pytest
 from dataflow.firing.source import SourceRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
+from dataflow.recording.layout import RUN
 from dataflow.records.firing import FiringRecord
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.supervision.run import run
 from dataflow.sync import Entry
 from dataflow.verification.verify import verify
@@ -27,7 +28,11 @@ def test_a_live_run_with_drops_and_timeouts_is_verified_in_another_placement(pla
 
     reasons = {(op, reason) for op, drops in report.drops.items() for _, reason, _ in drops}
     assert ("slow", "overflow") in reasons
+    waited = {(op, what) for op, waits in report.waits.items() for _, what, _ in waits}
+    assert ("mix", "timeout") in waited
+    assert "timeout" not in {reason for _, reason in reasons}
     with Recording(path) as recording:
+        assert recording.metadata[RUN]["seeding"] == "2"
         overflowed = [d for r in recorded_firings(recording, "slow") for d in r.drops if d.reason == "overflow"]
         assert len(overflowed) == sum(n for _, why, n in report.drops["slow"] if why == "overflow")
     verified = verify(path, placement="one_host" if placement == "host_each" else "host_each")

@@ -9,7 +9,7 @@ import pytest
 from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.reexecution.recorded import recorded_firings
+from dataflow.records.reading import recorded_firings
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
@@ -72,17 +72,17 @@ def test_a_middle_after_a_restart_has_the_parameters_with_which_it_was_started_a
     text = (HERE / "chaos.yaml").read_text().replace("runtime_operators:Tuned", "runtime_operators:TunedAtStart")
     file, path = tmp_path / "chaos.yaml", tmp_path / "run.mcap"
     file.write_text(text)
-    graph = load_graph(file, settings=["count=150"], live=True)
+    graph = load_graph(file, settings=["count=180"], live=True)
     plan = {
         "faults": [
             {"kind": "param", "operator": "tuned", "name": "factor", "values": [3.0], "at": "200ms"},
-            {"kind": "raise", "operator": "tuned", "at": "500ms"},
-            {"kind": "param", "operator": "tuned", "name": "factor", "values": [2.0], "at": "700ms"},
+            {"kind": "raise", "operator": "tuned", "at": "400ms"},
+            {"kind": "param", "operator": "tuned", "name": "factor", "values": [2.0], "at": "1s"},
         ]
     }
     run(graph, live=True, placement="one_host", record=path, faults=plan_of(plan, graph), rate=1.0)
 
-    report = verify(path, start=0.9, only="tuned")
+    report = verify(path, start=1.2, only="tuned")
 
     with Recording(path) as recording:
         kinds = [r.kind for r in recorded_firings(recording, "tuned") if r.kind in ("setup", "param")]

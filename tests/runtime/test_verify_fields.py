@@ -10,12 +10,10 @@ import pytest
 from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, machine_facts
 from dataflow.reexecution.recorded_run import ReplayError
-from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run import run
 from dataflow.verification import verify as verification
-from dataflow.verification.compare import compare_outputs
-from dataflow.verification.verify import VerifyReport, verify
-from dataflow.verification.worker import apart
+from dataflow.verification.report import VerifyReport
+from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
 SETTINGS = ["count=30"]
@@ -35,7 +33,7 @@ def with_smooth(use: str) -> Graph:
 
 
 def verified(recorded: Path, use: str, tolerance: float | None = None) -> VerifyReport:
-    return verify(recorded, graph=with_smooth(f"verified_operators:{use}"), tolerance=tolerance, placement="one_host")
+    return verify(recorded, graph=with_smooth(f"verified_operators:{use}"), tolerance=tolerance, jobs=1)
 
 
 def verdict(report: VerifyReport, operator: str) -> str:
@@ -95,7 +93,7 @@ def test_no_tolerance_covers_messages_where_there_were_none(recorded: Path) -> N
 
     assert verdict(report, "smooth") == "culprit"
     compared = report.comparisons["smooth"]
-    assert (compared.beyond, compared.otherwise > 0) == (0, True)
+    assert (compared.beyond, compared.unpaired > 0) == (0, True)
 
 
 def test_what_only_follows_from_another_is_identical_when_given_the_recorded_inputs(recorded: Path) -> None:
@@ -127,30 +125,6 @@ def test_without_recorded_outputs_only_digests_are_compared_and_it_says_so(tmp_p
     assert not verified(path, "Nudged", tolerance=1.0).within_tolerance
 
 
-def test_the_death_of_an_operator_in_the_second_run_leaves_the_verdict(
-    recorded: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DATAFLOW_TEST_DIE", "1")
-    graph = with_smooth("verified_operators:Dying")
-
-    with pytest.raises(RunFailed, match="ended with code 7"):
-        compare_outputs(recorded, graph, ["smooth"])
-
-
-def test_a_function_apart_gets_its_request_under_the_threads_of_hosts() -> None:
-    answer = apart("apart_functions:describe", {"word": "hello"}, threads=3)
-
-    assert answer == {"word": "hello", "OMP_NUM_THREADS": "3", "PYTHONHASHSEED": "0"}
-
-
-def test_a_function_apart_that_raises_or_hangs_ends_with_its_cause() -> None:
-    with pytest.raises(RunFailed, match="the wheels came off") as raised:
-        apart("apart_functions:fail", {}, threads=1)
-    assert "apart_functions.py" in raised.value.details
-    with pytest.raises(RunFailed, match=r"no progress for 0\.3 s"):
-        apart("apart_functions:hang", {}, threads=1, stall_timeout=0.3)
-
-
 def test_facts_that_differ_from_the_recording_are_named_with_both_values(
     recorded: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -165,7 +139,7 @@ def test_facts_that_differ_from_the_recording_are_named_with_both_values(
 
     monkeypatch.setattr(verification, "machine_facts", elsewhere)
 
-    found = {fact: (then, here) for fact, then, here in verify(recorded, only="sum", placement="one_host").facts}
+    found = {fact: (then, here) for fact, then, here in verify(recorded, only="sum", jobs=1).facts}
 
     assert found["machine cpu_features"][1] == "sse4_2"
     assert found["packages numpy"][1] == "1.0"

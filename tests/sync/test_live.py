@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataflow.sync import (
+    FOREVER,
     Aligner,
     AlignSpec,
     BatchSpec,
@@ -218,15 +219,41 @@ def test_forcing_what_is_waited_for_decides_the_stamp(scenario: Scenario, seed: 
         tell(aligner, step)
         poll_all(aligner)
         waiting = aligner.waiting()
-        static_missing = any(s not in aligner.ends for s in scenario.spec.static)
-        if waiting is None or static_missing or rng.random() < 0.5:
+        if waiting is None or rng.random() < 0.5:
             continue
         assert waiting.needs, "a stamp that waits for nothing is decided"
-        for name, frontier in waiting.needs.items():
-            aligner.force(name, frontier)
+        static_missing = {
+            i.name
+            for i in scenario.spec.inputs
+            if any(s in scenario.spec.static - set(aligner.ends) for s in i.streams)
+        }
+        unforced = {name for name, frontier in waiting.needs.items() if frontier == FOREVER}
+        assert unforced <= static_missing
+        for name in waiting.needs.keys() - unforced:
+            assert aligner.force(name, waiting.needs[name]), "forcing what is needed is news"
+            assert not aligner.force(name, waiting.needs[name]), "once"
         poll_all(aligner)
         after = aligner.waiting()
-        assert after is None or after.stamp > waiting.stamp
+        assert after is None or after.stamp > waiting.stamp or (unforced and set(after.needs) <= static_missing)
+
+
+def test_a_recorded_aligner_holds_only_what_a_later_record_takes() -> None:
+    spec = AlignSpec((A,), (SampledSpec("x", ("x",), required=False, max_age=1),))
+    says: dict[str, list[Step]] = {
+        "a": [("push", "a", e) for e in entries("a", *range(0, 900, 10))],
+        "x": [("push", "x", e) for e in entries("x", *range(5, 900, 10))],
+    }
+    fired = run(spec, interleave(says, random.Random(0)))
+    recorded = RecordedAligner(spec, [refs_of(f) for f in fired])
+
+    for step in says["x"]:
+        tell(recorded, step)  # type: ignore[arg-type]
+    assert recorded.buffered() == {"a": 0, "x": 0}
+    for step in says["a"][: len(fired)]:
+        tell(recorded, step)  # type: ignore[arg-type]
+    assert recorded.buffered() == {"a": len(fired), "x": 0}
+    assert len(poll_all_recorded(recorded)) == len(fired)
+    assert recorded.buffered() == {"a": 0, "x": 0}
 
 
 def test_a_recorded_aligner_says_which_message_it_waits_for() -> None:

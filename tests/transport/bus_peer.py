@@ -8,11 +8,11 @@ import sys
 from typing import Any
 
 import numpy as np
+from transport_envelopes import carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport import (
     Bus,
-    Envelope,
     Kind,
     NetworkConfig,
     TapClient,
@@ -78,9 +78,9 @@ def hold(endpoint: str) -> None:
 
 
 def live(endpoint: str) -> None:
-    """Declares an operator alive and a static stream, then waits to be killed or told to leave."""
-    with Bus(NetworkConfig(listen=(endpoint,))) as bus, bus.alive("robot1", "camera"):
-        bus.declare_static("robot1/camera/info", encode(Envelope.of(depth_image(3, 4), "robot1/camera/info", 0)))
+    """Declares a static stream, then waits to be killed or told to leave."""
+    with Bus(NetworkConfig(listen=(endpoint,))) as bus:
+        bus.declare_static("robot1/camera/info", encode(carrying(depth_image(3, 4), "robot1/camera/info", 0)))
         say(event="up")
         sys.stdin.readline()
 
@@ -94,7 +94,7 @@ def produce(endpoint: str, count: str) -> None:
         while not publisher.shares:
             publisher.probe()
         for i in range(int(count)):
-            publisher.put(Envelope.of(depth_image(i), DEPTH, i))
+            publisher.put(carrying(depth_image(i), DEPTH, i))
         say(event="sent", counters=bus.counters())
         sys.stdin.readline()
 

@@ -17,6 +17,7 @@ import pytest
 
 from dataflow.transport import Bus, NetworkConfig, reserve_endpoints
 
+sys.path.append(str(Path(__file__).parent))
 PEER = Path(__file__).with_name("bus_peer.py")
 WAIT = 30.0
 
@@ -50,6 +51,10 @@ class Peer:
         while not self._lines.empty():
             lines.append(json.loads(self._lines.get()))
         return lines
+
+    def waiting(self) -> bool:
+        """Whether it has said something that nobody has read."""
+        return not self._lines.empty()
 
     def tell(self) -> None:
         """Lets it go on."""
@@ -85,7 +90,7 @@ def peer() -> Iterator[Callable[..., Peer]]:
 
 @pytest.fixture
 def endpoint() -> Iterator[str]:
-    """A free loopback endpoint."""
+    """A free endpoint on this machine."""
     with reserve_endpoints(1) as reserved:
         yield reserved.endpoints[0]
 

@@ -12,10 +12,11 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
+from transport_envelopes import carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport import Bus, DecodeError, Envelope, Kind, decode
-from dataflow.transport.codec import MAGIC, PRELUDE, VERSION
+from dataflow.transport.envelope import MAGIC, PRELUDE, VERSION
 from dataflow.transport.shared import SUPPORTED
 
 pytestmark = pytest.mark.skipif(not SUPPORTED, reason=f"no memfd on {sys.platform}")
@@ -43,7 +44,7 @@ def test_another_process_reads_in_place_and_held_messages_stay_intact(
     eventually(lambda: publisher.shares)
     eventually(lambda: bool(publisher.probe()) and bool(consumer.said()))
     for i in range(200):
-        publisher.put(Envelope.of(depth_image(i), DEPTH, i))
+        publisher.put(carrying(depth_image(i), DEPTH, i))
     publisher.put(Envelope(Kind.END, DEPTH, 0, 200, 199))
     ended = consumer.expect("ended")
     assert [s[1] for s in ended["seen"]] == list(range(201))
@@ -68,7 +69,7 @@ def shared_pair(
 
 
 def send(publisher: Any, inbox: deque[Any], seq: int, eventually: Callable[..., None]) -> Any:
-    publisher.put(Envelope.of(depth_image(seq), DEPTH, seq))
+    publisher.put(carrying(depth_image(seq), DEPTH, seq))
     eventually(lambda: bool(inbox))
     message = decode(inbox.popleft()).message
     assert message is not None
@@ -105,7 +106,7 @@ def test_a_pool_that_nobody_holds_is_cut_anew_for_another_size(
     bus, publisher, inbox = shared_pair
     held = [send(publisher, inbox, seq, eventually) for seq in range(4)]
     held.clear()
-    publisher.put(Envelope.of(depth_image(9, 512), DEPTH, 4))  # 1 MB: fits only where all four were
+    publisher.put(carrying(depth_image(9, 512), DEPTH, 4))  # 1 MB: fits only where all four were
     eventually(lambda: bool(inbox))
     assert decode(inbox.popleft()).message == depth_image(9, 512)
     assert bus.counters()["shared_full"] == 0
@@ -116,7 +117,7 @@ def test_small_messages_and_frontiers_travel_whole_in_the_same_order(
 ) -> None:
     bus, publisher, inbox = shared_pair
     for seq in range(30):
-        publisher.put(Envelope.of(depth_image(2 * seq, 256 if seq % 3 == 0 else 4), DEPTH, seq))
+        publisher.put(carrying(depth_image(2 * seq, 256 if seq % 3 == 0 else 4), DEPTH, seq))
         publisher.put(Envelope(Kind.FRONTIER, DEPTH, 0, seq + 1, 2 * seq + 1))
     eventually(lambda: len(inbox) == 60)
     assert [decode(p).stamp for p in inbox] == list(range(60))
@@ -133,7 +134,7 @@ def test_nothing_is_shared_while_a_consumer_is_not_known_to_share(
         open_bus(connect=(endpoint,), shared_memory=shares).subscribe(DEPTH, inbox.append)
 
     def arrives() -> bool:
-        publisher.put(Envelope.of(depth_image(1), DEPTH, 0))
+        publisher.put(carrying(depth_image(1), DEPTH, 0))
         return all(inboxes)
 
     eventually(arrives)
@@ -147,7 +148,7 @@ def hold_the_whole_pool(publisher: Any, consumer: Any, eventually: Callable[...,
     eventually(lambda: publisher.shares)
     eventually(lambda: bool(publisher.probe()) and bool(consumer.said()))
     for seq in range(3):
-        publisher.put(Envelope.of(depth_image(seq), DEPTH, seq))
+        publisher.put(carrying(depth_image(seq), DEPTH, seq))
         assert consumer.expect("holding")["count"] == seq + 1
     consumer.kill()
     eventually(lambda: not publisher.shares)

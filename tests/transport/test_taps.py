@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from transport_envelopes import carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport import Bus, Envelope, TapClient, TapServer, TapWindow, decode, encode
@@ -22,7 +23,7 @@ SCAN = "robot1/lidar/scan"
 
 def envelope(seq: int, stream: str = DEPTH, side: int = 4) -> Envelope:
     data = np.full((side, side), seq, np.float32)
-    return Envelope.of(DepthImage(stamp=seq, frame="camera", data=data), stream, seq)
+    return carrying(DepthImage(stamp=seq, frame="camera", data=data), stream, seq)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
+from transport_envelopes import carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport import Envelope, Kind, decode, encode
@@ -16,7 +17,7 @@ from dataflow.transport import Envelope, Kind, decode, encode
 STREAM = "robot1/camera/depth"
 DEPTH = DepthImage(stamp=1_700_000_000_123_456_789, frame="camera", data=np.array([[0.5, 1.0], [0.0, 2.0]], np.float32))
 EXAMPLES = {
-    "message": Envelope.of(DEPTH, STREAM, 5, wall=1_700_000_000_125_000_000),
+    "message": carrying(DEPTH, STREAM, 5, wall=1_700_000_000_125_000_000),
     "frontier": Envelope(Kind.FRONTIER, STREAM, 0, 6, 1_700_000_000_156_789_122),
 }
 

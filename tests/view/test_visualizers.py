@@ -14,6 +14,7 @@ from rrd_rows import Row, at, rows
 
 from dataflow import messages
 from dataflow.messages import (
+    Alarm,
     Boxes3D,
     CameraInfo,
     CompressedDepth,
@@ -23,13 +24,19 @@ from dataflow.messages import (
     Image,
     Imu,
     Message,
+    Number,
     OccupancyGrid,
     Odometry,
     PointCloud,
     SegmentationMap,
+    Switch,
+    Text,
     Tracks,
     Transforms,
+    array,
+    scalar,
 )
+from dataflow.messages.declaration import Declaration, generic_type
 from dataflow.view import SceneState, ViewOptions, visualize, visualizers
 from dataflow.view.layout import layout
 
@@ -264,3 +271,61 @@ def test_diagnostics_are_told_when_they_change_and_plotted_by_kind(tmp_path: Pat
     assert [row.values[0] for row in at(found, "/d/d/log", "TextLog:level")] == ["INFO", "ERROR"]
     assert at(found, "/d/d/plot/rate/camera/rate_hz", "Scalars:scalars")[0].values == [30.0]
     assert at(found, "/d/d/plot/latency/camera/latency", "Scalars:scalars")[0].values == [4.5]
+
+
+class Weather(Message, schema="tests.view.Weather"):
+    """A type that nobody wrote a visualiser for."""
+
+    temperature: float = scalar("float", "°C")
+    sky: str = scalar("str", "what it looks like")
+    wind: object = array("float32", "2", "m/s, to the east and to the north")
+    gusts: object = array("float32", "N", "of the last minute, m/s")
+
+
+def test_a_type_without_a_visualiser_is_plotted_and_told(tmp_path: Path) -> None:
+    def weather(t: int, sky: str) -> Weather:
+        return Weather(stamp=STAMP + t, temperature=20.5, sky=sky, wind=[3, 4], gusts=[5, 6, 7])
+
+    found = draw(tmp_path, *[("w/d", weather(t, sky)) for t, sky in enumerate(("grey", "grey", "blue"))])
+    assert at(found, "/w/d/plot/temperature", "Scalars:scalars")[0].values == [20.5]
+    assert at(found, "/w/d/plot/wind", "Scalars:scalars")[0].values == [3.0, 4.0]
+    assert at(found, "/w/d/plot/wind", "SeriesLines:names")[0].values == ["wind 0", "wind 1"]
+    assert [row.values[0] for row in at(found, "/w/d/log", "TextLog:text")] == [
+        "tests.view.Weather sky='grey', gusts: float32[3]",
+        "tests.view.Weather sky='blue', gusts: float32[3]",
+    ]
+
+
+def test_a_type_known_from_a_recording_alone_is_drawn_the_same(tmp_path: Path) -> None:
+    message = Weather(stamp=STAMP, temperature=20.5, sky="grey", wind=[3, 4], gusts=[5])
+    made = generic_type(Declaration.of(Weather))
+    again = made.from_parts(STAMP, message.header(), message.arrays())
+    one, other = ([row for row in draw(tmp_path, ("w/d", m)) if row.entity.startswith("/w")] for m in (again, message))
+    assert one == other != []
+
+
+def test_numbers_and_switches_are_curves_named_for_their_streams(tmp_path: Path) -> None:
+    found = draw(
+        tmp_path,
+        ("robot/tank/level", Number(stamp=STAMP, value=0.5, unit="l")),
+        ("robot/door/open", Switch(stamp=STAMP, on=False)),
+        ("robot/door/open", Switch(stamp=STAMP + 1, on=True)),
+    )
+    assert at(found, "/robot/tank/level/plot/value", "Scalars:scalars")[0].values == [0.5]
+    assert at(found, "/robot/tank/level/plot/value", "SeriesLines:names")[0].values == ["tank/level l"]
+    assert [row.values for row in at(found, "/robot/door/open/plot/on", "Scalars:scalars")] == [[0.0], [1.0]]
+    steps = rr.components.InterpolationMode.StepAfter.value
+    assert at(found, "/robot/door/open/plot/on", "SeriesLines:interpolation_mode")[0].values == [steps]
+
+
+def test_texts_and_alarms_are_lines_of_the_log_with_levels(tmp_path: Path) -> None:
+    levels = ("debug", "info", "warning", "error", "fatal")
+    found = draw(
+        tmp_path,
+        ("a/said", Text(stamp=STAMP, text="hello")),
+        *[("a/alarm", Alarm(stamp=STAMP + i, level=level, name="arm", text="hot")) for i, level in enumerate(levels)],
+    )
+    assert [row.values[0] for row in at(found, "/a/said/log", "TextLog:text")] == ["hello"]
+    assert {row.values[0] for row in at(found, "/a/alarm/log", "TextLog:text")} == {"arm: hot"}
+    shown = [row.values[0] for row in at(found, "/a/alarm/log", "TextLog:level")]
+    assert shown == ["DEBUG", "INFO", "WARN", "ERROR", "CRITICAL"]

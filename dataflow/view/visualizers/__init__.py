@@ -10,6 +10,7 @@ from dataflow.view.visualizers import (
     ranging,
     semantics,
     status,
+    values,
 )
 
-__all__ = ["cameras", "clouds", "fallback", "maps", "objects", "poses", "ranging", "semantics", "status"]
+__all__ = ["cameras", "clouds", "fallback", "maps", "objects", "poses", "ranging", "semantics", "status", "values"]

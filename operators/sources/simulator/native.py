@@ -16,7 +16,8 @@ def open3d() -> ModuleType:
     try:
         return importlib.import_module("open3d")
     except ImportError as error:
-        raise ImportError(f"the simulator casts rays with Open3D, which cannot be imported: {error}") from error
+        hint = 'install it with: pip install "robot-dataflow[sim]" (in a checkout: pip install -e ".[sim]")'
+        raise ImportError(f"the simulator casts rays with Open3D, which cannot be imported: {error}; {hint}") from error
 
 
 def _load_bundled_libusb() -> None:

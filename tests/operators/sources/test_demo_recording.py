@@ -122,4 +122,4 @@ def test_it_is_whole(demo: Recording) -> None:
     held = [name for name, info in demo.streams.items() if info.count]
     assert not demo.torn
     assert len(held) == 16
-    assert demo.digests(held) == {name: demo.written_digests()[name] for name in held}
+    assert demo.digests(held) == {name: demo.metadata["digests"][name] for name in held}

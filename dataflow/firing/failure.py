@@ -1,0 +1,51 @@
+"""Failures of an operator, with what a reader needs to find them."""
+
+from __future__ import annotations
+
+import traceback
+
+RAISED = BaseException
+"""What an operator may raise: it has no right to end its process, whatever it derives its errors from."""
+MOST_OF_A_TRACEBACK = 20_000
+"""Characters of a traceback that are kept."""
+
+
+class OperatorFailure(RuntimeError):
+    """An operator raised or broke its contract. Carries its name, the firing and the operator's own traceback."""
+
+    def __init__(self, operator: str, when: str, error: BaseException) -> None:
+        self.operator, self.when = operator, when
+        self.summary = readable(error)
+        try:
+            self.traceback = cut(_printable("".join(traceback.format_exception(error))), MOST_OF_A_TRACEBACK)
+        except Exception:  # its own text cannot be made
+            self.traceback = "".join(traceback.format_tb(error.__traceback__)) + self.summary
+        super().__init__(f"operator {operator!r} failed in {when}: {self.summary}")
+
+
+class InputMutated(RuntimeError):
+    """An operator changed the memory of a message it was given."""
+
+
+class TooManyTicks(RuntimeError):
+    """The stamps of an operator's inputs jump so far ahead that its timer would fire for hours, or for ever."""
+
+
+def readable(error: BaseException) -> str:
+    """The type and text of an error, whatever it is made of."""
+    try:
+        text = str(error)
+    except Exception as problem:
+        text = f"(its text cannot be made: {type(problem).__name__})"
+    return cut(_printable(f"{type(error).__name__}: {text}" if text else type(error).__name__))
+
+
+def cut(text: str, most: int = 2000) -> str:
+    """The beginning and the end of a text that is longer than `most` characters, with a note of what is left out."""
+    if len(text) <= most:
+        return text
+    return f"{text[: most // 2]} [... {len(text) - most // 2 * 2} characters left out ...] {text[-(most // 2) :]}"
+
+
+def _printable(text: str) -> str:
+    return text.encode(errors="backslashreplace").decode()

@@ -1,0 +1,355 @@
+"""Runs one operator in a live run, where time will not wait for it.
+
+The aligner is the same as in a replay. In front of it stand bounded queues with the operator's declared policy, and a
+clock that gives up waiting: when an input's `wait` has run out, its frontier is forced. All of this only changes which
+messages reach which firing; the firing records say which, so a live run can be repeated exactly.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dataflow.firing.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, dropped
+from dataflow.firing.failure import RAISED, OperatorFailure
+from dataflow.firing.log import FiringLog, unlisted
+from dataflow.firing.ports import Emitter
+from dataflow.firing.restarts import Restarts
+from dataflow.firing.runner import MOST_TICKS, OperatorRunner
+from dataflow.graph.model import Node
+from dataflow.operator import Operator
+from dataflow.sync import NEVER, Aligner, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+
+OWN_CLOCK = 1_000_000_000
+"""A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
+
+Fault = Callable[[Firing], BaseException | None]
+"""A fault on purpose: is asked before each firing, may take its time, and gives an error to fail with instead."""
+
+
+class LiveRunner(OperatorRunner):
+    """One operator in a live run. It outlives its failures as its restart policy allows.
+
+    A failed operator is restarted after the back-off and goes on with what is then in its queues; its streams begin a
+    new incarnation. `on_failure` is told of every failure that is outlived.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        emitter: Emitter,
+        *,
+        static: frozenset[str],
+        seed: int = 0,
+        paranoid: bool = False,
+        operator: Operator | None = None,
+        snapshots: int | None = None,
+        clock: Clock = time.monotonic,
+        event_clock: EventClock = time.time_ns,
+        on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
+        fault: Fault = lambda firing: None,
+    ) -> None:
+        super().__init__(
+            node,
+            emitter,
+            static=static,
+            seed=seed,
+            paranoid=paranoid,
+            operator=operator,
+            lossy=True,
+            snapshots=snapshots,
+        )
+        triggers = {
+            stream: port.name
+            for port in self.spec.triggers
+            for stream in node.inputs.get(port.name, ())
+            if stream not in static
+        }
+        self._log = DropLog()  # of what did not reach an aligner
+        self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
+        self._event_clock = event_clock
+        self._newest, self._shift = NEVER, 0
+        self.patience = Patience(node.live.wait, clock, self._event_time)
+        self.restarts = Restarts(node.live.restart, clock)
+        self._timeouts: Counter[str] = Counter()
+        self._refused: Counter[str] = Counter()
+        self._drops_before: Counter[tuple[str, str]] = Counter()  # of the aligners before a jump of the clock
+        self._late_before: Counter[str] = Counter()
+        self._static = static
+        self._statics: dict[str, Entry] = {}
+        self._on_failure, self._fault = on_failure, fault
+        self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp that the aligner was given
+        self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
+        self._changed: dict[str, Any] = {}
+
+    # Counts
+
+    @property
+    def drops(self) -> Mapping[tuple[str, str], int]:
+        withheld = {(f"→ {port}", "non_monotonic"): n for port, n in self.ports.withheld.items()}
+        return self._drops_before + Counter(self.aligner.drops) + self._log.counts + Counter(withheld)
+
+    @property
+    def timeouts(self) -> Mapping[str, int]:
+        return self._timeouts
+
+    @property
+    def late(self) -> Mapping[str, int]:
+        return self._late_before + Counter(self.aligner.late)
+
+    @property
+    def refused(self) -> Mapping[str, int]:
+        return self._refused
+
+    @property
+    def restarted(self) -> int:
+        return self.restarts.total
+
+    def take_drops(self) -> tuple[list[Drop], Mapping[tuple[str, str], int]]:
+        mine, more = self._log.take(), Counter(self._log.take_unlisted())
+        theirs, others = super().take_drops()
+        return [*mine, *theirs], more + Counter(others)
+
+    # What streams say
+
+    def push(self, stream: str, entry: Entry) -> None:
+        if stream in self._static:
+            self._statics[stream] = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
+        elif entry.incarnation < self._jumped.get(_producer(stream), 0):
+            self._log.add(dropped(self._input_of(stream), stream, entry, "reset"))  # of the time before the jump
+            return
+        else:
+            self._note(stream, entry)
+        if self.restarts.pending:
+            self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away
+        self._arrive(stream, Arrival("message", entry.stamp, entry))
+
+    def _note(self, stream: str, entry: Entry) -> None:
+        incarnation, last = self._seen.get(stream, (entry.incarnation, NEVER))
+        if entry.incarnation > incarnation and entry.stamp <= last and not self.ended:
+            self._reset(stream, entry)
+        self._seen[stream] = (entry.incarnation, entry.stamp)
+        if self._newest == NEVER and abs(entry.stamp - self._event_time()) > OWN_CLOCK:
+            self._shift = entry.stamp - self._event_clock()  # a device whose clock is not this machine's
+        self._newest = max(self._newest, entry.stamp)
+
+    def advance(self, stream: str, frontier: int) -> None:
+        self._arrive(stream, Arrival("frontier", frontier))
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self._arrive(stream, Arrival("end", NEVER if final_stamp is None else final_stamp, None, reason))
+
+    def _arrive(self, stream: str, arrival: Arrival) -> None:
+        if stream in self.queue.triggers:
+            self.queue.put(stream, arrival)
+        else:
+            self._admit(stream, arrival)
+
+    # Work
+
+    def step(self) -> bool:
+        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough."""
+        if self.restarts.pending:
+            if self.restarts.due_in() > 0:
+                return False
+            self._start_again()
+        if super().step():
+            return True
+        while not self.ended:
+            taken = self.queue.take()
+            if taken is not None:
+                self._admit(*taken)
+            elif not self._give_up():
+                return False
+            if super().step():
+                return True
+        return False
+
+    def _bound_ticks(self, period: int) -> None:
+        """Of the ticks that came due while the operator was busy, only the newest are made up for, as many as its queue
+        holds; without this a slow operator would fall behind for ever. One that drops nothing is spared only what no
+        operator could make up for."""
+        if self.queue.policy != "block":
+            patience = max((wait for wait in self.node.live.wait.values() if wait is not None), default=0)
+            self.aligner.skip_ticks(self._event_time() - patience - self.queue.size * period)
+        number, _, last = self.aligner.owed_ticks()
+        if number > MOST_TICKS:
+            self.aligner.skip_ticks(last - (self.queue.size - 1) * period)
+
+    def next_due(self) -> float | None:
+        """Seconds until a decision need not wait any longer; None when nothing waits for the clock."""
+        if self.restarts.pending:
+            return self.restarts.due_in()
+        held = None if self.ended else self.aligner.waiting()
+        return None if held is None else self.patience.due_in(held.stamp, held.needs)
+
+    def set_parameter(self, name: str, value: Any) -> Any:
+        changed = super().set_parameter(name, value)
+        self._changed[name] = value
+        return changed
+
+    def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
+        self.ports.resume(incarnation, last)
+        self._changed = dict(changed)
+        self._change_again()
+
+    def _fire(self, firing: Firing) -> None:
+        if self.absent:
+            firing = self._without_the_absent(firing)
+        try:
+            if (error := self._fault(firing)) is not None:
+                self._fail_on_purpose(firing, error)
+            super()._fire(firing)
+        except OperatorFailure as failure:
+            if firing.kind == "finish" or not self.restarts.failed():
+                raise
+            self._on_failure(failure, self.restarts.due_in())
+
+    def _fail_on_purpose(self, firing: Firing, error: BaseException) -> None:
+        failure = OperatorFailure(self.node.name, f"{firing.kind} at stamp {firing.stamp}", error)
+        self._record(firing.kind, firing, time.time_ns(), (), failure.summary, injected=True)
+        raise failure
+
+    def _without_the_absent(self, firing: Firing) -> Firing:
+        """Marks inputs stale whose producer is gone; drops what they still hold where the policy says so."""
+        gone = frozenset(
+            name
+            for name, port in self.spec.inputs.items()
+            if port.kind == "sampled" and not self.absent.isdisjoint(self.node.inputs.get(name, ()))
+        )
+        if not gone:
+            return firing
+        inputs = dict(firing.inputs)
+        if self.node.live.on_stale == "drop":
+            inputs |= {
+                name: None for name in gone if not self.spec.inputs[name].required and not _is_many(inputs, name)
+            }
+        return Firing(firing.stamp, firing.kind, firing.tick, inputs, firing.stale | gone, firing.late)
+
+    def _start_again(self) -> None:
+        """A fresh operator in the place of the failed one, with the parameters as they were last set."""
+        self.restarts.begun()
+        old, self.operator = self.operator, self.node.make()
+        self.calls.operator = self.operator
+        self._begin_incarnation()
+        try:
+            _close_quietly(old)
+            self._change_again()
+            started = time.time_ns()
+            self.calls.setup()  # its static streams go on as they are
+            self.records.add_setup(self.operator, started, (None,) * len(self.ports.states))
+        except OperatorFailure as failure:
+            if not self.restarts.failed():
+                raise
+            self._on_failure(failure, self.restarts.due_in())
+
+    def _change_again(self) -> None:
+        for name, value in self._changed.items():
+            self.calls.parameter(name, value, (self.records.incarnation, NEVER))
+
+    def _reset(self, stream: str, entry: Entry) -> None:
+        """The clock behind a stream jumped back: alignment begins anew, and so do the operator's own streams.
+
+        Once for all streams of that producer: what those still bring from before is dropped, and what other streams
+        have brought counts no more, so that they may go back with it.
+        """
+        started = time.time_ns()
+        name = self._input_of(stream)
+        self.queue.clear()
+        drops, more = self.take_drops()
+        self._begin_alignment(stream)
+        self._jumped[_producer(stream)] = entry.incarnation
+        self._seen = {other: (incarnation, NEVER) for other, (incarnation, _) in self._seen.items()}
+        self._newest, self._shift = NEVER, entry.stamp - self._event_clock()
+        self._begin_incarnation(stamps_go_back=True)
+        self.done = NEVER
+        detail: dict[str, Any] = {"input": name, **unlisted(more)}
+        try:
+            self.calls.reset(name, (self.records.incarnation, NEVER + 1))
+        except RAISED as error:
+            failure = OperatorFailure(self.node.name, "on_reset()", error)
+            detail["error"] = failure.summary
+            self.records.add("reset", NEVER + 1, started, outcome="error", drops=tuple(drops), detail=detail)
+            raise failure from error
+        self.records.add("reset", NEVER + 1, started, drops=tuple(drops), detail=detail)
+
+    def _begin_alignment(self, jumped: str) -> None:
+        old = self.aligner
+        self._drops_before.update(old.drops)
+        self._late_before.update(old.late)
+        for held, count in old.buffered().items():
+            if count and self.spec.inputs[held].kind != "sampled":
+                self._drops_before[held, "reset"] += count
+        self.aligner = Aligner(old.spec)
+        for static in self._statics.values():
+            self.aligner.push(static.stream, static)
+        for stream, end in old.ends.items():
+            if stream != jumped and stream not in self._static:
+                self.aligner.end(stream, None, end.reason)
+
+    def _begin_incarnation(self, *, stamps_go_back: bool = False) -> None:
+        incarnation = self.records.incarnation + 1
+        self.records = FiringLog(self.node.name, self.ports.emitter, incarnation)
+        self.ports.begin(incarnation, stamps_go_back=stamps_go_back)
+
+    def _input_of(self, stream: str) -> str:
+        return next(name for name, streams in self.node.inputs.items() if stream in streams)
+
+    def _event_time(self) -> int:
+        """Event time now: by the clock, and not before what has been seen."""
+        return max(self._event_clock() + self._shift, self._newest)
+
+    def _admit(self, stream: str, arrival: Arrival) -> None:
+        """Tells the aligner. What breaks a promise of its stream is refused and counted; a live run goes on."""
+        try:
+            match arrival.kind:
+                case "message":
+                    assert arrival.entry is not None
+                    self.aligner.push(stream, arrival.entry)
+                case "frontier":
+                    self.aligner.advance(stream, arrival.stamp)
+                case "end":
+                    self._end_at(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
+        except StreamOrderError:
+            self._refused[stream] += 1
+            if arrival.entry is not None:
+                self._log.add(dropped(self._input_of(stream), stream, arrival.entry, "refused"))
+
+    def _end_at(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        try:
+            self.aligner.end(stream, final_stamp, reason)
+        except StreamOrderError:  # its clock went back, and it ended before it sent a message at its new time
+            self.aligner.end(stream, None, reason)
+
+    def _give_up(self) -> bool:
+        """Forces the frontiers of inputs whose wait has run out; False when that decides nothing new."""
+        held = self.aligner.waiting()
+        if held is None or not held.needs:
+            return False
+        moved = False
+        for name, frontier in self.patience.exhausted(held.stamp, held.needs).items():
+            if self.aligner.force(name, frontier):
+                self._timeouts[name] += 1
+                moved = True
+        return moved
+
+
+def _producer(stream: str) -> str:
+    """The operator that emits a stream, by the stream's name."""
+    return stream.rpartition("/")[0]
+
+
+def _is_many(inputs: Mapping[str, InputValue], name: str) -> bool:
+    return isinstance(inputs.get(name), Mapping)
+
+
+def _close_quietly(operator: Operator) -> None:
+    """Closes an operator that has failed; what else goes wrong in it is printed, since the first failure is known."""
+    try:
+        operator.close()
+    except Exception as error:
+        print(f"{type(operator).__name__}.close() after a failure: {type(error).__name__}: {error}", file=sys.stderr)

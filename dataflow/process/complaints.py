@@ -1,0 +1,45 @@
+"""Complaints of a process about what others send: the first is printed at once, the ones that follow are counted."""
+
+from __future__ import annotations
+
+import select
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+
+AGAIN_AFTER = 10.0
+"""Seconds after which a complaint about the same thing is printed again, with how many there were meanwhile."""
+
+
+class Complaints:
+    """Prints to stderr, but never waits for whoever reads it."""
+
+    def __init__(
+        self, clock: Callable[[], float] = time.monotonic, printing: Callable[[str], bool] | None = None
+    ) -> None:
+        self._clock, self._print = clock, printing or print_without_waiting
+        self._due: dict[str, float] = {}
+        self._unprinted: Counter[str] = Counter()
+
+    def say(self, about: str, text: str) -> None:
+        """Complains about something, such as a stream; `text` says all that the reader should know."""
+        now = self._clock()
+        more = self._unprinted[about]
+        line = f"{text} ({more} more like it before)" if more else text
+        if now >= self._due.get(about, now) and self._print(line):
+            self._due[about] = now + AGAIN_AFTER
+            self._unprinted.pop(about, None)
+        else:
+            self._unprinted[about] += 1
+
+
+def print_without_waiting(line: str) -> bool:
+    """Prints a line to stderr; False when nobody reads it at the moment."""
+    try:
+        _, writable, _ = select.select([], [sys.stderr], [], 0.0)
+    except (ValueError, OSError):  # it is no file, or closed
+        writable = [sys.stderr]
+    if writable:
+        print(line, file=sys.stderr, flush=True)
+    return bool(writable)

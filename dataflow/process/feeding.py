@@ -1,0 +1,83 @@
+"""Admits messages from the feeds of a process: sources of a run that is not live, recordings that stand in for them."""
+
+from __future__ import annotations
+
+from dataflow.feeds.log import LogFeed
+from dataflow.feeds.window import Feed, Window
+from dataflow.process.pace import Pace
+
+PROMISE_EVERY = 8
+"""Steps after which a frontier is sent on streams that had no message."""
+
+
+class Feeding:
+    """Of several feeds, the oldest step first, as far as the window and the pace allow."""
+
+    def __init__(self, window: Window, pace: Pace) -> None:
+        self.feeds: list[Feed] = []
+        self._window, self._pace = window, pace
+        self._since_promise = 0
+
+    @property
+    def ended(self) -> bool:
+        return all(feed.ended for feed in self.feeds)
+
+    @property
+    def full(self) -> bool:
+        """Whether a step waits for room in the window."""
+        return self._window.full and not self.ended
+
+    @property
+    def logs(self) -> list[LogFeed]:
+        """The recordings among the feeds."""
+        return [feed for feed in self.feeds if isinstance(feed, LogFeed)]
+
+    def first_stamps(self) -> list[int]:
+        """The stamps that the feeds begin with."""
+        return [stamp for feed in self.feeds if (stamp := feed.look_ahead()) is not None]
+
+    def admit(self) -> bool:
+        """Emits the next step; False when there is none, or it has to wait."""
+        due = self._oldest()
+        if due is None or self._window.full or self._pace.due_in(due[0]) > 0:
+            return False
+        stamp, feed = due
+        self._window.add(stamp, *feed.admit())
+        self._since_promise += 1
+        if self._since_promise >= PROMISE_EVERY:
+            self.promise()
+        if feed.look_ahead() is None:
+            feed.finish("end of source")
+        return True
+
+    def promise(self) -> None:
+        """Sends the frontiers of streams which had no message of late."""
+        self._since_promise = 0
+        for feed in self.feeds:
+            if not feed.ended:
+                feed.promise()
+
+    def next_due(self) -> float | None:
+        """Seconds until the next paced step; None when nothing waits for the clock."""
+        if not self._pace.held or self._window.full:
+            return None
+        stamps = [s for feed in self.feeds if not feed.ended and (s := feed.look_ahead()) is not None]
+        return self._pace.due_in(min(stamps)) if stamps else None
+
+    def finish(self, reason: str) -> None:
+        """Ends all feeds."""
+        for feed in self.feeds:
+            feed.finish(reason)
+
+    def _oldest(self) -> tuple[int, Feed] | None:
+        """The feed whose next step has the oldest stamp, in graph order at a tie."""
+        best: tuple[int, Feed] | None = None
+        for feed in self.feeds:
+            if feed.ended:
+                continue
+            stamp = feed.look_ahead()
+            if stamp is None:
+                feed.finish("end of source")
+            elif best is None or stamp < best[0]:
+                best = (stamp, feed)
+        return best

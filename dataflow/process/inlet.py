@@ -1,0 +1,149 @@
+"""The inlet of a process: from the bytes that arrive on its keys to envelopes that belong to its streams.
+
+Whatever does not belong there is dropped, counted and complained about: bytes that are no envelope (`malformed`), and
+envelopes that contradict what their stream has said so far (`misplaced`). Neither ends a process.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Collection, Iterable
+from typing import Any
+
+from dataflow.process.channel import Channel
+from dataflow.process.complaints import Complaints
+from dataflow.process.stream_order import StreamOrder
+from dataflow.transport import Bus, DecodeError, Envelope, Kind, decode
+
+Deliver = Callable[[str, Envelope], None]
+"""Takes the next envelope of a stream."""
+
+
+STATICS_WITHIN = 5.0
+
+
+class StreamDamaged(RuntimeError):
+    """Messages of a stream were lost where none may be."""
+
+
+class Inlet:
+    """Takes payloads by stream, and delivers the envelopes that count, in order."""
+
+    def __init__(
+        self,
+        label: str,
+        channel: Channel,
+        deliver: Deliver,
+        *,
+        static: Collection[str],
+        live: bool,
+        complaints: Complaints | None = None,
+    ) -> None:
+        self.label, self.live = label, live
+        self.received = 0
+        """Envelopes that counted, for the proof of quiescence."""
+        self.malformed = self.misplaced = 0
+        self._channel, self._deliver, self._static = channel, deliver, frozenset(static)
+        self._complaints = complaints or Complaints()
+        self._orders: dict[str, StreamOrder] = {}
+        self._seen: set[str] = set()
+        self._probed: set[str] = set()
+
+    def take(self, stream: str, payload: Any) -> None:
+        """Takes what arrived on a stream's key. Raises `StreamDamaged` for a gap, unless the run is live."""
+        try:
+            envelope = decode(payload)
+        except DecodeError as error:  # from outside: of our own, the next number would show the gap
+            self.refuse_malformed(stream, error)
+            return
+        if envelope.kind is Kind.PROBE:
+            if stream not in self._probed:
+                self._probed.add(stream)
+                self._channel.send("seen", stream=stream)
+        elif envelope.stream != stream:
+            self.refuse(stream, f"an envelope of {envelope.stream!r}")
+        elif stream in self._static:
+            self._take_static(stream, envelope)
+        else:
+            self._take_in_order(stream, envelope)
+
+    def refuse(self, stream: str, what: str, number: int = 1) -> None:
+        """Counts, and complains about, what arrived on a key and does not belong to its stream."""
+        self.misplaced += number
+        self._complaints.say(f"misplaced {stream}", f"dropped {what} on {stream!r}: it does not go on from that stream")
+
+    def refuse_malformed(self, stream: str, error: Exception) -> None:
+        """Counts, and complains about, bytes that mean nothing."""
+        self.malformed += 1
+        self._complaints.say(f"malformed {stream}", f"dropped a malformed message on {stream!r}: {error}")
+
+    def restarted(self, streams: Iterable[str]) -> None:
+        """Notes that the process that makes these streams was restarted: it is to be probed again."""
+        for stream in streams:
+            self._probed.discard(stream)
+            self._order(stream).announce()
+
+    def statics_missing(self, streams: Iterable[str]) -> set[str]:
+        """Returns those of some streams that are static and have not come."""
+        return {stream for stream in streams if stream in self._static} - self._seen
+
+    def _order(self, stream: str) -> StreamOrder:
+        return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder())
+
+    def _take_static(self, stream: str, envelope: Envelope) -> None:
+        """Takes the one message of a static stream, if it has one, and its end; both come again after a restart.
+
+        An end whose number is 0 says that there is no message.
+        """
+        known = stream in self._seen
+        ends = envelope.kind is Kind.END and (known or not envelope.seq)
+        if envelope.kind is not Kind.MESSAGE and not ends:
+            self.refuse(stream, _described(envelope))
+            return
+        self.received += 1
+        self._seen.add(stream)
+        if ends or not known:
+            self._deliver(stream, envelope)
+
+    def _take_in_order(self, stream: str, envelope: Envelope) -> None:
+        verdict = self._order(stream).take(envelope)
+        if verdict.refused:
+            if verdict.damaged and not self.live:
+                raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")
+            self.refuse(stream, _described(envelope), verdict.refused)
+        if verdict.gap is not None:
+            self._lost(stream, *verdict.gap)
+        for taken in verdict.taken:
+            self.received += 1
+            self._deliver(stream, taken)
+
+    def _lost(self, stream: str, first: int, following: int) -> None:
+        """Messages were lost: to a link that broke, or before this process was there."""
+        if not self.live:
+            raise StreamDamaged(
+                f"stream {stream!r} lost messages on its way to process {self.label!r}: "
+                f"number {first} was due, {following} came"
+            )
+        self._channel.send("gap", stream=stream, first=first, following=following)
+
+
+def fetch_statics(bus: Bus, namespace: str, inlet: Inlet, streams: Collection[str]) -> None:
+    """Asks for the static ones of some streams, which were given before this process came to be.
+
+    Raises `StreamDamaged` when they do not come in time.
+    """
+    deadline = time.monotonic() + STATICS_WITHIN
+    while missing := inlet.statics_missing(streams):
+        for stream, payload in bus.fetch_statics(namespace, timeout=1.0).items():
+            if stream in missing:
+                inlet.take(stream, payload)
+        if time.monotonic() > deadline and (missing := inlet.statics_missing(streams)):
+            raise StreamDamaged(
+                f"process {inlet.label!r} was restarted and did not get the static streams "
+                f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"
+            )
+        time.sleep(0.01)
+
+
+def _described(envelope: Envelope) -> str:
+    return f"a {envelope.kind.name} (incarnation {envelope.incarnation}, number {envelope.seq})"

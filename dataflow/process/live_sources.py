@@ -1,0 +1,297 @@
+"""The sources of a live run: each is read by a thread of its own, at the pace of the clock; restarted by its policy.
+
+A reader thread only reads, and appends to the inbox what it has read; everything else is done on the main thread. It
+also ends the generator that it reads, so `close()` is never called while `stream()` runs.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import sys
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.chaos.faults import SourceFaults
+from dataflow.chaos.plan import TO_SOURCES
+from dataflow.feeds.window import Handover, Window
+from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.restarts import Restarts
+from dataflow.firing.source import SourceRunner, step_size, step_stamp
+from dataflow.messages.base import Message
+from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.pace import Pace
+
+MISSED_AFTER = 0.2
+"""Seconds after which a step of a restarted source counts as missed."""
+BACKLOG_EVERY = 0.5
+EARLY = 10.0
+"""Seconds for which a source waits for the clock that are worth a word."""
+RETURN_WITHIN = 3.0
+"""Seconds that `stream()` has to return when the process is closed."""
+
+Step = Mapping[str, Message]
+
+
+class Reader:
+    """Reads one source on a thread of its own until the source ends, fails, or is to stop."""
+
+    def __init__(self, owner: LiveSources, runner: SourceRunner, faults: SourceFaults, *, behind: bool) -> None:
+        self.runner = runner
+        self.unread = Handover()
+        self.failure: OperatorFailure | None = None
+        """What went wrong on the thread, until somebody has dealt with it."""
+        self.condemned: OperatorFailure | None = None
+        """Why what it reads is of no use any more; it stops as soon as it can."""
+        self.read_late = self.sent_late = 0.0
+        """Seconds by which the last step was behind the clock: when it was read, and when it was sent."""
+        self._last: int | None = None
+        self._owner, self._faults, self._behind = owner, faults, behind
+        self._lost = 0
+        self._thread = threading.Thread(target=self._run, name=f"source {runner.node.name}", daemon=True)
+        self._thread.start()
+
+    def join(self, timeout: float) -> bool:
+        """Waits for the thread to end; False when it has not after `timeout` seconds."""
+        self._thread.join(max(0.0, timeout))
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        ended = False
+        try:
+            ended = self._read()
+        except OperatorFailure as failure:
+            self.failure = failure
+        except BaseException as error:  # whatever it is, it ends this source, and under its name
+            self.failure = OperatorFailure(self.runner.node.name, "the thread that reads stream()", error)
+        if self.failure is None and not ended:
+            self.failure = self.condemned
+        if self.failure is not None:
+            self._owner.inbox.put(("source_failed", self, self.failure))
+        elif ended:
+            self._owner.inbox.put(("source", self, None, self._lost))
+
+    def _read(self) -> bool:
+        """Reads until the source has ended (True) or is to stop."""
+        owner, runner = self._owner, self.runner
+        while not owner.stopping.is_set() and self.condemned is None:
+            step = runner.take()
+            if step is None:
+                return True
+            if not runner.source.live and not self._paced(step_stamp(step)):
+                continue
+            for given in self._faults.apply(step, time.monotonic()):
+                self._hand_over(given)
+        runner.close_stream()
+        return False
+
+    def _paced(self, stamp: int) -> bool:
+        """Holds a source that could wait to the clock, as a device would be; False for what a device would have seen
+        while it was away. Ends early when the process stops."""
+        pace = self._owner.pace
+        if self._behind and pace.due_in(stamp) < -MISSED_AFTER:
+            return False
+        self._behind = False
+        early = pace.due_in(stamp)
+        self.read_late = max(0.0, -early)
+        if early > EARLY:
+            self._owner.tell_early(self.runner.node.name, self._last, stamp, early)
+        self._last = stamp
+        self._owner.stopping.wait(min(max(0.0, early), threading.TIMEOUT_MAX))
+        return True
+
+    def _hand_over(self, step: Step) -> None:
+        owner = self._owner
+        if self.unread.count >= owner.backlog.messages or self.unread.size >= owner.backlog.nbytes:
+            self._lost += 1
+            owner.tell_backlog(self.unread.count, self.unread.size)
+            return
+        self.unread.put(*step_size(step))
+        owner.inbox.put(("source", self, step, self._lost))
+        self._lost = 0
+
+
+class LiveSources:
+    """The live sources of one process."""
+
+    def __init__(
+        self,
+        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        channel: Channel,
+        pace: Pace,
+        window: Window,
+        backlog: Window,
+        *,
+        resumed: bool,
+    ) -> None:
+        self.inbox, self.pace, self.backlog = inbox, pace, backlog
+        self.stopping = threading.Event()
+        self.runners: list[SourceRunner] = []
+        self._channel, self._window, self._resumed = channel, window, resumed
+        self._faults: dict[str, SourceFaults] = {}
+        self._readers: dict[str, Reader] = {}
+        self._restarts: dict[str, Restarts] = {}
+        self._backlog_due = 0.0
+
+    def add(self, runner: SourceRunner) -> None:
+        name = runner.node.name
+        self.runners.append(runner)
+        self._faults[name] = SourceFaults()
+        self._restarts[name] = Restarts(runner.node.live.restart, time.monotonic)
+
+    @property
+    def ended(self) -> bool:
+        return all(runner.ended for runner in self.runners)
+
+    def first_stamps(self) -> list[int]:
+        """The stamps that those sources begin with which need not be waited for."""
+        able = [runner for runner in self.runners if not runner.source.live]
+        return [stamp for runner in able if (stamp := runner.look_ahead()) is not None]
+
+    def start(self) -> None:
+        """Begins to read."""
+        for runner in self.runners:
+            self._read(runner, behind=self._resumed)
+
+    def restarts_of(self, name: str) -> int:
+        """How often a source of this process was restarted here."""
+        return self._restarts[name].total if name in self._restarts else 0
+
+    def begin_fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> bool:
+        """Does a planned fault, if it is one for a source that is here."""
+        if operator not in self._faults or kind not in TO_SOURCES:
+            return False
+        self._faults[operator].begin(kind, fields, time.monotonic())
+        return True
+
+    # What readers hand over
+
+    def take(self, reader: Reader, step: Step | None, lost: int) -> None:
+        """Takes a step that was read (None: the source has ended), and how many were dropped before, as too many."""
+        runner = reader.runner
+        if step is not None:
+            reader.unread.take(*step_size(step))
+        if reader.condemned is not None and step is None:
+            self.failed(reader, reader.condemned)
+        if runner.ended or reader.condemned is not None:
+            return
+        if lost:
+            runner.refused["overflow"] += lost
+        if step is None:
+            runner.finish()
+        elif self._window.full or self.backlog.full:
+            runner.refused["overflow"] += 1
+            if self.backlog.full:
+                self.tell_backlog(self.backlog.count, self.backlog.size)
+        else:
+            self._emit(reader, step)
+
+    def _emit(self, reader: Reader, step: Step) -> None:
+        runner = reader.runner
+        incarnation = runner.records.incarnation
+        try:
+            admitted = runner.emit_live(step)
+        except OperatorFailure as failure:
+            if runner.node.live.restart.max == 0 or self.stopping.is_set():
+                raise
+            reader.condemned = failure  # it comes back as this source's failure when the thread has ended
+            return
+        if admitted is None:
+            return
+        if runner.records.incarnation != incarnation:
+            self._window.clear()
+            self.backlog.clear()
+            self._channel.send("jumped", operator=runner.node.name, stamp=runner.last)
+        if not runner.source.live:
+            reader.sent_late = max(0.0, -self.pace.due_in(runner.last))
+        runner.promise()
+        self._window.add(runner.last, *admitted)
+        self.backlog.add(runner.last, *admitted)
+
+    def tell_backlog(self, messages: int, nbytes: int) -> None:
+        """Tells the supervisor, now and then, that a source drops since so much waits; on any thread."""
+        now = time.monotonic()
+        if now >= self._backlog_due:
+            self._backlog_due = now + BACKLOG_EVERY
+            with contextlib.suppress(ChannelClosed):  # the control thread sees to it
+                self._channel.send("backlog", messages=messages, bytes=nbytes)
+
+    def tell_early(self, operator: str, last: int | None, stamp: int, seconds: float) -> None:
+        """Tells the supervisor that a source waits long for the clock, after a step at `last`; on any thread."""
+        with contextlib.suppress(ChannelClosed):  # the control thread sees to it
+            self._channel.send("early", operator=operator, last=last, stamp=stamp, seconds=seconds)
+
+    def behind(self) -> dict[str, list[float]]:
+        """For each source that could wait: seconds by which its last step was read and sent behind the clock."""
+        readers = {name: reader for name, reader in self._readers.items() if not reader.runner.source.live}
+        return {name: [reader.read_late, reader.sent_late] for name, reader in readers.items()}
+
+    # Restarts
+
+    def failed(self, reader: Reader, failure: OperatorFailure) -> None:
+        """A source raised: it is restarted by its policy. Raises the failure when that allows it no more."""
+        reader.failure = None
+        if reader.runner.ended:
+            raise failure
+        self._outlive(reader.runner, failure)
+
+    def next_due(self) -> float | None:
+        """Seconds until a source is to be restarted; None when none is."""
+        return min((r.due_in() for r in self._restarts.values() if r.pending), default=None)
+
+    def restart_due(self) -> None:
+        """Restarts the sources whose pause is over."""
+        for runner in self.runners:
+            restarts = self._restarts[runner.node.name]
+            if restarts.pending and restarts.due_in() <= 0:
+                restarts.begun()
+                if not runner.ended:
+                    self._restart(runner)
+
+    def _outlive(self, runner: SourceRunner, failure: OperatorFailure) -> None:
+        restarts = self._restarts[runner.node.name]
+        if self.stopping.is_set() or not restarts.failed():
+            raise failure
+        self._channel.send(
+            "restarting",
+            operator=failure.operator,
+            when=failure.when,
+            summary=failure.summary,
+            pause=restarts.due_in(),
+        )
+
+    def _restart(self, runner: SourceRunner) -> None:
+        try:
+            runner.start_again()
+        except OperatorFailure as failure:
+            self._outlive(runner, failure)
+        else:
+            self._read(runner, behind=True)
+
+    def _read(self, runner: SourceRunner, *, behind: bool) -> None:
+        name = runner.node.name
+        self._readers[name] = Reader(self, runner, self._faults[name], behind=behind)
+
+    # End
+
+    def finish(self, reason: str) -> None:
+        """Ends the streams of all sources; their threads are to stop."""
+        self.stopping.set()
+        for runner in self.runners:
+            runner.finish(reason)
+
+    def await_readers(self) -> tuple[set[str], list[OperatorFailure]]:
+        """Waits (bounded) for the threads; returns the sources whose thread did not return, and what went wrong in
+        those that did."""
+        self.stopping.set()
+        deadline = time.monotonic() + RETURN_WITHIN
+        late = {name for name, reader in self._readers.items() if not reader.join(deadline - time.monotonic())}
+        for name in sorted(late):
+            print(
+                f"the stream() of source {name!r} did not return within {RETURN_WITHIN:g} s: close() is not called",
+                file=sys.stderr,
+            )
+        failures = [r.failure for name, r in self._readers.items() if name not in late and r.failure is not None]
+        return late, failures

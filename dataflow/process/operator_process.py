@@ -1,0 +1,370 @@
+"""An operator process: it runs one or more operators on one thread, between its inbox and its outlet.
+
+Zenoh's threads, the control thread and the readers of live sources only append to the inbox. The main thread takes from
+it, feeds the aligners, runs the firings that are decided, lets feeds admit what the window allows, and waits (bounded)
+when there is nothing to do.
+"""
+
+from __future__ import annotations
+
+import queue
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dataflow.chaos.faults import OperatorFaults
+from dataflow.feeds.window import Window
+from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.source import SourceRunner
+from dataflow.firing.threads import limit_threads
+from dataflow.graph.model import Graph, Node
+from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.config import ProcessConfig
+from dataflow.process.feeding import Feeding
+from dataflow.process.inlet import Inlet, fetch_statics
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.network import network_config
+from dataflow.process.outlet import Links, Outlet, incarnations_of
+from dataflow.process.pace import Pace
+from dataflow.process.planned_faults import do_fault
+from dataflow.process.progress import Progress
+from dataflow.process.requests import Requests
+from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
+from dataflow.process.watchdog import Watchdog
+from dataflow.sync import FOREVER, StreamOrderError
+from dataflow.transport import Bus, Envelope, TapServer
+from dataflow.transport.publisher import BusError
+
+IDLE_WAIT = 0.1
+TAKE_WITHIN = 0.001
+"""Seconds for what has arrived, before what is decided is run; live runs take all, to know the newest."""
+PROBE_EVERY = 0.01
+BACKLOG = (16, 8)
+"""How many windows of messages and of bytes may wait for operators that no source waits for."""
+
+
+class OperatorProcess:
+    """Runs its operators until they end, it is told to leave, or something fails."""
+
+    def __init__(
+        self,
+        config: ProcessConfig,
+        channel: Channel,
+        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        box: int | None = None,
+    ) -> None:
+        """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
+        self.config, self.channel, self.inbox = config, channel, inbox
+        self.graph = Graph.from_json(config.graph)
+        self.static = statics_of(self.graph)
+        self.pace = Pace(config.rate)
+        self.window = Window(*config.window)
+        self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
+        self.runners = Runners()
+        self.feeding = Feeding(self.window, self.pace)
+        self.live = LiveSources(inbox, channel, self.pace, self.window, self.backlog, resumed=config.resume is not None)
+        self.inlet = Inlet(
+            config.label,
+            channel,
+            self._deliver,
+            static=self.static,
+            live=config.live,
+        )
+        self.outlet = Outlet(
+            channel,
+            self.runners.taking,
+            namespace=self.graph.namespace,
+            static=self.static,
+            live=config.live,
+            box=None if box is None else open_box(box, config, self.graph),
+            firings=config.firings,
+            incarnations=incarnations_of(
+                config.resume or {}, {name: node.outputs for name, node in self.graph.nodes.items()}
+            ),
+        )
+        self.progress = Progress(channel, self.runners, self.feeding, self.live)
+        self.requests = Requests(config, self.runners, self.live, self.progress)
+        self._watch: Watchdog | None = None
+        self._probing = False
+        self._released = False
+        self._stopping = False
+        self._ended = False
+        self._left = False
+        self._asked: int | None = None
+
+    # Life
+
+    def open(self) -> None:
+        """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
+        config, graph = self.config, self.graph
+        settings = network_config(graph.network, config.secret, config.listen, config.connect, live=config.live)
+        self.bus = Bus(settings)
+        self.taps = TapServer(self.bus, graph.namespace)
+        publishers = {s: self.bus.publisher(s, consumers=consumers) for s, consumers in config.publish.items()}
+        self.outlet.open(Links(self.bus, self.taps, publishers, config.publish))
+        for stream in config.subscribe:
+            self.bus.subscribe(stream, self._receiver(stream))
+        self.channel.send("joined")
+        for stream in config.subscribe:
+            graph.message_types(stream)  # its messages may be of a type that no operator here names
+        self.make()
+        self.requests.serve(self.bus, graph.namespace, self.inbox)
+        self.set_up()
+        if config.resume is not None:
+            fetch_statics(self.bus, graph.namespace, self.inlet, config.subscribe)
+        for log in self.feeding.logs:
+            log.setup()
+        first = [*self.feeding.first_stamps(), *self.live.first_stamps()]
+        lengths = [n for source in self.runners.sources if (n := source.source.length()) is not None]
+        self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
+
+    def make(self) -> None:
+        """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
+        for name in self.config.nodes:
+            try:
+                self._make(self.graph.nodes[name])
+            except OperatorFailure:
+                raise
+            except Exception as error:
+                raise OperatorFailure(name, "construction", error) from error
+        log = make_log(self.graph, self.config, self.outlet)
+        if log is not None:
+            self.feeding.feeds.append(log)
+
+    def _make(self, node: Node) -> None:
+        config, outlet = self.config, self.outlet
+        if not node.source:
+            clock, tell = self.pace.event_time, self._on_outlived_failure
+            faults = self.runners.faults[node.name] = OperatorFaults()
+            self.runners.add(
+                make_runner(node, self.graph, config, outlet, faults=faults, event_clock=clock, on_failure=tell)
+            )
+            return
+        source = make_source(node, self.graph, config, outlet)
+        self.runners.sources.append(source)
+        if config.live:
+            self.live.add(source)
+        else:
+            self.feeding.feeds.append(source)
+
+    def set_up(self) -> None:
+        """Calls `setup()` of every operator, with as many library threads as the graph allows."""
+        limit_threads(self.graph.threads)
+        for maker in self.runners.all:
+            maker.setup()
+
+    def _receiver(self, stream: str) -> Callable[[Any], None]:
+        put = self.inbox.put
+
+        def receive(payload: Any) -> None:
+            put(("envelope", stream, payload))
+
+        return receive
+
+    def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
+        self.channel.send(
+            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
+        )
+
+    def run(self) -> None:
+        """Runs the main loop; returns when the supervisor has let the process go."""
+        while True:
+            if self._probing:
+                self.outlet.probe()
+            self._take(self._wait_time())
+            if self._left:
+                break
+            self.live.restart_due()
+            worked = self._work()
+            self.outlet.flush_due()
+            self.progress.report(idle=self.inbox.empty())
+            self._answer_poll(idle=not worked)
+        self.hand_over()
+
+    def hand_over(self) -> None:
+        """Sends the firing records that were not sent yet: after a failure here, the failed one among them."""
+        if self._released:
+            self.outlet.flush_all()
+
+    def close(self) -> None:
+        """Closes every operator and the network; the first error is raised when all are closed."""
+        if self._watch is not None:
+            self._watch.stop()
+        reading, failures = self.live.await_readers()
+        for maker in self.runners.all:
+            if maker.node.name in reading:
+                continue
+            try:
+                if isinstance(maker, SourceRunner) and not self.config.live:
+                    maker.close_stream()
+                maker.operator.close()
+            except OperatorFailure as failure:
+                failures.append(failure)
+            except Exception as error:
+                failures.append(OperatorFailure(maker.node.name, "close()", error))
+        for log in self.feeding.logs:
+            log.close()
+        self.taps.close()
+        try:
+            self.bus.close()
+        except BusError as error:  # a neighbour that hangs takes no leave; everything that was to be done is done
+            print(f"process {self.config.label!r} leaves the network unheard: {error}", file=sys.stderr)
+        if failures:
+            raise failures[0]
+
+    # Inbox
+
+    def _wait_time(self) -> float:
+        if self._probing:
+            return PROBE_EVERY
+        patient = (runner.next_due() for runner in self.runners.operators)
+        due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), *patient]
+        return max(0.0, min(seconds for seconds in due if seconds is not None))
+
+    def _next_due(self) -> float | None:
+        return self.feeding.next_due() if self._released else None
+
+    def _take(self, timeout: float) -> None:
+        """Handles what is in the inbox, but not for long; waits up to `timeout` for the first."""
+        try:
+            item = self.inbox.get(timeout=timeout) if timeout > 0 else self.inbox.get_nowait()
+        except queue.Empty:
+            return
+        until = time.monotonic() + TAKE_WITHIN
+        more = self.inbox.qsize()
+        self._handle(item)
+        while more and (self.config.live or time.monotonic() < until):
+            self._handle(self.inbox.get_nowait())
+            more -= 1
+
+    def _handle(self, item: tuple[Any, ...]) -> None:
+        match item:
+            case ("envelope", stream, payload):
+                self.inlet.take(stream, payload)
+            case ("control", kind, fields):
+                self._control(kind, fields)
+            case ("source", reader, step, lost):
+                self.live.take(reader, step, lost)
+            case ("source_failed", reader, failure):
+                self.live.failed(reader, failure)
+            case ("param", name, query):
+                self.requests.answer_parameter(name, query)
+
+    def _deliver(self, stream: str, envelope: Envelope) -> None:
+        """Gives an envelope to the operators that take its stream. What contradicts what they have seen is refused, in
+        a live run."""
+        for runner in self.runners.taking(stream):
+            try:
+                give(runner, stream, envelope)
+            except StreamOrderError as error:
+                if not self.config.live:
+                    raise
+                self.inlet.refuse(stream, str(error))
+
+    # Work
+
+    def _work(self) -> bool:
+        """Runs what is decided; when nothing is and nothing has arrived, admits from the feeds. True when anything was
+        done."""
+        worked = False
+        while not self._left:
+            if self._step_all() or (self.inbox.empty() and self._admit()):
+                worked = True
+            elif self.inbox.empty():
+                self.feeding.promise()
+                if not self._step_all():
+                    break
+                worked = True
+            self.progress.report(idle=False)
+            if not self.inbox.empty():
+                break
+        if not self._ended and self._released:
+            self._end_if_done()
+        return worked
+
+    def _step_all(self) -> bool:
+        """One step of every operator, last ones first, so that what is under way is done before more is begun."""
+        if self.config.live and not self._released:
+            return False  # a restarted process is sent messages before it is told what time it is
+        worked = False
+        for runner in reversed(self.runners.operators):
+            worked = runner.step() or worked
+        return worked
+
+    def _admit(self) -> bool:
+        return self._released and not self._stopping and self.feeding.admit()
+
+    def _end_if_done(self) -> None:
+        if self.feeding.ended and self.live.ended and all(runner.ended for runner in self.runners.operators):
+            self._ended = True
+            self.outlet.flush_all()
+            self.progress.report(idle=True)
+            transport = {**self.bus.counters(), "malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
+            self.channel.send("ended", report=self.progress.final_report(transport))
+
+    def _answer_poll(self, *, idle: bool) -> None:
+        """Answers after the work that was there: a process is idle only when a look at everything found nothing."""
+        if self._asked is None:
+            return
+        asked, self._asked = self._asked, None
+        self.outlet.flush_all()
+        self.channel.send(
+            "state",
+            round=asked,
+            idle=idle and self.inbox.empty() and not self._waits_for_clock() and self.live.ended,
+            sent=self.outlet.sent,
+            received=self.inlet.received,
+            full=self.feeding.full,
+            waiting=self.progress.waiting(),
+            due=self.feeding.next_due(),
+        )
+
+    def _waits_for_clock(self) -> bool:
+        return self._next_due() is not None or any(runner.next_due() is not None for runner in self.runners.operators)
+
+    # Control
+
+    def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
+        match kind:
+            case "probe":
+                self._probing = True
+            case "go":
+                self._release(fields["first"], fields["at"])
+            case "absent":
+                for stream in fields["streams"]:
+                    for consumer in self.runners.taking(stream):
+                        (consumer.absent.add if fields["absent"] else consumer.absent.discard)(stream)
+                if not fields["absent"]:
+                    self.inlet.restarted(fields["streams"])
+            case "ended_elsewhere":
+                for stream in fields["streams"]:
+                    for runner in self.runners.taking(stream):
+                        runner.end(stream, None, fields["reason"])
+            case "fault":
+                kind, operator = fields["fault"], fields["operator"]
+                do_fault(kind, operator, fields["fields"], runners=self.runners, live=self.live, outlet=self.outlet)
+            case "covered":
+                self.window.cover(fields["frontier"])
+                self.backlog.cover(fields.get("backlog", FOREVER))
+            case "grow":
+                self.window.grow()
+            case "poll":
+                self._asked = fields["round"]
+            case "stop":
+                self._stopping = True
+                self.feeding.finish("interrupted")
+                self.live.finish("interrupted")
+            case "lacks":
+                self.outlet.send_again(fields["operator"])
+            case "leave":
+                self._left = True
+            case "lost":
+                raise ChannelClosed("the supervisor is gone")
+
+    def _release(self, first: int | None, at: float) -> None:
+        self._probing, self._released = False, True
+        self.outlet.release()
+        self.pace.begin(first, at)
+        self.live.start()
+        self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)

@@ -1,0 +1,128 @@
+"""Tells the supervisor how far the operators of a process are, and at the end what came of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from dataflow.firing.calls import summary_of
+from dataflow.firing.protocol import Runner
+from dataflow.process.channel import Channel
+from dataflow.process.feeding import Feeding
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.runners import Runners
+
+REPORT_EVERY = 0.004
+REPORT_IDLE = 0.002
+"""Seconds between two reports of a process that has nothing more to do: others may be waiting for this one."""
+
+
+class Progress:
+    """Reports what has changed: not too often, and as soon as there is nothing else to do."""
+
+    def __init__(
+        self,
+        channel: Channel,
+        runners: Runners,
+        feeding: Feeding,
+        live: LiveSources,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
+        self._clock = clock
+        self.counted: dict[str, list[int]] = {}
+        """The counts that were last reported."""
+        self._dropped: dict[str, list[list[Any]]] = {}
+        self._waited: dict[str, list[list[Any]]] = {}
+        self._done: dict[str, int] = {}
+        self._firings = 0
+        self._reported = -REPORT_EVERY
+        self._owed = False
+
+    def report(self, *, idle: bool) -> None:
+        """Sends what has changed, if it is time to."""
+        now = self._clock()
+        self._owed = False
+        if not idle and now < self._reported + REPORT_EVERY:
+            return
+        done = {r.node.name: r.done for r in self._runners.operators if self._done.get(r.node.name) != r.done}
+        firings = self._made()
+        if not done and firings == self._firings:
+            return
+        if now < self._reported + (REPORT_IDLE if done else REPORT_EVERY):
+            self._owed = True
+            return
+        self._reported = now
+        self._done.update(done)
+        self._firings = firings
+        self.counted = self.counts()
+        drops = {name: found for name, found in self.drops().items() if found != self._dropped.get(name)}
+        self._dropped |= drops
+        waits = {name: found for name, found in self.waits().items() if found != self._waited.get(name)}
+        self._waited |= waits
+        behind = self._live.behind()
+        self._channel.send("progress", done=done, counts=self.counted, drops=drops, waits=waits, behind=behind)
+
+    def next_due(self) -> float | None:
+        """Seconds until what has changed is to be reported; None when nothing has."""
+        return max(0.0, self._reported + REPORT_IDLE - self._clock()) if self._owed else None
+
+    def _made(self) -> int:
+        operators = sum(runner.firings for runner in self._runners.operators)
+        return operators + sum(f.firings for f in self._feeding.feeds) + sum(s.firings for s in self._live.runners)
+
+    def counts(self) -> dict[str, list[int]]:
+        """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
+        counts = {}
+        for source in self._runners.sources:
+            refused = source.refused.total()
+            counts[source.node.name] = [source.firings, source.ports.emitted, refused, source.busy_ns, source.last]
+        for runner in self._runners.operators:
+            drops = sum(runner.drops.values())
+            counts[runner.node.name] = [runner.firings, runner.ports.emitted, drops, runner.busy_ns, runner.done]
+        for log in self._feeding.logs:
+            counts["@log"] = [log.firings, sum(n for _, n, _ in log.counts()), 0, log.busy_ns, log.last]
+        return counts
+
+    def drops(self) -> dict[str, list[list[Any]]]:
+        """For each operator: input ("" for a source), reason and number of what it dropped."""
+        return {
+            r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self._runners.operators
+        } | {s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self._live.runners}
+
+    def waits(self) -> dict[str, list[list[Any]]]:
+        """For each operator: input, "timeout" or "late", and number: waits given up, and messages that came late."""
+        return {
+            r.node.name: [
+                *([i, "timeout", n] for i, n in sorted(r.timeouts.items())),
+                *([i, "late", n] for i, n in sorted(r.late.items())),
+            ]
+            for r in self._runners.operators
+        }
+
+    def waiting(self) -> dict[str, list[Any]]:
+        """Per operator that is not done: the stamp it cannot decide, and the inputs (with frontiers) that hold it."""
+        return {r.node.name: list(r.waiting()) for r in self._runners.operators if not r.ended}
+
+    def final_report(self, transport: Mapping[str, int]) -> dict[str, Any]:
+        """What came of everything; `transport`: what the process has moved."""
+        streams: dict[str, list[Any]] = {}
+        for maker in self._runners.all:
+            for state in maker.ports.states.values():
+                assert state.digest is not None
+                streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
+        for log in self._feeding.logs:
+            streams |= {name: [count, digest] for name, count, digest in log.counts()}
+        return {
+            "streams": streams,
+            "counts": self.counts(),
+            "drops": self.drops(),
+            "waits": self.waits(),
+            "summaries": {r.node.name: s for r in self._runners.operators if (s := _summary(r))},
+            "transport": dict(transport),
+        }
+
+
+def _summary(runner: Runner) -> Mapping[str, Any]:
+    return summary_of(runner.operator, runner.node.name)

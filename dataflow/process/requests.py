@@ -1,0 +1,78 @@
+"""Answers requests from outside the graph: for parameters of operators, and for how the process fares."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable
+from typing import Any
+
+import msgpack
+
+from dataflow.firing.source import SourceRunner
+from dataflow.operator import ParameterError, is_live
+from dataflow.process.config import ProcessConfig
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.progress import Progress
+from dataflow.process.runners import Maker, Runners
+from dataflow.transport import Bus
+from dataflow.transport.keys import runtime_key
+
+
+class Requests:
+    """Takes requests on Zenoh's thread; changes parameters on the main thread, between two firings."""
+
+    def __init__(self, config: ProcessConfig, runners: Runners, live: LiveSources, progress: Progress) -> None:
+        self._config, self._runners, self._live, self._progress = config, runners, live, progress
+
+    def serve(self, bus: Bus, namespace: str, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None:
+        """Declares what is answered."""
+        for name in self._config.nodes:
+            bus.serve(runtime_key(namespace, "param", name), _to_inbox(inbox, name))
+        bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
+
+    def answer_parameter(self, name: str, query: Any) -> None:
+        """Answers a request to change a parameter with the value as validated, or with an error.
+
+        A request `{"get": true}` is answered with the values of all, and whether they can change now.
+        """
+        with query:
+            try:
+                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
+                value = self._value_asked(self._runners[name], asked)
+                answer = {"ok": True, "operator": name, "value": value}
+            except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
+                answer = {"ok": False, "operator": name, "error": str(error)}
+            query.reply(query.key_expr, msgpack.packb(answer))
+
+    @staticmethod
+    def _value_asked(maker: Maker, asked: Any) -> Any:
+        if asked.get("get"):
+            fields = maker.operator.spec.parameters.model_fields
+            values = maker.operator.params.model_dump(mode="json")
+            return {n: {"value": values[n], "live": is_live(field)} for n, field in fields.items()}
+        return maker.set_parameter(asked["name"], asked["value"])
+
+    def _answer_status(self, query: Any) -> None:
+        """Answers with the counts of the last report; on Zenoh's thread, so an operator at work holds up nothing."""
+        with query:
+            status = {
+                "host": self._config.label,
+                "counts": self._progress.counted,
+                "restarts": {maker.node.name: self._restarts_of(maker) for maker in self._runners.all},
+                "ended": [maker.node.name for maker in self._runners.all if maker.ended],
+            }
+            query.reply(query.key_expr, msgpack.packb(status))
+
+    def _restarts_of(self, maker: Maker) -> int:
+        """How often an operator was restarted, by this process and in the processes before it."""
+        here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
+        return self._config.resumed(maker.node.name).restarts + here
+
+
+def _to_inbox(inbox: queue.SimpleQueue[tuple[Any, ...]], name: str) -> Callable[[Any], None]:
+    put = inbox.put
+
+    def asked(query: Any) -> None:
+        put(("param", name, query))
+
+    return asked

@@ -1,0 +1,150 @@
+"""Makes the runners of a process: which kind drives an operator follows from what the supervisor has said."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from dataflow.chaos.faults import OperatorFaults
+from dataflow.feeds.log import LogFeed
+from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.live import LiveRunner
+from dataflow.firing.ports import Emitter
+from dataflow.firing.protocol import Runner
+from dataflow.firing.runner import OperatorRunner
+from dataflow.firing.source import SourceRunner
+from dataflow.graph.model import Graph, Node
+from dataflow.process.config import ProcessConfig, Resumed
+from dataflow.recording import Recording
+from dataflow.records.black_box import BlackBox, Reached
+from dataflow.sync import NEVER, Entry
+from dataflow.transport import Envelope, Kind
+
+Maker = SourceRunner | Runner
+"""Drives an operator that emits."""
+
+
+class Runners:
+    """The runners of one process, and which of them take a stream."""
+
+    def __init__(self) -> None:
+        self.sources: list[SourceRunner] = []
+        self.operators: list[Runner] = []
+        self.consumers: dict[str, list[Runner]] = {}
+        self.faults: dict[str, OperatorFaults] = {}
+        """What is done on purpose to the operators of a live run."""
+
+    @property
+    def all(self) -> list[Maker]:
+        """Everything that emits, sources first."""
+        return [*self.sources, *self.operators]
+
+    def __getitem__(self, name: str) -> Maker:
+        return next(maker for maker in self.all if maker.node.name == name)
+
+    def add(self, runner: Runner) -> None:
+        self.operators.append(runner)
+        for stream in {s for streams in runner.node.inputs.values() for s in streams}:
+            self.consumers.setdefault(stream, []).append(runner)
+
+    def taking(self, stream: str) -> Iterable[Runner]:
+        return self.consumers.get(stream, ())
+
+
+def give(runner: Runner, stream: str, envelope: Envelope) -> None:
+    """Gives a runner what another process says on a stream. Raises `StreamOrderError` for what contradicts it."""
+    match envelope.kind:
+        case Kind.MESSAGE:
+            message = envelope.message
+            assert message is not None
+            entry = Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, message.digest(), stream)
+            runner.push(stream, entry)
+        case Kind.FRONTIER:
+            runner.advance(stream, envelope.stamp)
+        case Kind.END:
+            runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
+
+
+def make_source(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitter) -> SourceRunner:
+    """The runner of a source; it goes on where the process before this one died."""
+    source = SourceRunner(node, emitter, seed=graph.seed, live=config.live)
+    _resume(source, config.resumed(node.name))
+    return source
+
+
+def make_runner(
+    node: Node,
+    graph: Graph,
+    config: ProcessConfig,
+    emitter: Emitter,
+    *,
+    faults: OperatorFaults,
+    event_clock: Callable[[], int],
+    on_failure: Callable[[OperatorFailure, float], None],
+) -> Runner:
+    """Makes the runner of an operator that has inputs."""
+    common: dict[str, Any] = {
+        "static": statics_of(graph),
+        "seed": graph.seed,
+        "paranoid": config.paranoid,
+        "snapshots": config.snapshots,
+    }
+    if config.live:
+        live = LiveRunner(node, emitter, **common, event_clock=event_clock, on_failure=on_failure, fault=faults.before)
+        _resume(live, config.resumed(node.name))
+        return live
+    runner = OperatorRunner(node, emitter, **common)
+    if config.warm is not None:
+        _begin_in_the_middle(runner, graph, Path(config.warm["path"]), config.warm["stamp"])
+    return runner
+
+
+def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed | None:
+    """The recording that stands in for sources, if there is one."""
+    replay = config.replay
+    if replay is None:
+        return None
+    nodes = {graph.streams[s].node for s in replay["streams"]}
+    return LogFeed(
+        Recording(replay["path"]),
+        {s: graph.streams[s].node for s in replay["streams"]},
+        emitter,
+        ports={n: tuple(graph.nodes[n].outputs.values()) for n in nodes},
+        finals=replay["finals"],
+        start=replay["start"],
+        end=replay["end"],
+    )
+
+
+def open_box(descriptor: int, config: ProcessConfig, graph: Graph) -> BlackBox:
+    """Opens what keeps the firing records of this process; they go on from where the one before it had got to."""
+    ports = {name: tuple(graph.nodes[name].outputs) for name in config.nodes}
+    before = {name: config.resumed(name) for name in config.nodes}
+    reached = {
+        name: Reached(r.incarnation - 1, dict(r.last), dict(r.changed)) for name, r in before.items() if r.incarnation
+    }
+    return BlackBox(descriptor, ports, reached)
+
+
+def statics_of(graph: Graph) -> frozenset[str]:
+    """The static streams of a graph."""
+    return frozenset(name for name, stream in graph.streams.items() if stream.static)
+
+
+def _resume(runner: Maker, resumed: Resumed) -> None:
+    if resumed.incarnation:
+        runner.resume(resumed.incarnation, resumed.last, resumed.changed)
+
+
+def _begin_in_the_middle(runner: OperatorRunner, graph: Graph, path: Path, stamp: int) -> None:
+    from dataflow.reexecution.warm_start import held_before, warm_start
+
+    held, began = held_before(path, runner.node, stamp, statics_of(graph))
+    if began:
+        runner.aligner.begin_at(stamp)
+    warm = warm_start(path, graph, runner.node, stamp)
+    if warm is not None:
+        runner.take_over(warm.operator, stamp)
+    for entry in held:
+        runner.aligner.push(entry.stream, entry)

@@ -1,0 +1,135 @@
+"""The chunks of an MCAP file, decompressed within bounds; the newest ones stay in memory."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import lz4.frame  # type: ignore[import-untyped]
+import zstandard
+
+from dataflow.recording.errors import RecordingError
+from dataflow.recording.packing import MAX_CHUNK_BYTES
+from dataflow.recording.rawfile import RawFile
+
+CACHE_BYTES = 256 * 2**20
+MAX_RATIO = 300
+"""Beyond what LZ4 can do and what zstd does on sensor data: only a file made to do harm expands so much for long."""
+UNDOUBTED_BYTES = 2**31
+"""Expanded bytes of a file whose ratio is not looked at."""
+
+_CHUNK = struct.Struct("<QQQII")
+CHUNK_HEAD = _CHUNK.size
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkRef:
+    """One chunk: where its record's body begins in the file, and what the index says of it."""
+
+    offset: int
+    length: int
+    uncompressed_size: int
+
+
+def size_in_head(head: bytes) -> int:
+    """The uncompressed size that the head of a chunk record's body tells."""
+    return int(_CHUNK.unpack_from(head)[2])
+
+
+class Chunks:
+    """The chunks of one file by number."""
+
+    def __init__(self, file: RawFile) -> None:
+        self.refs: list[ChunkRef] = []
+        self._file = file
+        self._cache: OrderedDict[int, bytes] = OrderedDict()
+        self._cached_bytes = 0
+        self._packed_bytes = self._unpacked_bytes = 0
+        self._decompressor = zstandard.ZstdDecompressor()
+
+    def add(self, ref: ChunkRef) -> int:
+        """The number of a chunk."""
+        self.refs.append(ref)
+        return len(self.refs) - 1
+
+    def clear(self) -> None:
+        self._cache.clear()
+        self._cached_bytes = 0
+
+    def data(self, number: int) -> bytes:
+        """The records of a chunk, decompressed and checked."""
+        cached = self._cache.get(number)
+        if cached is not None:
+            self._cache.move_to_end(number)
+            return cached
+        self._make_room(self.refs[number].uncompressed_size)
+        data = self._decompress(number)
+        self._cache[number] = data
+        self._cached_bytes += len(data)
+        return data
+
+    def check_ratio(self, number: int) -> None:
+        """Refuses a file whose chunks, those asked about so far, expand beyond reason."""
+        ref = self.refs[number]
+        self._packed_bytes += ref.length
+        self._unpacked_bytes += ref.uncompressed_size
+        if self._unpacked_bytes > max(UNDOUBTED_BYTES, MAX_RATIO * self._packed_bytes):
+            raise self._file.damaged(
+                f"its chunks up to byte {ref.offset + ref.length} expand from {self._packed_bytes} to "
+                f"{self._unpacked_bytes} bytes and it has no index of them, so all would have to be expanded"
+            )
+
+    def where(self, number: int) -> str:
+        return f"chunk {number} at byte {self.refs[number].offset}"
+
+    def _make_room(self, size: int) -> None:
+        """Lets the oldest chunks go before the next one is there."""
+        while self._cache and self._cached_bytes + size > CACHE_BYTES:
+            _, old = self._cache.popitem(last=False)
+            self._cached_bytes -= len(old)
+
+    def _decompress(self, number: int) -> bytes:
+        ref = self.refs[number]
+        where = self.where(number)
+        body = self._file.read(ref.offset, ref.length)
+        if len(body) < _CHUNK.size:
+            raise self._file.damaged(f"{where} is too short")
+        _, _, size, crc, name_length = _CHUNK.unpack_from(body)
+        at = _CHUNK.size + name_length
+        if at + 8 > len(body):
+            raise self._file.damaged(f"{where} is too short")
+        if size > MAX_CHUNK_BYTES:
+            raise self._file.damaged(f"{where} says it has {size} bytes, at most {MAX_CHUNK_BYTES} are read")
+        name = body[_CHUNK.size : at].decode("ascii", "replace")
+        (length,) = struct.unpack_from("<Q", body, at)
+        packed = memoryview(body)[at + 8 : at + 8 + length]
+        try:
+            data = self._unpack(name, packed, size, where)
+        except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
+            raise self._file.damaged(f"{where} does not decompress: {error}") from error
+        if len(data) != size:
+            raise self._file.damaged(f"{where} does not hold the {size} bytes that it says it has")
+        if crc and zlib.crc32(data) != crc:
+            raise self._file.damaged(f"{where} fails its checksum")
+        return data
+
+    def _unpack(self, compression: str, packed: memoryview, size: int, where: str) -> bytes:
+        """At most `size` + 1 bytes, whatever the data says of itself."""
+        match compression:
+            case "":
+                return bytes(packed)
+            case "zstd":
+                if not size:
+                    return b""
+                stated = zstandard.frame_content_size(packed)
+                if stated == size:
+                    return self._decompressor.decompress(packed, max_output_size=size)
+                if stated > size:  # one-shot decompression would believe it
+                    raise self._file.damaged(f"{where} says it has {size} bytes, its zstd frame {stated}")
+                with self._decompressor.stream_reader(packed, read_across_frames=True) as reader:
+                    return reader.read(size + 1)
+            case "lz4":
+                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)) if size else b""
+        raise RecordingError(f"{self._file.path}: chunks are compressed with {compression!r}; known: zstd, lz4, none")

@@ -1,0 +1,114 @@
+"""What an MCAP file holds, by a pass over its records: for torn files, and those whose summary is no help."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from mcap.opcode import Opcode
+
+from dataflow.recording.chunks import CHUNK_HEAD, ChunkRef, size_in_head
+from dataflow.recording.container import MAGIC
+from dataflow.recording.contents import MESSAGE_BODY, Contents
+from dataflow.recording.rawfile import RECORD, RawFile
+from dataflow.recording.seals import Seal, seal_of
+
+
+@dataclass(slots=True)
+class _Pending:
+    """A chunk whose message indexes are being read."""
+
+    number: int
+    indexes: list[bytes] = field(default_factory=list)
+
+
+class Scan:
+    """One pass over the records of a file, up to the last whole one.
+
+    `end`: where it stopped; `whole`: whether that was at the end of the data. `trusting`: message indexes are believed
+    where they are well formed; otherwise every chunk is read. Raises `DamagedError`.
+    """
+
+    def __init__(self, file: RawFile, *, sealed: bool, trusting: bool) -> None:
+        self.contents = Contents(file)
+        self.end = len(MAGIC)
+        self.whole = False
+        self._file = file
+        self._sealed, self._trusting = sealed, trusting
+        self._pending: _Pending | None = None
+
+    def run(self) -> None:
+        file = self._file
+        while self.end + RECORD.size <= file.size:
+            opcode, length = RECORD.unpack(file.near(self.end, RECORD.size))
+            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
+                self.whole = True
+                break
+            if self.end + RECORD.size + length > file.size or opcode == 0:
+                break
+            self._take(opcode, self.end, length)
+            self.end += RECORD.size + length
+        self._settle(torn=not self.whole)
+
+    def _take(self, opcode: int, at: int, length: int) -> None:
+        if opcode == Opcode.MESSAGE_INDEX and self._pending is not None:
+            body = self._body(at, length)
+            if body is not None:
+                self._pending.indexes.append(body)
+            return
+        self._settle()
+        match opcode:
+            case Opcode.CHUNK:
+                if length < CHUNK_HEAD:
+                    raise self._file.damaged(f"the chunk at byte {at} is too short")
+                head = self._file.near(at + RECORD.size, CHUNK_HEAD)
+                ref = ChunkRef(at + RECORD.size, length, size_in_head(head))
+                self._pending = _Pending(self.contents.add_chunk(ref))
+            case Opcode.SCHEMA | Opcode.CHANNEL:
+                body = self._body(at, length)
+                if body is not None:
+                    self.contents.declare(opcode, body, at)
+            case Opcode.METADATA:
+                body = self._body(at, length)
+                if body is not None:
+                    self.contents.add_metadata(body, at)
+            case Opcode.MESSAGE if not self._sealed:
+                if length < MESSAGE_BODY.size:
+                    raise self._file.damaged(f"the message at byte {at} is too short")
+                self.contents.add_loose_message(at, length)
+            case Opcode.HEADER:
+                pass
+            case _ if self._sealed:
+                self.contents.damage.append(f"the record at byte {at} is none that this program writes; it is left out")
+
+    def _body(self, at: int, length: int) -> bytes | None:
+        """The body of a record; None, and a note, where its checksum says that it is damaged."""
+        record = self._file.record(at, length)
+        if self._sealed and seal_of(record) is not Seal.SOUND:
+            self.contents.damage.append(f"the record at byte {at} is damaged and left out")
+            return None
+        return record[RECORD.size :]
+
+    def _settle(self, torn: bool = False) -> None:
+        """Takes the messages of the chunk just passed; at a torn end its message indexes may be incomplete."""
+        pending, self._pending = self._pending, None
+        if pending is None:
+            return
+        contents = self.contents
+        known = all(int.from_bytes(body[:2], "little") in contents.channels for body in pending.indexes)
+        if self._trusting and not torn and pending.indexes and known:
+            if contents.add_indexes(pending.number, pending.indexes):
+                return
+            contents.damage.append(f"a message index of {contents.chunks.where(pending.number)} is damaged")
+        contents.take_chunk(pending.number)
+
+
+def scan(file: RawFile, *, sealed: bool, trusting: bool) -> Scan:
+    """The pass that tells what `file` holds: where a trusting one comes upon damage, one that reads every chunk."""
+    first = Scan(file, sealed=sealed, trusting=trusting)
+    first.run()
+    if not trusting or not first.contents.damage:
+        return first
+    second = Scan(file, sealed=sealed, trusting=False)
+    second.run()
+    second.contents.damage[:] = list(dict.fromkeys([*first.contents.damage, *second.contents.damage]))
+    return second

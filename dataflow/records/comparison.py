@@ -1,0 +1,82 @@
+"""The outcome of re-executing one operator by its firing records: what was repeated, and the first difference."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+Verdict = Literal["identical", "culprit", "downstream", "unverifiable"]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """The first firing of an operator that differs. `expected` and `got` are digests, or say what else differs."""
+
+    index: int
+    kind: str
+    stamp: int
+    port: str
+    expected: str
+    got: str
+    incarnation: int = 0
+
+
+@dataclass(slots=True)
+class Verification:
+    """Counts of what re-executing one operator repeated, and where it differs first.
+
+    `verified` firings were repeated and compared; `unverifiable` ones could not be, because a message they were given
+    is unavailable; `lost_records` are missing between others, so the firings that follow them in their incarnation
+    cannot be repeated either. `beyond` of the unverifiable ones wait for a message after the last one of its stream.
+    `unaccounted` messages were made by no record, `unfinished` says that the records end before the run did: records
+    are lost. `cut` says that the recording itself ends before the run did, and before this operator; `after_cut` are
+    then the messages without a record. `not_stored` messages were made again, but are not in the recording.
+    `tainted` is the index of the first firing that was given anything other than recorded, `own_fault` says that the
+    first difference came before; `states` of the differences are in snapshots, not in messages.
+    `began` says from where it was repeated: "start", "snapshot" (its recorded state) or "stateless".
+    """
+
+    operator: str
+    firings: int = 0
+    verified: int = 0
+    outputs: int = 0
+    differing: int = 0
+    states: int = 0
+    unverifiable: int = 0
+    beyond: int = 0
+    lost_records: int = 0
+    unaccounted: int = 0
+    unfinished: bool = False
+    cut: bool = False
+    after_cut: int = 0
+    not_stored: int = 0
+    began: str = "start"
+    own_fault: bool = False
+    tainted: int | None = None
+    first: Difference | None = None
+    missing: str = ""
+    files_changed: list[str] = field(default_factory=list)
+
+    @property
+    def verdict(self) -> Verdict:
+        if self.first is not None:
+            return "culprit" if self.own_fault else "downstream"
+        return "identical" if self.whole else "unverifiable"
+
+    @property
+    def whole(self) -> bool:
+        """True when everything that was recorded before the cut, if there is one, was repeated, and there was any."""
+        if self.lost_records or self.unaccounted or self.unfinished:
+            return False
+        if self.cut:
+            return self.unverifiable == self.beyond and (self.verified > 0 or not (self.beyond or self.after_cut))
+        return not self.unverifiable
+
+    def to_wire(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_wire(values: Mapping[str, Any]) -> Verification:
+        first = values["first"]
+        return Verification(**{**values, "first": None if first is None else Difference(**first)})

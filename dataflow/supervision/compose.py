@@ -1,0 +1,57 @@
+"""What watches over which kind of run: here alone live runs and others part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from dataflow.supervision.configs import Config
+from dataflow.supervision.core import Core
+from dataflow.supervision.counts import Counts
+from dataflow.supervision.cover import LiveCover, LosslessCover
+from dataflow.supervision.diagnostics import DiagnosticsPart
+from dataflow.supervision.drain import DrainLimit
+from dataflow.supervision.heartbeats import Heartbeats
+from dataflow.supervision.lateness import Lateness
+from dataflow.supervision.part import Part
+from dataflow.supervision.plan import HostPlan, RunPlan
+from dataflow.supervision.planned_faults import PlannedFaults
+from dataflow.supervision.quiescence import LOST_AFTER, Quiescence
+from dataflow.supervision.remains import RemainsPart
+from dataflow.supervision.restarts import LiveRestarts, RestartPolicy
+from dataflow.supervision.run_state import RunState
+from dataflow.supervision.stall import LiveStallWatch, StallWatch
+from dataflow.supervision.supervised import Supervised
+
+
+def core_of(plan: RunPlan, hosts: Mapping[str, HostPlan], configs: Mapping[str, Config]) -> Core:
+    """Returns the core that a plan needs."""
+    return (_live if plan.live else _lossless)(RunState(plan, hosts, configs))
+
+
+def _lossless(run: RunState) -> Core:
+    """Nothing may be lost: sources wait for all, and the first death ends the run."""
+    quiescence = Quiescence(run)
+    parts = [Counts(run), LosslessCover(run), quiescence, StallWatch(run, quiescence), DrainLimit(run)]
+    return Core(run, parts, RestartPolicy(run))
+
+
+def _live(run: RunState) -> Core:
+    """Time does not wait: what fails is started again by its policy, and the rest goes on."""
+    parts: list[Part] = []
+
+    def tell(what: str, process: Supervised) -> None:
+        for part in parts:
+            if what == "away":
+                part.away(process)
+            else:
+                part.back(process)
+
+    remains = RemainsPart(run)
+    cover = LiveCover(run)
+    restarts = LiveRestarts(run, remains, tell)
+    quiescence = Quiescence(run, lost_after=LOST_AFTER)
+    parts += [Counts(run), remains, cover, Lateness(run), restarts, Heartbeats(run, cover, restarts)]
+    if run.plan.faults is not None:
+        parts.append(PlannedFaults(run, run.plan.faults))
+    parts += [DiagnosticsPart(run), quiescence, LiveStallWatch(run, quiescence), DrainLimit(run)]
+    return Core(run, parts, restarts)

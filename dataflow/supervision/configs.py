@@ -1,0 +1,82 @@
+"""What each process of a run is told to be: its kind and its configuration, as plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.supervision.plan import HostPlan, RunPlan
+
+Config = tuple[str, dict[str, Any]]
+"""Kind of process ("host" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
+
+
+def configurations(
+    plan: RunPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str], secret: str
+) -> dict[str, Config]:
+    """Returns every process's configuration by label.
+
+    `endpoints` are those on which the processes listen, `secret` what the run's messages are sealed with.
+    """
+    first = next(iter(hosts))
+    configs: dict[str, Config] = {}
+    for label, host in hosts.items():
+        common = _common(plan, host, endpoints) | {"secret": secret}
+        if host.sink is None:
+            configs[label] = _host(plan, host, common, endpoints, label == first)
+        else:
+            configs[label] = _sink(plan, host, common)
+    return configs
+
+
+def _common(plan: RunPlan, host: HostPlan, endpoints: Mapping[str, str]) -> dict[str, Any]:
+    connect = [endpoints[up] for up in host.upstream]
+    return {"label": host.label, "graph": plan.graph.to_json(), "connect": connect, "live": plan.live}
+
+
+def _sink(plan: RunPlan, host: HostPlan, common: Mapping[str, Any]) -> Config:
+    return "sink", {
+        **common,
+        "kind": host.sink,
+        "streams": list(host.streams),
+        "firings": list(plan.graph.nodes) if host.sink == "record" else [],
+        "options": dict(host.options),
+    }
+
+
+def _host(
+    plan: RunPlan, host: HostPlan, common: Mapping[str, Any], endpoints: Mapping[str, str], first: bool
+) -> Config:
+    return "host", {
+        **common,
+        "nodes": list(host.nodes),
+        "publish": dict(host.publish),
+        "subscribe": list(host.subscribe),
+        "listen": [endpoints[host.label], *(plan.graph.network.listen if first else ())],
+        "replay": _log(plan) if host.has_log else None,
+        "window": list(plan.window),
+        "rate": 1.0 if plan.live and plan.rate is None else plan.rate,
+        "paranoid": plan.paranoid,
+        "firings": plan.record is not None,
+        "snapshots": plan.graph.record.snapshots,
+        "warm": _warm_start(plan),
+    }
+
+
+def _log(plan: RunPlan) -> dict[str, Any]:
+    log = plan.log
+    assert log is not None
+    return {
+        "path": str(log.path),
+        "streams": list(log.streams),
+        "finals": dict(log.finals),
+        "start": log.start,
+        "end": log.end,
+    }
+
+
+def _warm_start(plan: RunPlan) -> dict[str, Any] | None:
+    log = plan.log
+    if log is None or log.start is None:
+        return None
+    return {"path": str(log.path), "stamp": log.start}

@@ -1,0 +1,101 @@
+"""What the supervisor's core is told: each event with the moment at which it happened."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from dataflow.records.black_box import Remains
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """A clock value. `steady` (s) never goes back and times everything; `wall` (s since the epoch) is for stamps."""
+
+    steady: float
+    wall: float
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """The run begins."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """Time has passed."""
+
+
+@dataclass(frozen=True, slots=True)
+class StopAsked:
+    """The user asks for an orderly end; a second time, for an end at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class Aborted:
+    """The program around the core cannot go on."""
+
+    why: str
+    interrupted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Said:
+    """A process sent a message on its control channel."""
+
+    label: str
+    kind: str
+    fields: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Printed:
+    """A process printed a line."""
+
+    label: str
+    line: str
+
+
+@dataclass(frozen=True, slots=True)
+class NotReading:
+    """A process has not taken what was sent to it for `seconds`. `overflowed`: some of it is lost."""
+
+    label: str
+    seconds: float
+    waiting: int
+    overflowed: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class HungUp:
+    """A process has closed its control channel."""
+
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class LeftBehind:
+    """A process that ended has left others, which were killed: each as "name (process N)"."""
+
+    label: str
+    processes: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Remained:
+    """A process has ended, and these are the firing records that it left. Comes just before its `Died`."""
+
+    label: str
+    remains: Remains
+
+
+@dataclass(frozen=True, slots=True)
+class Died:
+    """A process has ended. `code`: exit code, negative for a signal; None: unknown. Its last event."""
+
+    label: str
+    code: int | None
+
+
+Event = Begin | Tick | StopAsked | Aborted | Said | Printed | NotReading | HungUp | LeftBehind | Remained | Died

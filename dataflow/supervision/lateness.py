@@ -1,0 +1,76 @@
+"""Sources of a live run against the clock: who falls behind it, and who waits for it without end.
+
+A source that can wait (a data set, a simulator) is read at the pace of the clock. Where that takes longer than real
+time, event time falls behind, and everything after it looks healthy; so it is said, at once and at the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.supervision.part import Part
+from dataflow.supervision.run_state import RunState
+from dataflow.supervision.supervised import Supervised
+from dataflow.supervision.wording import how_long
+
+LATE = 1.0
+"""Seconds behind the clock that are worth a word."""
+ITS_OWN = 0.5
+"""Share of its lateness that a source must have when it is read, to be the one that is slow."""
+AT_WORK = 0.7
+"""Share of its time that a source is at work when reading it takes longer than real time."""
+
+
+class Lateness(Part):
+    """Takes in how late each source's last message was, in s: when it was read, and when it was sent."""
+
+    def __init__(self, run: RunState) -> None:
+        super().__init__(run)
+        self._worst: dict[str, float] = {}
+        self._said: set[str] = set()
+
+    def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
+        if kind == "progress":
+            for source, (read, sent) in fields.get("behind", {}).items():
+                self._take(process, source, read, sent)
+        elif kind == "early":
+            self._waits(fields["operator"], fields["last"], fields["stamp"], fields["seconds"])
+
+    def _take(self, process: Supervised, source: str, read: float, sent: float) -> None:
+        behind = max(read, sent)
+        self.run.status.behind[source] = behind
+        self._worst[source] = max(behind, self._worst.get(source, 0.0))
+        if behind > LATE and source not in self._said:
+            self._said.add(source)
+            why = self._why(process, source, read, sent)
+            self.run.event("behind", f"source {source!r} has fallen behind the clock: {why}", operator=source)
+        elif behind < LATE / 2:
+            self._said.discard(source)
+
+    def _why(self, process: Supervised, source: str, read: float, sent: float) -> str:
+        """Names who holds a source up."""
+        others = ", ".join(name for name in process.nodes if name != source)
+        if read < ITS_OWN * sent:
+            return f"its process is busy with {others or 'sending'}"
+        run = self.run
+        assert run.release is not None
+        elapsed = max(run.steady - run.release.at.steady, 1e-9)
+        if run.status.operators[source].busy_ns * 1e-9 > AT_WORK * elapsed:
+            return "reading it takes longer than real time"
+        beside = f"with {others}, its process's others, " if others else "with other processes "
+        return f"reading it waits, for a device or a file, or because it shares the CPU {beside}which are busy"
+
+    def _waits(self, source: str, last: int | None, stamp: int, seconds: float) -> None:
+        jump = "" if last is None else f", its stamps jump from {last} to {stamp}"
+        rate = "" if self.run.plan.rate in (None, 1.0) else f" at rate {self.run.plan.rate:g}"
+        text = f"source {source!r} waits {how_long(seconds)} for the clock{rate}{jump}: nothing comes until then"
+        self.run.event("clock_wait", text, operator=source, stamp=stamp, seconds=seconds)
+
+    def closing(self) -> None:
+        for source, behind in sorted(self.run.status.behind.items()):
+            if self._worst[source] > LATE:
+                self.run.note(
+                    f"source {source!r} was {behind:.1f} s behind the clock at the end, "
+                    f"{self._worst[source]:.1f} s at most"
+                )

@@ -1,0 +1,186 @@
+"""The nursery process: it has imported the runtime once and forks hosts from itself.
+
+Starting Python and importing the runtime takes half a second a process; forking takes milliseconds. The nursery is
+single-threaded, holds no session and no model, and runs with the environment that hosts need (thread counts, hash
+seed). It ends when the supervisor does, and tells it how its children ended.
+
+What operators start must end with their host, also what has left its process group or session: each host is a subreaper
+(prctl(2)), so such a process becomes the host's child when its parent ends, and the nursery's when the host does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import gc
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import psutil  # type: ignore[import-untyped]
+
+LEAVE_WITHIN = 12.0
+"""Seconds that hosts get after the supervisor is gone."""
+DIE_WITHIN = 1.0
+MOST_DESCRIPTORS = 253
+"""As many as one message on a Unix socket carries."""
+PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
+
+_PR_SET_CHILD_SUBREAPER = 36
+
+
+def _adopt_orphans() -> None:
+    """Makes this process the parent of descendants whose parent ends."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0) != 0:
+        raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
+
+
+def _fork_host(descriptor: int, words: int, handed: Sequence[int], inherited: Iterable[int]) -> int:
+    pid = os.fork()
+    if pid:
+        return pid
+    code = 1
+    try:
+        os.setpgid(0, 0)
+        _adopt_orphans()
+        os.dup2(words, 1)
+        os.dup2(words, 2)
+        for other in (words, *inherited):
+            os.close(other)
+        sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+        from dataflow.process.main import main
+
+        code = main(descriptor, handed)
+        sys.stdout.flush()
+        sys.stderr.flush()
+    finally:
+        os._exit(code)  # libraries' threads must not be able to hold up the end
+
+
+def serve(connection: socket.socket) -> None:
+    """Forks on request and reports ends, until the supervisor closes the connection."""
+    children: dict[int, int] = {}  # pidfd → pid
+    while True:
+        readable, _, _ = select.select([connection.fileno(), *children], [], [])
+        for pidfd in readable:
+            if pidfd != connection.fileno():
+                _ended(connection, children, pidfd)
+        if connection.fileno() in readable:
+            request, descriptors, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
+            if not request:
+                break
+            descriptor, words, *handed = descriptors
+            pid = _fork_host(descriptor, words, handed, [connection.fileno(), *children])
+            for given in descriptors:
+                os.close(given)
+            pidfd = os.pidfd_open(pid)
+            children[pidfd] = pid
+            _tell(connection, "spawned", pid, None, [pidfd])
+    _outlive(children)
+
+
+def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: int) -> None:
+    """Buries a host and everything that its operators have started."""
+    pid = children.pop(pidfd)
+    os.close(pidfd)
+    with contextlib.suppress(ProcessLookupError, PermissionError):  # it is no group of its own yet
+        os.killpg(pid, signal.SIGKILL)  # before it is waited for: until then nobody else can have its number
+    left = _end_orphans({pid, *children.values()}, pid)
+    _, status = os.waitpid(pid, 0)
+    if connection is not None:
+        if left:
+            _tell(connection, "left", pid, left)
+        _tell(connection, "ended", pid, os.waitstatus_to_exitcode(status))
+
+
+def _end_orphans(known: set[int], group: int) -> list[str]:
+    """Kills every child that is not `known`, and theirs; returns those that had left the process group."""
+    left = []
+    while orphans := [pid for pid in _children() if pid not in known]:
+        for pid in orphans:
+            name = _name_outside(pid, group)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)  # our own child, not waited for yet: nobody else has its number
+            if not _await_death(pid):
+                known.add(pid)
+            if name:
+                left.append(f"{name} (process {pid})")
+    return left
+
+
+def _children() -> list[int]:
+    listed = Path(f"/proc/self/task/{os.getpid()}/children")
+    if listed.exists():
+        return [int(word) for word in listed.read_text().split()]
+    return [child.pid for child in psutil.Process().children()]
+
+
+def _name_outside(pid: int, group: int) -> str:
+    """Returns the name of a process that runs outside a group, else nothing."""
+    try:
+        process = psutil.Process(pid)
+        runs = process.status() != psutil.STATUS_ZOMBIE
+        return str(process.name()) if runs and os.getpgid(pid) != group else ""
+    except (psutil.Error, ProcessLookupError):
+        return ""
+
+
+def _await_death(pid: int) -> bool:
+    """Waits (bounded) for a child that was killed."""
+    pidfd = os.pidfd_open(pid)
+    try:
+        readable, _, _ = select.select([pidfd], [], [], DIE_WITHIN)
+    finally:
+        os.close(pidfd)
+    if readable:
+        os.waitpid(pid, 0)
+    return bool(readable)
+
+
+def _tell(connection: socket.socket, what: str, pid: int, fact: Any, descriptors: Iterable[int] = ()) -> None:
+    with contextlib.suppress(BrokenPipeError, ConnectionResetError):  # the supervisor is gone; serve() sees that next
+        data = msgpack.packb([what, pid, fact])
+        sent = socket.send_fds(connection, [data], list(descriptors))
+        connection.sendall(data[sent:])
+
+
+def _outlive(children: dict[int, int]) -> None:
+    """The supervisor is gone: its hosts notice by themselves and leave; those that do not are killed."""
+    deadline = time.monotonic() + LEAVE_WITHIN
+    while children and (left := deadline - time.monotonic()) > 0:
+        readable, _, _ = select.select(list(children), [], [], left)
+        for pidfd in readable:
+            _ended(None, children, pidfd)
+    for pidfd, pid in list(children.items()):
+        signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+        if select.select([pidfd], [], [], DIE_WITHIN)[0]:
+            _ended(None, children, pidfd)
+        else:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(pid, signal.SIGKILL)
+
+
+def main(descriptor: int) -> None:
+    """Runs the nursery process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    import importlib
+
+    _adopt_orphans()
+    for name in PRELOAD:
+        importlib.import_module(name)
+    gc.collect()
+    gc.freeze()
+    with socket.socket(fileno=descriptor) as connection:
+        serve(connection)
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]))

@@ -1,0 +1,40 @@
+"""The report of a run that has ended in order."""
+
+from __future__ import annotations
+
+from dataflow.supervision.report import RunReport
+from dataflow.supervision.run_state import RunState
+from dataflow.sync import FOREVER, NEVER
+
+
+def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport:
+    """Returns the report of a run that was released; `ended_at` is when everything was drained (steady s)."""
+    assert run.release is not None
+    status = run.status
+    reports = {p.label: p.report or {} for p in run.processes.values()}
+    streams = {s: (n, d) for r in reports.values() for s, (n, d) in r.get("streams", {}).items()}
+    reached = [c.done for c in status.operators.values() if c.done not in (NEVER, FOREVER)]
+    return RunReport(
+        graph=run.graph.name,
+        streams=dict(sorted(streams.items())),
+        operators=dict(status.operators),
+        drops={
+            node: tuple((i, why, n) for (i, why), n in sorted(status.drops[node].items()))
+            for node in status.operators
+            if status.drops.get(node)
+        },
+        summaries={node: s for r in reports.values() for node, s in r.get("summaries", {}).items()},
+        transport={label: r["transport"] for label, r in reports.items() if "transport" in r},
+        files={p.label: p.facts for p in run.processes.values() if p.is_sink},
+        first=status.first,
+        last=max(reached, default=None),
+        wall=ended_at - run.release.at.steady,
+        interrupted=interrupted,
+        notes=tuple(status.notes),
+        restarts=dict(status.restarts),
+        waits={
+            node: tuple((i, what, n) for (i, what), n in sorted(found.items()))
+            for node, found in status.waits.items()
+            if found
+        },
+    )

@@ -1,0 +1,109 @@
+"""The watch over runs in which nothing happens: who holds them up is named, and the run ends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.supervision.life import WORKS
+from dataflow.supervision.part import Part
+from dataflow.supervision.quiescence import Quiescence
+from dataflow.supervision.report import RunFailed
+from dataflow.supervision.run_state import RunState
+from dataflow.supervision.supervised import Supervised
+from dataflow.supervision.wording import how_long
+
+PING_AFTER = 1.0
+"""Seconds after which a process that says nothing is asked for a sign of life."""
+NO_ROUND = 0
+"""The number of a question that is no round of the proof of quiescence."""
+
+
+class StallWatch(Part):
+    """Ends a run in which nobody has made progress for `stall_timeout` seconds."""
+
+    def __init__(self, run: RunState, quiescence: Quiescence) -> None:
+        super().__init__(run)
+        self.quiescence = quiescence
+        self._heard = 0.0
+
+    def released(self) -> None:
+        self._heard = self.run.steady
+
+    def back(self, process: Supervised) -> None:
+        self._heard = self.run.steady
+
+    def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
+        if kind in ("progress", "ended"):
+            self._heard = self.run.steady
+
+    def tick(self) -> None:
+        timeout = self.run.plan.stall_timeout
+        if self.run.steady - self._heard <= timeout:
+            return
+        stuck = self._stuck()
+        if not stuck:
+            return
+        names = "; ".join(p.at_work() for p in stuck) + self._waits_for_clock()
+        words = self.run.last_words()
+        for process in self.quiescence.unanswered():  # they could not leave in order
+            self.run.kill(process)
+        raise RunFailed(f"no progress for {timeout:g} s; still busy: {names}", words)
+
+    def not_reading(self, process: Supervised, seconds: float, *, overflowed: bool) -> None:
+        """One that takes nothing any more has lost what it needs to go on."""
+        if overflowed and process.life in WORKS:
+            words = self.run.last_words()
+            self.run.kill(process)
+            raise RunFailed(f"{process.describe()} has read nothing for {seconds:.0f} s", words)
+
+    def _stuck(self) -> list[Supervised]:
+        """Returns those who hold up the run: who does not answer, else who has not ended."""
+        return self.quiescence.unanswered() or [p for p in self.run.working() if p.report is None]
+
+    def _waits_for_clock(self) -> str:
+        """Names a source that has nothing to do for long because its next message is due late."""
+        dues = [(due, label) for label, a in self.quiescence.latest.items() if (due := a.get("due")) is not None]
+        due, label = max(dues, default=(0.0, ""))
+        if due <= self.run.plan.stall_timeout:
+            return ""
+        rate = 1.0 if self.run.plan.rate is None else self.run.plan.rate
+        return f"; the next message of host {label!r} is due in {how_long(due)} at rate {rate:g}"
+
+
+class LiveStallWatch(StallWatch):
+    """As `StallWatch`, for a live run, where a robot at which nothing happens is as it should be: only one whose call
+    does not end holds it up. A process that gives no sign of life for so long ends the run, whatever others do."""
+
+    def __init__(self, run: RunState, quiescence: Quiescence) -> None:
+        super().__init__(run, quiescence)
+        self._signs: dict[str, float] = {}
+
+    def released(self) -> None:
+        super().released()
+        self._signs = dict.fromkeys(self.run.processes, self.run.steady)
+
+    def back(self, process: Supervised) -> None:
+        super().back(process)
+        self._signs[process.label] = self.run.steady
+
+    def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
+        super().said(process, kind, fields)
+        self._signs[process.label] = self.run.steady
+
+    def _stuck(self) -> list[Supervised]:
+        """Returns those who are at a call for as long as nothing has happened."""
+        timeout = self.run.plan.stall_timeout
+        return [p for p in self.run.working() if p.work is not None and p.work[2] >= timeout]
+
+    def tick(self) -> None:
+        super().tick()
+        now, timeout = self.run.steady, self.run.plan.stall_timeout
+        for process in list(self.run.working()):
+            silence = now - self._signs.get(process.label, now)
+            if silence > timeout:
+                words = self.run.last_words()
+                self.run.kill(process)
+                raise RunFailed(f"{process.describe()} gave no sign of life for {silence:.0f} s", words)
+            if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # hosts give one by themselves
+                self.run.send(process, "poll", replaces=True, round=NO_ROUND)

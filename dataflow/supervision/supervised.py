@@ -1,0 +1,87 @@
+"""One process, as its supervisor sees it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Any
+
+from dataflow.supervision.life import HAS_PROCESS, Life, Step, after
+from dataflow.supervision.plan import HostPlan
+from dataflow.sync import FOREVER, NEVER
+
+WORDS_KEPT = 50
+
+
+@dataclass(slots=True)
+class Supervised:
+    """State and news of one process. `since`: when it came into its state (steady s)."""
+
+    host: HostPlan
+    since: float = 0.0
+    life: Life = Life.STARTING
+    attempt: int = 0
+    """How many processes had this place before."""
+    unseen: set[str] = field(default_factory=set)
+    """Keys on which it has not seen a probe yet."""
+    done: dict[str, int] = field(default_factory=dict)
+    """How far it is: by operator, or for the recorder and the like of a live run by source."""
+    report: dict[str, Any] | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    """What it says when it has closed."""
+    words: deque[str] = field(default_factory=lambda: deque(maxlen=WORDS_KEPT))
+    cause: str = ""
+    """Why it was killed or told to leave."""
+    work: tuple[str, int, float] | None = None
+    """The firing that took longer than a moment when it was last heard of: operator, stamp, seconds."""
+    silent: bool = False
+    """It gives no sign of life, and the others go on without it."""
+    hung_up: float | None = None
+    """When it closed its channel."""
+
+    @property
+    def label(self) -> str:
+        return self.host.label
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return self.host.nodes
+
+    @property
+    def is_sink(self) -> bool:
+        return self.host.sink is not None
+
+    @property
+    def reachable(self) -> bool:
+        return self.life in HAS_PROCESS
+
+    def take(self, step: Step, now: float) -> bool:
+        """Changes the state; False, and nothing changes, when the step is out of turn."""
+        state = after(self.life, step)
+        if state is None:
+            return False
+        self.life, self.since = state, now
+        return True
+
+    def renew(self) -> None:
+        """Forgets what belonged to the process before."""
+        self.attempt += 1
+        self.unseen.clear()
+        self.words.clear()
+        self.cause, self.report, self.work = "", None, None
+        self.silent, self.hung_up = False, None
+
+    def describe(self) -> str:
+        what = ", ".join(self.nodes)
+        return f"host {self.label!r}" + (f" (operators {what})" if what and what != self.label else "")
+
+    def at_work(self) -> str:
+        """Returns such as "host 'camera', camera at stamp 5 for 3 s"."""
+        if self.work is None:
+            return self.describe()
+        operator, stamp, seconds = self.work
+        return f"{self.describe()}, {operator} at stamp {stamp} for {seconds:.0f} s"
+
+    def reached(self) -> str:
+        """Returns such as "camera had reached stamp 5"."""
+        return "; ".join(f"{n} had reached stamp {f}" for n, f in self.done.items() if f not in (NEVER, FOREVER))

@@ -1,0 +1,108 @@
+"""The work of one verification worker: operators re-executed and compared, stored messages checked."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from typing import Any
+
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.engine import Feeding, Recomputation, plan_feeding
+from dataflow.sync import Entry
+from dataflow.verification.board import Board
+from dataflow.verification.compare import Comparer
+from dataflow.verification.letters import inherited_records
+from dataflow.verification.stored import StoredCheck
+
+
+def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
+    """Re-executes the operators of one part. Runs in a worker.
+
+    The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
+    `records` and `batches` (see `letters.shared_records`), `begin` (stamp, or None), `tolerance`.
+    The answer: `operators` (verifications), `comparisons`, `stored`, `digests` by stream, `work` by
+    operator (see `OperatorCounts`), `wall` in seconds.
+    """
+    graph = Graph.from_json(request["graph"])
+    with Recording(request["path"]) as recording:
+        feeding = _with(plan_feeding(recording, graph, request["operators"]), request["checks"])
+        log = _records(request, graph, feeding)
+        comparer = Comparer(recording, graph, log, feeding.operators, request["tolerance"])
+        checks = _checks(recording, graph, log, request)
+
+        def read(stream: str, entry: Entry) -> None:
+            if stream in checks:
+                checks[stream].take((entry.incarnation, entry.seq), entry.digest)
+
+        work = Recomputation(
+            recording,
+            graph,
+            feeding,
+            log,
+            made=comparer.made,
+            read=read,
+            begin=request["begin"],
+            watcher=board,
+        )
+        started = time.monotonic()
+        results = work.run()
+        wall = time.monotonic() - started
+        compared = comparer.close(results)
+    states = [state for runner in work.runners.values() for state in runner.ports.states.values()]
+    return {
+        "operators": [result.to_wire() for result in results.values()],
+        "comparisons": {name: asdict(comparison) for name, comparison in compared.items()},
+        "stored": [check.result().to_wire() for check in checks.values()],
+        "digests": {s.stream: [s.digest.count, s.digest.hexdigest()] for s in states if s.digest is not None},
+        "work": {n: [r.firings, r.ports.emitted, 0, r.busy_ns, r.done] for n, r in work.runners.items()},
+        "wall": wall,
+    }
+
+
+def repeat_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
+    """Re-executes operators once more, until each has differed. Runs in a worker; the request is that of `verify_part`.
+
+    The answer: the first difference of each, as [incarnation, index, what was made]; None where there was none.
+    """
+    graph = Graph.from_json(request["graph"])
+    with Recording(request["path"]) as recording:
+        feeding = plan_feeding(recording, graph, request["operators"])
+        log = _records(request, graph, feeding)
+        work = Recomputation(recording, graph, feeding, log, made=_let_go, begin=request["begin"], watcher=board)
+        results = work.results()
+        asked = [results[name] for name in request["operators"]]
+        work.run(until=lambda: all(result.first is not None for result in asked))
+    return {v.operator: None if v.first is None else [v.first.incarnation, v.first.index, v.first.got] for v in asked}
+
+
+def _with(feeding: Feeding, checks: list[str]) -> Feeding:
+    return Feeding(feeding.operators, tuple(sorted({*feeding.streams, *checks})))
+
+
+def _records(request: Mapping[str, Any], graph: Graph, feeding: Feeding) -> FiringLog:
+    """The firing records of the operators, and of those that made what they take."""
+    taken = {s for name in feeding.operators for given in graph.nodes[name].inputs.values() for s in given}
+    makers = {graph.streams[stream].node for stream in taken.union(feeding.streams)}
+    return inherited_records(request["records"], request["batches"], makers.union(feeding.operators), request["path"])
+
+
+def _checks(recording: Recording, graph: Graph, log: FiringLog, request: Mapping[str, Any]) -> dict[str, StoredCheck]:
+    streams = request["checks"]
+    digests = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in streams}], streams)
+    return {
+        stream: StoredCheck(
+            stream,
+            graph.streams[stream].node,
+            digests[stream],
+            static=recording.streams[stream].static,
+            whole=request["begin"] is None,
+        )
+        for stream in streams
+    }
+
+
+def _let_go(stream: str, entry: Entry) -> None:
+    """Takes a message that nobody needs."""

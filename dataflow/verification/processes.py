@@ -1,0 +1,209 @@
+"""Calls functions in worker processes of their own, side by side, and watches over them.
+
+No network is involved: a worker has a socket pair to its parent and memory that both share. Whatever a worker does,
+the wait for it is bounded, and it does not outlive the call.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from types import FrameType, TracebackType
+from typing import IO, Any, Self
+
+from dataflow.firing.threads import environment
+from dataflow.process.channel import Channel, ChannelClosed, ready
+from dataflow.supervision.report import OperatorCounts, RunFailed, Status
+from dataflow.supervision.run import Watch
+from dataflow.verification.board import Board
+from dataflow.verification.letters import read_letter, write_letter
+
+LOOK_EVERY = 0.1
+SHOW_EVERY = 0.2
+LEAVE_WITHIN = 10.0
+LAST_WORDS = 4000
+
+Locate = Callable[[str, int], str]
+"""(operator, calls that it has repeated) → the call that it is at, in words."""
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A call for a worker: the function as `module:name`, plain values for it, and the operators it will run."""
+
+    function: str
+    request: Mapping[str, Any]
+    operators: tuple[str, ...] = ()
+
+
+def call_workers(
+    calls: Sequence[Call],
+    *,
+    threads: int,
+    descriptors: Sequence[int] = (),
+    stall_timeout: float = 120.0,
+    locate: Locate = lambda operator, repeated: "a firing",
+    watch: Watch | None = None,
+) -> list[Any]:
+    """The answers to `calls`, each from a process of its own.
+
+    `threads`: of numerical libraries, as in a run. `descriptors`: files that the workers inherit under the same number.
+    `stall_timeout`: seconds allowed without a step of a worker. `watch` is given the status a few times a second.
+    Raises `RunFailed` with the first that raises, dies or stalls; the others are then ended. Ctrl-C and SIGTERM end all
+    of them, and raise a `RunFailed` that is `interrupted`.
+    """
+    status = Status(phase="starting", started=time.time())
+    with ExitStack() as stack:
+        interrupted = stack.enter_context(_interrupts())
+        workers: list[_Worker] = []
+        for number, call in enumerate(calls, start=1):
+            words = stack.enter_context(tempfile.TemporaryFile())
+            workers.append(stack.enter_context(_Worker(number, call, threads, descriptors, locate, words)))
+        shown = 0.0
+        while left := [worker for worker in workers if not worker.answered]:
+            for channel in ready([worker.channel for worker in left], LOOK_EVERY):
+                next(worker for worker in left if worker.channel is channel).hear()
+            if interrupted.is_set():
+                raise RunFailed("interrupted", interrupted=True)
+            for worker in left:
+                worker.check(stall_timeout)
+            if watch is not None and time.monotonic() - shown >= SHOW_EVERY:
+                shown = time.monotonic()
+                watch(_updated(status, workers))
+        if watch is not None:
+            watch(_updated(status, workers))
+        return [worker.answer for worker in workers]
+
+
+def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
+    for worker in workers:
+        if worker.board.steps:
+            status.phase = "running"
+        for name in worker.call.operators:
+            counts = worker.board.counts(name)
+            status.host_of[name] = f"worker {worker.number}"
+            status.operators[name] = OperatorCounts(counts.firings, counts.emitted, 0, counts.busy_ns, counts.done)
+    return status
+
+
+class _Worker:
+    """One worker process, as its parent sees it."""
+
+    def __init__(
+        self,
+        number: int,
+        call: Call,
+        threads: int,
+        descriptors: Sequence[int],
+        locate: Locate,
+        words: IO[bytes],
+    ) -> None:
+        self.number, self.call, self._locate, self._words = number, call, locate, words
+        self.answered, self.answer = False, None
+        self._letter = os.memfd_create("call")
+        write_letter(
+            self._letter,
+            {"function": call.function, "request": dict(call.request), "operators": list(call.operators)},
+        )
+        self.channel, theirs = Channel.pair()
+        shared = os.memfd_create("board")
+        try:
+            self.board = Board(shared, call.operators)
+            self._process = subprocess.Popen(
+                [sys.executable, "-P", "-m", "dataflow.verification.worker", *map(str, (theirs, self._letter, shared))],
+                pass_fds=(theirs, self._letter, shared, *descriptors),
+                env=environment(threads),
+                stdin=subprocess.DEVNULL,
+                stdout=words,
+                stderr=subprocess.STDOUT,
+                process_group=0,
+            )
+        finally:
+            os.close(theirs)  # the worker has its own; with ours open its death would go unseen
+            os.close(shared)
+        self._steps, self._since = 0, time.monotonic()
+
+    def hear(self) -> None:
+        """Takes the answer. Raises `RunFailed` when there is none to come."""
+        try:
+            kind, _ = self.channel.receive()
+        except ChannelClosed:
+            raise self._failed(self._end()) from None
+        answer = read_letter(self._letter)
+        if kind == "failed":
+            raise RunFailed(answer["summary"], answer["traceback"], answer["operator"])
+        self.answered, self.answer = True, answer["value"]
+
+    def _end(self) -> str:
+        """The way in which the process ended, in words. It is not waited for yet: so its group keeps its number."""
+        deadline = time.monotonic() + LEAVE_WITHIN
+        while time.monotonic() < deadline:
+            found = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
+            if found is not None and found.si_code == os.CLD_EXITED:
+                return f"ended its process with code {found.si_status}"
+            if found is not None:
+                return f"was killed by {signal.Signals(found.si_status).name}"
+            time.sleep(0.01)
+        return "closed its connection"
+
+    def check(self, stall_timeout: float) -> None:
+        """Raises `RunFailed` when the worker has made no step for so long."""
+        now, steps = time.monotonic(), self.board.steps
+        if steps != self._steps:
+            self._steps, self._since = steps, now
+        elif not self.answered and now - self._since > stall_timeout:
+            raise self._failed(f"made no progress for {stall_timeout:g} s")
+
+    def _failed(self, what: str) -> RunFailed:
+        phase, operator = self.board.place()
+        self._words.seek(0, os.SEEK_END)
+        self._words.seek(max(0, self._words.tell() - LAST_WORDS))
+        words = self._words.read().decode(errors="backslashreplace")
+        if not operator:
+            doing = "while starting" if phase == "start" else "while reading the recording"
+            of = f" (operators {', '.join(self.call.operators)})" if self.call.operators else ""
+            return RunFailed(f"worker {self.number}{of} {what} {doing}", words)
+        at = f"{phase}()" if phase != "fire" else self._locate(operator, self.board.counts(operator).repeated)
+        return RunFailed(f"operator {operator!r} {what} in {at}", words, operator)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Ends the process, if it still runs, with everything that its operators have started."""
+        with suppress(ProcessLookupError, PermissionError):  # not waited for yet: nobody else can have its number
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait(timeout=LEAVE_WITHIN)
+        os.close(self._letter)
+        self.channel.close()
+        self.board.close()
+
+
+@contextmanager
+def _interrupts() -> Iterator[threading.Event]:
+    """The event that Ctrl-C, SIGTERM and SIGHUP set meanwhile; a signal that is ignored stays so."""
+    asked = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield asked
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        asked.set()
+
+    mine = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
+    before = {number: signal.signal(number, handle) for number in mine}
+    try:
+        yield asked
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

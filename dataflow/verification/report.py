@@ -1,0 +1,163 @@
+"""The report of a verification: what was re-executed and compared, and what that says of the recording."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from dataflow.records.comparison import Verification
+from dataflow.supervision.report import OperatorCounts
+from dataflow.verification.compare import OutputComparison
+from dataflow.verification.ledger import Account
+from dataflow.verification.stored import StoredStream
+
+Verdict = Literal["identical", "within tolerance", "culprit", "downstream", "changed", "unverifiable"]
+
+
+@dataclass(frozen=True, slots=True)
+class StandIn:
+    """A source, or another operator whose recorded streams were used: its streams against its firing records.
+
+    `unaccounted` stored messages are of no record; `lost_records` calls follow a gap in the records; `unfinished`: they
+    end before the run did. `missing` messages are in the records and not in the recording: never sent, or lost.
+    `cut`: the recording itself ends before the run did.
+    """
+
+    operator: str
+    unaccounted: int = 0
+    lost_records: int = 0
+    unfinished: bool = False
+    missing: int = 0
+    cut: bool = False
+
+    @staticmethod
+    def of(operator: str, account: Account, *, ended: bool) -> StandIn:
+        cut = not ended and not account.finished
+        return StandIn(
+            operator, account.unaccounted, account.lost, not account.finished and not cut, account.not_stored, cut
+        )
+
+    @property
+    def whole(self) -> bool:
+        """Its records tell of every stored message, as far as the recording goes. Missing messages are only noted."""
+        return not (self.lost_records or self.unfinished or (self.unaccounted and not self.cut))
+
+
+@dataclass(frozen=True, slots=True)
+class VerifyReport:
+    """The result of verifying one recording.
+
+    `stood_in` are the operators whose recorded streams were used instead, `stand_ins` those and the sources, with what
+    their records say; `stored` the streams whose stored messages were compared with the records, `unchecked` those that
+    could not be. `facts` are what differs between the machine that recorded and this one: (fact, then, now). `wall`:
+    seconds of re-execution, `total`: of everything; `span`: seconds of event time.
+    `comparisons` hold, for the operators that differ, how their messages compare with the recorded ones; `repeated`,
+    for culprits that were run twice, whether they differed alike. `digests` are (messages, stream digest) of what was
+    made here, by stream; `outputs` the streams of each operator, `producers` the nodes that it takes from.
+    `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so what is
+    verified is what had been stored. `work` tells how long each operator worked.
+    """
+
+    operators: tuple[Verification, ...]
+    stood_in: tuple[str, ...]
+    facts: tuple[tuple[str, str, str], ...]
+    messages: int
+    streams: int
+    wall: float
+    span: float
+    total: float = 0.0
+    stand_ins: tuple[StandIn, ...] = ()
+    stored: tuple[StoredStream, ...] = ()
+    unchecked: tuple[str, ...] = ()
+    tolerance: float | None = None
+    comparisons: Mapping[str, OutputComparison] = field(default_factory=dict)
+    repeated: Mapping[str, bool] = field(default_factory=dict)
+    digests: Mapping[str, tuple[int, str]] = field(default_factory=dict)
+    outputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
+    start: float | None = None
+    torn: bool = False
+    work: Mapping[str, OperatorCounts] = field(default_factory=dict)
+
+    @property
+    def identical(self) -> bool:
+        """True only when every firing of the run was repeated, every output was the same, bit for bit, and every
+        stored message is the one that the firing records tell of."""
+        return (
+            not self.cut
+            and all(self.verdict(v) == "identical" for v in self.operators)
+            and not self.changed
+            and all(s.whole for s in self.stand_ins)
+        )
+
+    @property
+    def cut(self) -> bool:
+        """The recording ends before its run did: what it was verified up to is all that can be said of it."""
+        return any(v.cut for v in self.operators)
+
+    @property
+    def empty(self) -> bool:
+        """Nothing but the end of operators was repeated of a run that was cut: nothing was verified."""
+        if not self.operators:
+            return True
+        repeated = sum(self.work[v.operator].firings if v.operator in self.work else v.verified for v in self.operators)
+        return self.cut and not repeated
+
+    @property
+    def changed(self) -> tuple[StoredStream, ...]:
+        """The streams in which stored messages are not what was recorded."""
+        return tuple(s for s in self.stored if s.changed)
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Every operator is identical or, given the recorded inputs, stays within the tolerance."""
+        return all(self.verdict(v) in ("identical", "within tolerance") for v in self.operators)
+
+    @property
+    def culprits(self) -> tuple[str, ...]:
+        return tuple(v.operator for v in self.operators if self.verdict(v) == "culprit")
+
+    def verdict(self, verification: Verification) -> Verdict:
+        """The verdict on an operator: its own, what the tolerance makes of it, or `changed` where only what was stored
+        of it is not what it made."""
+        compared = self.comparisons.get(verification.operator)
+        if verification.first is None:
+            changed = any(s.maker == verification.operator for s in self.changed)
+            return "changed" if changed else verification.verdict
+        if self.tolerance is None or compared is None:
+            return verification.verdict
+        return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
+
+    def repeats(self, operator: str) -> bool | None:
+        """Whether a culprit differed twice alike; None where it was not run twice."""
+        return self.repeated.get(operator)
+
+    def as_json(self) -> dict[str, Any]:
+        operators = []
+        for v in self.operators:
+            compared = self.comparisons.get(v.operator)
+            operators.append(
+                v.to_wire()
+                | {"verdict": self.verdict(v), "repeats": self.repeats(v.operator)}
+                | {"comparison": None if compared is None else compared.as_json()}
+            )
+        return {
+            "identical": self.identical,
+            "tolerance": self.tolerance,
+            "within_tolerance": None if self.tolerance is None else self.within_tolerance,
+            "culprits": list(self.culprits),
+            "start_s": self.start,
+            "torn": self.torn,
+            "cut": self.cut,
+            "messages": self.messages,
+            "streams": self.streams,
+            "wall_s": self.wall,
+            "real_time_factor": self.span / self.wall if self.wall else None,
+            "operators": operators,
+            "stood_in": list(self.stood_in),
+            "sources": [asdict(s) | {"whole": s.whole} for s in self.stand_ins],
+            "stored": [s.to_wire() for s in self.stored if not s.as_recorded or s.missing],
+            "unchecked": list(self.unchecked),
+            "differing_facts": [{"fact": f, "recorded": a, "here": b} for f, a, b in self.facts],
+        }

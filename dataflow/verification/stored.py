@@ -1,0 +1,80 @@
+"""Compares stored messages with the digests in the firing records of the operators that made them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from dataflow.records.reading import Place
+
+
+@dataclass(slots=True)
+class StoredStream:
+    """The messages of one stream in a recording against the firing records of its maker.
+
+    `changed` stored messages have another digest than the records say, `uncalled` ones are of no record, or are stored
+    twice; `missing` ones are in the records and not in the stream. The places are those of the first of each.
+    """
+
+    stream: str
+    maker: str
+    changed: int = 0
+    uncalled: int = 0
+    missing: int = 0
+    first_changed: Place | None = None
+    first_uncalled: Place | None = None
+    first_missing: Place | None = None
+
+    @property
+    def as_recorded(self) -> bool:
+        """Every stored message is one that its maker's records tell of. Missing ones may never have been sent."""
+        return not (self.changed or self.uncalled)
+
+    def to_wire(self) -> dict[str, Any]:
+        return asdict(self)
+
+    @staticmethod
+    def from_wire(values: Mapping[str, Any]) -> StoredStream:
+        """From the values of `to_wire` after a way that knows only lists."""
+        first = {name: tuple(values[name]) for name in values if name.startswith("first") and values[name] is not None}
+        return StoredStream(**{**values, **first})
+
+
+class StoredCheck:
+    """Checks one stream, message by message in any order. `digests`: what the records say was emitted, by place.
+
+    `whole`: the stream is read from its beginning; else what is missing counts from the first message on.
+    """
+
+    def __init__(self, stream: str, maker: str, digests: Mapping[Place, bytes], *, static: bool, whole: bool) -> None:
+        self._result = StoredStream(stream, maker)
+        self._left = {place: digest for place, digest in digests.items() if place[1] >= 0}
+        self._static, self._whole = static, whole
+        self._first: Place | None = None
+
+    def take(self, place: Place, digest: bytes) -> None:
+        """Compares a stored message, known by its place in the stream."""
+        result = self._result
+        if self._first is None or place < self._first:
+            self._first = place
+        expected = self._left.pop(place, None)
+        if expected is None:
+            result.uncalled += 1
+            if result.first_uncalled is None or place < result.first_uncalled:
+                result.first_uncalled = place
+        elif expected != digest:
+            result.changed += 1
+            if result.first_changed is None or place < result.first_changed:
+                result.first_changed = place
+
+    def result(self) -> StoredStream:
+        """The outcome, once every message was taken. A static stream is recorded once, however often it was made."""
+        left = set(self._left)
+        if self._static and self._first is not None:
+            left = set()
+        elif not self._whole:
+            left = {place for place in left if self._first is not None and place > self._first}
+        self._result.missing = len(left)
+        self._result.first_missing = min(left, default=None)
+        return self._result

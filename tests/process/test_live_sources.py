@@ -1,0 +1,201 @@
+"""Live sources: they are restarted when they raise, and closed when nobody reads them any more."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Iterator
+from typing import Any
+
+import process_operators
+import pytest
+from process_doubles import RecordedChannel
+
+from dataflow.feeds.window import Window
+from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.source import SourceRunner
+from dataflow.graph import load_text
+from dataflow.process import live_sources
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.pace import Pace
+from dataflow.records.firing import FiringRecord
+from dataflow.sync import Entry
+
+
+@pytest.fixture(autouse=True)
+def _first_lives() -> Iterator[None]:
+    process_operators.Count.lives = 0
+    process_operators.Count.closed.clear()
+    process_operators.Blocks.ends.clear()
+    process_operators.Blocks.waiting.clear()
+    process_operators.Blocks.let_go.clear()
+    yield
+    process_operators.Blocks.let_go.set()
+
+
+class Emitted:
+    """Keeps what a source emits."""
+
+    def __init__(self) -> None:
+        self.messages: list[tuple[int, int, int]] = []  # incarnation, number, stamp
+        self.ends: list[str] = []
+        self.records: list[tuple[int, str]] = []
+
+    def message(self, stream: str, entry: Entry) -> None:
+        self.messages.append((entry.incarnation, entry.seq, entry.stamp))
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        """Frontiers are of no interest here."""
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        self.ends.append(reason)
+
+    def record(self, record: FiringRecord) -> None:
+        self.records.append((record.incarnation, record.kind))
+
+
+class Sources:
+    """Live sources of a graph with one of them, and a main thread for them."""
+
+    def __init__(self, use: str, *, restarts: int = 0, **params: Any) -> None:
+        self.inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
+        self.channel, self.emitted = RecordedChannel(), Emitted()
+        window, backlog = Window(256, 1 << 20), Window(4096, 1 << 24)
+        self.live = LiveSources(
+            self.inbox,
+            self.channel,  # type: ignore[arg-type]
+            Pace(None),
+            window,
+            backlog,
+            resumed=False,
+        )
+        self.runner = SourceRunner(node_of(use, restarts, params), self.emitted, live=True)
+        self.live.add(self.runner)
+        self.runner.setup()
+        self.live.start()
+
+    def run(self) -> None:
+        """Handles what the reader hands over until the source has ended."""
+        while not self.runner.ended:
+            due = self.live.next_due()
+            self.live.restart_due()
+            try:
+                kind, *rest = self.inbox.get(timeout=10 if due is None else due)
+            except queue.Empty:
+                assert due is not None, "the source neither ends nor fails"
+                continue
+            (self.live.take if kind == "source" else self.live.failed)(*rest)
+
+
+def node_of(use: str, restarts: int, params: dict[str, Any]) -> Any:
+
+    live = f"live: {{restart: {{max: {restarts}, backoff: 1ms}}}}" if restarts else ""
+    text = f"""\
+graph: sources
+namespace: test
+operators:
+  camera:
+    use: process_operators:{use}
+    params: {params}
+    {live}
+  twice: {{use: process_operators:Twice, inputs: {{x: camera/count}}}}
+"""
+    node = load_text(text).nodes["camera"]
+    assert node.live.restart.max == restarts
+    return node
+
+
+def test_a_source_that_raises_is_restarted_and_its_streams_begin_a_new_incarnation() -> None:
+    sources = Sources("Count", restarts=2, fails_at=4)
+
+    with pytest.raises(OperatorFailure) as caught:
+        sources.run()
+
+    assert (caught.value.operator, caught.value.summary) == ("camera", "Unplugged: no such device")
+    assert caught.value.when == "stream() after stamp 1203"
+    told = sources.channel.of("restarting")
+    assert [(t["operator"], t["when"]) for t in told] == [
+        ("camera", "stream() after stamp 1003"),
+        ("camera", "stream() after stamp 1103"),
+    ]
+    assert all(t["summary"] == "Unplugged: no such device" and t["pause"] > 0 for t in told)
+    assert sources.emitted.messages == [(i, k, 1000 + 100 * i + k) for i in range(3) for k in range(4)]
+    assert [i for i, kind in sources.emitted.records if kind == "setup"] == [0, 1, 2]
+    assert len(process_operators.Count.closed) == 2
+    assert sources.live.restarts_of("camera") == 2
+
+
+def test_without_a_policy_a_source_that_raises_fails_the_run() -> None:
+    with pytest.raises(OperatorFailure, match="'camera' failed in stream"):
+        Sources("Count", fails_at=0).run()
+
+
+def test_a_step_that_breaks_the_contract_restarts_the_source_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread that reads it ends first."""
+    monkeypatch.setattr(SourceRunner, "emit_live", _refuse_once(SourceRunner.emit_live))
+    sources = Sources("Count", restarts=1, number=3)
+
+    sources.run()
+
+    assert sources.channel.of("restarting")[0]["summary"] == "ValueError: no such port"
+    assert sources.emitted.messages[-1][0] == 1
+    assert sources.emitted.ends == ["end of source"]
+
+
+def _refuse_once(emit: Any) -> Any:
+    refused: list[int] = []
+
+    def emit_live(self: SourceRunner, step: Any) -> Any:
+        if not refused:
+            refused.append(1)
+            raise OperatorFailure(self.node.name, "stream()", ValueError("no such port"))
+        return emit(self, step)
+
+    return emit_live
+
+
+def test_any_exception_of_the_thread_ends_the_source_under_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    def wrong(step: Any) -> tuple[int, int]:
+        raise AssertionError("a fault of the runtime's own")
+
+    monkeypatch.setattr(live_sources, "step_size", wrong)
+
+    with pytest.raises(OperatorFailure, match=r"'camera' failed in the thread .*AssertionError: a fault of the"):
+        Sources("Count").run()
+
+
+def test_a_source_is_closed_when_its_stream_has_returned() -> None:
+    sources = Sources("Blocks")
+    assert process_operators.Blocks.waiting.wait(10)
+    process_operators.Blocks.let_go.set()
+
+    late, failures = sources.live.await_readers()
+
+    assert (late, failures) == (set(), [])
+    assert process_operators.Blocks.ends == [("stream", "source camera")]
+
+
+def test_a_stream_that_does_not_return_is_named_and_left_alone(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(live_sources, "RETURN_WITHIN", 0.05)
+    sources = Sources("Blocks")
+    assert process_operators.Blocks.waiting.wait(10)
+
+    late, _ = sources.live.await_readers()
+
+    assert late == {"camera"}
+    assert "source 'camera' did not return within 0.05 s: close() is not called" in capsys.readouterr().err
+
+
+def test_the_restart_that_is_pending_is_forgotten_when_the_run_is_stopped() -> None:
+    sources = Sources("Count", restarts=1, fails_at=0)
+    kind, *rest = sources.inbox.get(timeout=10)
+    assert kind == "source_failed"
+    sources.live.failed(*rest)
+    sources.live.finish("interrupted")
+
+    sources.run()
+    sources.live.restart_due()
+
+    assert sources.emitted.ends == ["interrupted"]
+    assert process_operators.Count.lives == 1

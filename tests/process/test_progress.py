@@ -1,0 +1,71 @@
+"""When a process reports: not too often, and no later than when there is nothing else to do."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from process_doubles import RecordedChannel
+
+from dataflow.process.progress import REPORT_EVERY, REPORT_IDLE, Progress
+
+
+class Reporting:
+    """The progress of one operator, and a clock for it."""
+
+    def __init__(self) -> None:
+        ports = SimpleNamespace(emitted=0, states={})
+        node = SimpleNamespace(name="last")
+        counts: dict[str, Any] = {"drops": {}, "timeouts": {}, "late": {}}
+        self.operator = SimpleNamespace(node=node, done=0, firings=0, ports=ports, busy_ns=0, **counts)
+        self.channel, self.now = RecordedChannel(), 0.0
+        runners: Any = SimpleNamespace(operators=[self.operator], sources=[])
+        feeding: Any = SimpleNamespace(feeds=[], logs=[])
+        live: Any = SimpleNamespace(runners=[], behind=dict)
+        channel: Any = self.channel
+        self.progress = Progress(channel, runners, feeding, live, lambda: self.now)
+
+    def fires(self, *, idle: bool) -> None:
+        self.operator.done += 10
+        self.operator.firings += 1
+        self.progress.report(idle=idle)
+
+    @property
+    def told(self) -> list[int]:
+        return [fields["done"].get("last", 0) for fields in self.channel.of("progress")]
+
+
+def test_a_busy_process_reports_now_and_then() -> None:
+    one = Reporting()
+    for _ in range(8):
+        one.fires(idle=False)
+        one.now += REPORT_EVERY / 4
+
+    assert one.told == [10, 50]
+    assert one.progress.next_due() is None
+
+
+def test_an_idle_process_reports_at_once_or_wakes_up_to_do_so() -> None:
+    one = Reporting()
+    one.fires(idle=True)
+    one.now += REPORT_IDLE
+    one.fires(idle=True)
+    one.fires(idle=True)
+
+    assert one.told == [10, 20]
+    assert one.progress.next_due() == pytest.approx(REPORT_IDLE)
+    one.now += REPORT_IDLE
+    one.progress.report(idle=True)
+    assert one.told == [10, 20, 30]
+    assert one.progress.next_due() is None
+
+
+def test_a_process_in_which_nothing_changed_says_nothing() -> None:
+    one = Reporting()
+    one.fires(idle=True)
+    one.now += 1.0
+    one.progress.report(idle=True)
+
+    assert one.told == [10]
+    assert one.progress.next_due() is None

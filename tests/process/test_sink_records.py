@@ -1,0 +1,98 @@
+"""Firing records on their way into a recording: none is passed over, and none of somebody else is stored."""
+
+from __future__ import annotations
+
+import queue
+from typing import Any
+
+import pytest
+from process_doubles import RecordedChannel
+
+from dataflow.graph import load_text
+from dataflow.names import firings_key
+from dataflow.process.sink import SinkConfig, SinkProcess
+from dataflow.records.firing import FiringRecord, decode_batch, encode_batch
+
+GRAPH = """\
+graph: one
+namespace: test
+operators:
+  camera: {use: "process_operators:Count"}
+  last: {use: "process_operators:Twice", inputs: {x: camera/count}}
+"""
+KEY = firings_key("test", "last")
+
+
+class Stored:
+    """A sink that keeps the places of the records it is given."""
+
+    def __init__(self) -> None:
+        self.places: list[tuple[int, int]] = []
+
+    def firings(self, operator: str, stamp: int, payload: bytes) -> None:
+        self.places += [(r.incarnation, r.index) for r in decode_batch(payload).records]
+
+
+class Recorder:
+    """A recorder without a network."""
+
+    def __init__(self) -> None:
+        graph = load_text(GRAPH)
+        self.channel, self.stored = RecordedChannel(), Stored()
+        config = SinkConfig("@recorder", "record", graph.to_json(), [], ["camera", "last"], [], "secret", {}, live=True)
+        inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
+        self.process = SinkProcess(config, self.channel, inbox, lambda *_: self.stored)  # type: ignore[arg-type]
+        self.process.sink = self.stored  # type: ignore[assignment]
+
+    def arrives(self, *places: tuple[int, int], operator: str = "last", key: str = KEY) -> None:
+        self.process._receive(key, batch(*places, operator=operator))
+
+
+def batch(*places: tuple[int, int], operator: str = "last") -> bytes:
+    return encode_batch([FiringRecord(operator, incarnation, index, "fire", index) for incarnation, index in places])
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "lacking"),
+    [
+        ([(0, 0), (0, 1)], [(0, 4)], [(0, 2), (0, 3)]),  # in the same incarnation
+        ([(0, 0), (0, 1)], [(1, 2)], [(1, 0), (1, 1)]),  # at the beginning of the next one
+        ([], [(0, 1)], [(0, 0)]),  # at the very beginning
+    ],
+)
+def test_records_that_did_not_come_are_asked_for(
+    before: list[tuple[int, int]], after: list[tuple[int, int]], lacking: list[tuple[int, int]]
+) -> None:
+    recorder = Recorder()
+    if before:
+        recorder.arrives(*before)
+    recorder.arrives(*after)
+
+    assert recorder.channel.of("lacks") == [{"operator": "last"}]
+    everything = [batch(place) for place in (*before, *lacking, *after)]
+    recorder.process._control("records", {"batches": everything})
+    assert sorted(recorder.stored.places) == sorted([*before, *lacking, *after])
+
+
+def test_records_that_come_again_after_the_last_ones_are_taken() -> None:
+    recorder = Recorder()
+    recorder.process._receive(KEY, batch((0, 0)))
+    finish = encode_batch([FiringRecord("last", 0, 2, "finish", 2)], last=True)
+    recorder.process._receive(KEY, finish)
+    for again in (batch((0, 0), (0, 1)), finish):
+        recorder.process._receive(KEY, again)
+
+    assert sorted(recorder.stored.places) == [(0, 0), (0, 1), (0, 2)]
+    assert recorder.process.inlet.malformed == 0
+
+
+def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys: pytest.CaptureFixture[str]) -> None:
+    recorder = Recorder()
+
+    recorder.process._receive(KEY, b"\xc1garbage")
+    recorder.arrives((0, 0), operator="camera")
+    recorder.arrives((0, 0))
+
+    assert recorder.stored.places == [(0, 0)]
+    assert (recorder.process.inlet.malformed, recorder.process.inlet.misplaced) == (1, 1)
+    assert capsys.readouterr().err.count(KEY) == 2

@@ -1,0 +1,187 @@
+"""Plays of the supervisor's core: processes that answer as real ones do, a clock that the test moves, no I/O."""
+
+from __future__ import annotations
+
+import signal
+from collections import deque
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.graph import load_text
+from dataflow.records.black_box import Reached, Remains
+from dataflow.records.firing import FiringRecord, encode_batch
+from dataflow.supervision.commands import Command, Over, Send, Signal, Spawn
+from dataflow.supervision.compose import core_of
+from dataflow.supervision.configs import configurations
+from dataflow.supervision.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
+from dataflow.supervision.plan import RunPlan, host_plans
+
+WALL = 1_700_000_000.0
+STEP = 0.05
+
+
+def graph_of(*operators: str) -> Any:
+    lines = "\n  ".join(operators)
+    return load_text(f"graph: robot\nnamespace: test\noperators:\n  {lines}\n")
+
+
+IDLE = {"idle": True, "sent": 0, "received": 0, "full": False, "waiting": {}, "due": None}
+LEFT = "left: {use: runtime_operators:Counter}"
+SUM = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}"
+
+
+class Play:
+    """One run. `deaf` processes do nothing any more, as stopped ones; `broken` ones fail when they are set up."""
+
+    def __init__(self, *operators: str, live: bool = False, **options: Any) -> None:
+        graph = graph_of(*(operators or (LEFT, SUM)))
+        self.plan = RunPlan(graph, live=live, **{"placement": "host_each"} | options)
+        self.hosts = host_plans(self.plan)
+        endpoints = {label: f"tcp/127.0.0.1:{7000 + k}" for k, label in enumerate(self.hosts)}
+        self.core = core_of(self.plan, self.hosts, configurations(self.plan, self.hosts, endpoints, "secret"))
+        self.now = 100.0
+        self.commands: list[Command] = []
+        self.over: Over | None = None
+        self.deaf: set[str] = set()
+        self.broken: set[str] = set()
+        self.beating = live
+        self.state: Mapping[str, Any] | None = None
+        """What processes answer when they are asked how they are; None: they are too busy to answer."""
+        self.alive: set[str] = set()
+        self.kept: dict[str, list[bytes]] = {}
+        self.reached: dict[str, Reached] = {}
+        self._answers: deque[Event] = deque()
+
+    # The clock
+
+    def tell(self, *events: Event) -> list[Command]:
+        """Feeds events, and whatever the processes answer; returns the commands that they led to."""
+        self._answers.extend(events)
+        given: list[Command] = []
+        while self._answers:
+            for command in self.core.handle(self._answers.popleft(), Moment(self.now, WALL + self.now)):
+                given.append(command)
+                self._do(command)
+                self.commands.append(command)
+        return given
+
+    def wait(self, seconds: float) -> list[Command]:
+        """Lets time pass, in ticks."""
+        given: list[Command] = []
+        until = self.now + seconds
+        while self.now < until and self.over is None:
+            self.now += STEP
+            if self.beating and self.core.run.under_way:
+                given += self.tell(*(self.beat(label) for label in self.hosts if self.works(label)))
+            given += self.tell(Tick())
+        return given
+
+    def works(self, label: str) -> bool:
+        return label in self.alive and label not in self.deaf and not label.startswith("@")
+
+    def beat(self, label: str, work: tuple[str, int, float] | None = None) -> Said:
+        return Said(label, "beat", {"memory": 1, "work": work})
+
+    # What processes do
+
+    def _do(self, command: Command) -> None:
+        match command:
+            case Spawn(label):
+                if label in spawned(self.commands):  # a new process, not the stopped one
+                    self.deaf.discard(label)
+                self.alive.add(label)
+            case Signal(label, signal.SIGKILL) if label in self.alive:
+                self.dies(label, -9)
+            case Send(label, kind, fields) if label in self.alive and label not in self.deaf:
+                self._answers.extend(self._answer(label, kind, fields))
+            case Over():
+                assert self.over is None
+                self.over = command
+
+    def dies(self, label: str, code: int) -> None:
+        self._answers.extend(self._ends(label, code))
+
+    def _ends(self, label: str, code: int) -> list[Event]:
+        """A process ends; in a live run, what it has kept of its firing records is read."""
+        self.alive.discard(label)
+        nodes = self.hosts[label].nodes
+        remains = Remains({n: self.kept.pop(n, []) for n in nodes}, {n: self.reached.get(n, Reached()) for n in nodes})
+        return [*([Remained(label, remains)] if self.plan.live and nodes else []), Died(label, code)]
+
+    def keeps(self, *records: FiringRecord) -> None:
+        """Operators write these into the black boxes of their processes."""
+        for record in records:
+            self.kept.setdefault(record.operator, []).append(encode_batch([record]))
+            self.reached.setdefault(record.operator, Reached()).take(
+                record, tuple(self.plan.graph.nodes[record.operator].outputs)
+            )
+
+    def _answer(self, label: str, kind: str, fields: Mapping[str, Any]) -> list[Event]:
+        match kind:
+            case "host" | "sink" if label in self.broken:
+                return [self.failed(label, "setup()")]
+            case "host" | "sink":
+                return [Said(label, "joined", {}), Said(label, "ready", {"first": None, "steps": None})]
+            case "probe":
+                return [
+                    Said(other, "seen", {"stream": stream})
+                    for other in self.hosts
+                    if other in self.alive and other not in self.deaf
+                    for stream in self.hosts[label].publish
+                ]
+            case "poll" if self.state is not None:
+                return [Said(label, "state", IDLE | self.state | {"round": fields["round"]})]
+            case "leave":
+                return [Said(label, "closed", {"facts": {}}), *self._ends(label, 0)]
+        return []
+
+    def failed(self, label: str, when: str) -> Said:
+        fields = {"operator": label, "when": when, "summary": "RuntimeError: no camera", "traceback": "…"}
+        return Said(label, "failed", fields)
+
+    def progress(self, label: str, done: Mapping[str, int] | None = None, **more: Any) -> Said:
+        done = done or {}
+        counts = {name: [1, 1, 0, 0, stamp] for name, stamp in done.items()}
+        return Said(label, "progress", {"done": done, "counts": counts, **more})
+
+    def ended(self, label: str) -> Said:
+        return Said(label, "ended", {"report": {"counts": {}, "streams": {}, "transport": {}}})
+
+    # Scenes
+
+    def begins(self) -> None:
+        self.tell(Begin())
+
+    def starts(self) -> Play:
+        self.begins()
+        self.wait(2 * STEP)
+        assert self.core.status.phase == "running", self.over
+        return self
+
+    def stops(self) -> list[Command]:
+        return self.tell(StopAsked())
+
+    def ends(self) -> Over:
+        """All processes hand in their reports, and the run closes."""
+        self.tell(*(self.ended(label) for label in self.hosts))
+        self.wait(5.0)
+        assert self.over is not None
+        return self.over
+
+    def failure(self) -> str:
+        assert self.over is not None
+        assert self.over.failure is not None
+        return str(self.over.failure)
+
+
+def sent(commands: list[Command], kind: str) -> list[tuple[str, Mapping[str, Any]]]:
+    """Returns to whom messages of a kind were sent, and their fields."""
+    return [(c.label, c.fields) for c in commands if isinstance(c, Send) and c.kind == kind]
+
+
+def spawned(commands: list[Command]) -> list[str]:
+    return [c.label for c in commands if isinstance(c, Spawn)]
+
+
+def killed(commands: list[Command]) -> list[str]:
+    return [c.label for c in commands if isinstance(c, Signal) and c.number == signal.SIGKILL]

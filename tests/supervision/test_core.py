@@ -1,0 +1,255 @@
+"""The course of a run without loss: from the barrier to the last process's end."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from plays import Play, killed, sent, spawned
+
+from dataflow.supervision.commands import Announce, Over, Withdraw
+from dataflow.supervision.events import Aborted, Begin, Died, HungUp, LeftBehind, Printed, Said, Tick
+from dataflow.sync import FOREVER
+
+
+def test_sources_are_released_when_every_edge_is_proven_and_not_before() -> None:
+    play = Play()
+    play.deaf.add("sum")
+
+    assert spawned(play.tell(Begin())) == ["left", "sum"]
+    play.tell(Said("sum", "joined", {}))
+    assert sent(play.wait(1.0), "probe") == []
+    asked = play.tell(Said("sum", "ready", {"first": 7, "steps": 3}), Tick())
+    assert [label for label, _ in sent(asked, "probe")] == ["left", "sum"]
+    assert sent(play.wait(1.0), "go") == []
+
+    released = play.tell(Said("sum", "seen", {"stream": "test/left/fast"}), Tick())
+
+    assert Announce(("left", "sum")) in released
+    assert [(label, fields["first"]) for label, fields in sent(released, "go")] == [("left", 7), ("sum", 7)]
+    assert play.core.status.phase == "running"
+
+
+def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
+    play = Play(start_timeout=10.0)
+    play.deaf.add("sum")
+    play.tell(Begin(), Said("sum", "joined", {}), Said("sum", "ready", {"first": None, "steps": None}))
+    play.wait(25.0)
+
+    assert play.failure() == "no connection within 10 s on: test/left/fast → sum"
+
+
+def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
+    play = Play(start_timeout=10.0)
+    play.deaf.add("sum")
+    play.tell(Begin(), Said("sum", "joined", {}))
+    play.wait(25.0)
+
+    assert play.failure() == "not ready within 10 s: host 'sum'"
+    assert killed(play.commands) == ["sum"]
+
+
+def test_the_end_is_told_to_the_recorder_when_the_others_have_closed() -> None:
+    play = Play(record="run.mcap").starts()
+    order = []
+
+    play.tell(*(play.ended(label) for label in play.hosts))
+    for command in play.wait(1.0):
+        order += [label for label, _ in sent([command], "leave")]
+
+    assert order == ["left", "sum", "@recorder"]
+    assert dict(sent(play.commands, "leave"))["@recorder"]["outcome"] == "complete"
+    assert Withdraw() in play.commands
+    assert play.over is not None
+    assert play.over.report is not None
+
+
+def test_a_recording_is_not_complete_when_a_close_fails_before_it() -> None:
+    play = Play(record="run.mcap").starts()
+    play.deaf.add("sum")
+    play.tell(*(play.ended(label) for label in play.hosts))
+    play.wait(0.2)
+
+    play.tell(play.failed("sum", "close()"), Said("sum", "closed", {"facts": {}}), Died("sum", 1))
+    play.wait(1.0)
+
+    assert play.failure() == "operator 'sum' failed in close(): RuntimeError: no camera"
+    outcome = dict(sent(play.commands, "leave"))["@recorder"]["outcome"]
+    assert outcome == "failed: operator 'sum' failed in close(): RuntimeError: no camera"
+
+
+def test_covered_goes_to_processes_with_sources_only_and_replaces_what_is_queued() -> None:
+    play = Play().starts()
+
+    told = play.tell(play.progress("sum", {"sum": 5}), play.progress("sum", {"sum": 6}))
+
+    covered = [c for c in told if getattr(c, "kind", "") == "covered"]
+    assert [(c.label, c.fields["frontier"], c.replaces) for c in covered] == [("left", 5, True), ("left", 6, True)]
+    told = play.tell(play.ended("sum"))
+    assert sent(told, "covered") == [("left", {"frontier": FOREVER})]
+
+
+def test_the_first_death_ends_the_run_with_how_far_it_was_and_its_last_words() -> None:
+    play = Play().starts()
+    play.tell(play.progress("sum", {"sum": 5}), Printed("sum", "a segment is at fault"))
+
+    play.dies("sum", -11)
+    play.wait(1.0)
+
+    assert play.failure() == "host 'sum' was killed by SIGSEGV while running (sum had reached stamp 5)"
+    assert play.over is not None
+    assert play.over.failure is not None
+    assert play.over.failure.details == "a segment is at fault"
+    assert dict(sent(play.commands, "leave"))["left"]["outcome"].startswith("failed: host 'sum' was killed")
+
+
+def test_what_fails_because_of_a_failure_is_noted_and_the_first_cause_stays() -> None:
+    play = Play().starts()
+    play.deaf.add("left")
+    play.tell(play.failed("sum", "fire at stamp 5"))
+    play.tell(play.failed("left", "close()"))
+    play.dies("left", 1)
+    play.wait(1.0)
+
+    assert play.failure() == "operator 'sum' failed in fire at stamp 5: RuntimeError: no camera"
+    notes = play.core.status.notes
+    assert notes[0] == "then: operator 'left' failed in close(): RuntimeError: no camera"
+
+
+def test_a_process_that_closes_its_channel_and_does_not_end_is_killed() -> None:
+    play = Play().starts()
+    play.tell(HungUp("sum"))
+    assert killed(play.wait(9.0)) == []
+
+    assert killed(play.wait(3.0)) == ["sum"]
+    assert "closed its channel and did not end" in play.failure()
+
+
+def test_nobody_makes_progress_and_who_does_not_answer_is_killed_and_named() -> None:
+    play = Play(stall_timeout=20.0).starts()
+    play.deaf.add("sum")
+    play.tell(Said("sum", "beat", {"memory": 1, "work": None}))
+
+    play.wait(60.0)
+
+    assert play.failure() == "no progress for 20 s; still busy: host 'left'; host 'sum'"
+    assert "sum" in killed(play.commands)
+
+
+def test_a_stuck_graph_is_proven_and_who_waits_is_named() -> None:
+    play = Play().starts()
+
+    play.state = {"waiting": {"sum": [7, {"x": 5}]}}
+    play.wait(2.0)
+
+    assert play.failure() == "the graph is stuck: nothing is on its way and no operator can fire"
+    assert play.over is not None
+    assert play.over.failure is not None
+    assert play.over.failure.details == "  sum waits at stamp 7 for x (≥ 5)"
+
+
+def test_a_full_window_is_doubled_when_nothing_else_helps() -> None:
+    play = Play(window=(8, 1 << 20)).starts()
+
+    play.state = {"full": True}
+    play.wait(0.6)
+
+    assert {label for label, _ in sent(play.commands, "grow")} == {"left", "sum"}
+    assert play.core.status.notes == ["the graph looks further ahead than the window: doubled to 16 messages"]
+
+
+def test_what_is_under_way_is_no_proof() -> None:
+    play = Play().starts()
+
+    for k in range(100):
+        play.state = {"sent": 5 + k, "received": 4 + k}
+        play.wait(0.05)
+    play.state = {"idle": False}
+    play.wait(5.0)
+    play.state = {"sent": 5, "received": 4}
+    play.wait(5.0)
+
+    assert play.over is None
+
+
+def test_a_rate_at_which_nothing_is_ever_due_is_named() -> None:
+    play = Play(rate=1e-300, stall_timeout=3.0).starts()
+    play.state = {"idle": False, "due": 1e298}
+    play.wait(5.0)
+
+    assert "no progress for 3 s" in play.failure()
+    assert "the next message of host 'sum' is due in 3.17e+290 years at rate 1e-300" in play.failure()
+
+
+def test_ctrl_c_drains_and_a_second_one_does_not_wait() -> None:
+    play = Play().starts()
+    assert {label for label, _ in sent(play.stops(), "stop")} == {"left", "sum"}
+    over = play.ends()
+    assert over.report is not None
+    assert over.report.interrupted
+
+    play = Play().starts()
+    play.stops()
+    play.deaf |= {"left", "sum"}
+    play.stops()
+    play.wait(2.0)
+    assert play.failure() == "stopped before everything was drained"
+    assert play.over is not None
+    assert play.over.failure is not None
+    assert play.over.failure.interrupted
+
+
+def test_a_run_that_always_finds_more_to_do_ends_in_time_and_says_what_it_owed() -> None:
+    play = Play(stall_timeout=30.0).starts()
+    play.tell(play.progress("left", {"left": 1_800_000_000}))
+    play.stops()
+
+    for k in range(40):
+        play.tell(play.progress("sum", {"sum": k}))
+        play.wait(1.0)
+
+    assert re.fullmatch(
+        "interrupted, and not everything was drained within 30 s: "
+        "sum was at stamp (28|29|30) after 1 firings, sources had given up to 1800000000",
+        play.failure(),
+    )
+    assert play.over is not None
+    assert play.over.failure is not None
+    assert play.over.failure.interrupted
+
+
+@pytest.mark.parametrize(("patience", "closes_within"), [(120.0, 60.0), (8.0, 8.0), (1.0, 5.0)])
+def test_patience_shortens_the_time_for_closing(patience: float, closes_within: float) -> None:
+    play = Play(stall_timeout=patience).starts()
+    play.deaf.add("sum")
+
+    play.tell(*(play.ended(label) for label in play.hosts))
+    play.wait(100.0)
+
+    assert play.failure() == f"did not close within {closes_within:g} s: host 'sum'"
+    assert killed(play.commands) == ["sum"]
+
+
+def test_what_a_process_has_left_behind_is_named() -> None:
+    play = Play().starts()
+    play.tell(LeftBehind("sum", ("sleep (process 12)",)))
+    over = play.ends()
+
+    assert over.report is not None
+    assert over.report.notes == ("host 'sum' left processes behind, which were killed: sleep (process 12)",)
+
+
+def test_a_program_that_cannot_go_on_ends_the_run_in_order() -> None:
+    play = Play().starts()
+    play.tell(Aborted("the process that starts the others has ended"))
+    play.wait(1.0)
+
+    assert play.failure() == "the process that starts the others has ended"
+
+
+def test_after_the_end_nothing_is_commanded() -> None:
+    play = Play().starts()
+    play.ends()
+
+    assert play.tell(Tick(), Said("sum", "progress", {"done": {}, "counts": {}}), Died("sum", 0)) == []
+    assert [c for c in play.commands if isinstance(c, Over)] == [play.over]

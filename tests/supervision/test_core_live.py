@@ -1,0 +1,356 @@
+"""The course of a live run: what fails is restarted by its policy, who is silent is not waited for."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+from plays import LEFT, Play, killed, sent, spawned
+
+from dataflow.chaos.plan import Fault
+from dataflow.records.firing import Emission, FiringRecord
+from dataflow.supervision.commands import Send, Signal
+from dataflow.supervision.events import Begin, Died, NotReading, Said, Tick
+from dataflow.sync import FOREVER
+
+AGAIN = "live: {restart: {max: 2, backoff: 100ms}}"
+SUM = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}"
+SMOOTH = f"smooth: {{use: runtime_operators:Smooth, inputs: {{x: left/fast}}, {AGAIN}}}"
+AFTER = "after: {use: runtime_operators:Sum, inputs: {x: smooth/mean}}"
+
+
+def robot(*operators: str, **options: object) -> Play:
+    return Play(LEFT, SMOOTH, AFTER, *operators, live=True, **options)
+
+
+def record(operator: str, index: int, stamp: int) -> FiringRecord:
+    return FiringRecord(operator, 0, index, "fire", stamp, outputs=(Emission(index, stamp, bytes(16)),))
+
+
+def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5), record("smooth", 1, 7))
+
+    play.dies("smooth", -9)
+    told = play.tell()
+    assert ("after", {"streams": ["test/smooth/mean"], "absent": True}) in sent(told, "absent")
+    assert [len(fields["batches"]) for label, fields in sent(told, "records")] == [2]
+    assert play.core.status.restarts == {"smooth": 1}
+    told = play.wait(0.3)
+
+    assert spawned(told) == ["smooth"]
+    ((_, config),) = sent(told, "host")
+    assert config["resume"]["smooth"] == {"incarnation": 1, "last": {"mean": 7}, "changed": {}, "restarts": 1}
+    assert [label for label, _ in sent(told, "probe")] == ["smooth"]
+    assert [label for label, _ in sent(told, "go")] == ["smooth"]
+    assert play.core.status.notes == [
+        "host 'smooth' was killed by SIGKILL; started again in 0.1 s",
+        "host 'smooth' is back",
+    ]
+    assert play.ends().report is not None
+
+
+def test_restarts_come_to_an_end() -> None:
+    play = robot().starts()
+    for _ in range(3):
+        play.dies("smooth", -9)
+        play.wait(1.0)
+
+    assert play.failure() == "host 'smooth' was killed by SIGKILL while running"
+
+
+def test_a_process_that_is_killed_while_starting_is_restarted_by_its_policy() -> None:
+    play = robot()
+    play.deaf.add("smooth")
+    play.tell(Begin())
+    play.dies("smooth", -9)
+
+    told = play.wait(1.0)
+
+    assert spawned(told) == ["smooth"]
+    ((_, config),) = sent(told, "host")
+    assert "resume" not in config  # nobody had heard of the one before
+    assert play.core.status.phase == "running"
+
+
+def test_a_set_up_that_fails_is_tried_again_by_the_policy_until_it_is_used_up() -> None:
+    play = robot()
+    play.broken.add("smooth")
+    play.tell(Begin())
+    play.wait(5.0)
+
+    assert len(spawned(play.commands)) == 3 + 2
+    assert play.failure() == "operator 'smooth' failed in setup(): RuntimeError: no camera"
+
+    play = robot()
+    play.broken.add("smooth")
+    play.tell(Begin())
+    play.broken.clear()
+    play.wait(1.0)
+    assert play.core.status.phase == "running"
+
+
+def test_a_set_up_that_fails_after_a_restart_is_tried_again_by_the_policy() -> None:
+    play = robot().starts()
+    play.broken.add("smooth")
+    play.dies("smooth", -9)
+    play.wait(0.15)
+    play.broken.clear()
+    play.wait(1.0)
+
+    assert play.core.status.restarts == {"smooth": 2}
+    assert play.core.status.notes[-1] == "host 'smooth' is back"
+
+
+def test_a_process_that_fails_itself_is_restarted_and_an_operator_that_failed_for_good_is_not() -> None:
+    play = robot().starts()
+    failed = {"operator": None, "when": "", "summary": "ProcessFailure: no statics", "traceback": "…"}
+    play.tell(Said("smooth", "failed", failed))
+    play.wait(1.0)
+    assert play.core.status.notes[-1] == "host 'smooth' is back"
+
+    play.tell(play.failed("smooth", "fire at stamp 5"))  # its process has tried
+    play.wait(1.0)
+    assert play.failure() == "operator 'smooth' failed in fire at stamp 5: RuntimeError: no camera"
+
+
+def test_one_that_failed_and_does_not_leave_is_killed() -> None:
+    play = robot().starts()
+    play.deaf.add("smooth")
+    play.tell(Said("smooth", "failed", {"operator": None, "when": "", "summary": "x", "traceback": ""}))
+
+    assert killed(play.wait(11.0)) == ["smooth"]
+    assert play.core.status.notes[-1] == "host 'smooth' is back"
+
+
+def test_a_stopped_process_is_killed_and_restarted_by_its_policy() -> None:
+    play = robot().starts()
+    play.wait(1.0)
+    play.deaf.add("smooth")
+
+    assert killed(play.wait(4.0)) == ["smooth"]
+    assert "host 'smooth' gave no sign of life for 3.0 s; started again" in play.core.status.notes[0]
+
+
+def test_a_process_that_reads_nothing_is_killed_and_restarted_by_its_policy() -> None:
+    play = robot().starts()
+
+    assert killed(play.tell(NotReading("smooth", 2.0, 9))) == []
+    assert killed(play.tell(NotReading("smooth", 3.5, 9))) == ["smooth"]
+    assert "host 'smooth' has read nothing for 3.5 s" in play.core.status.notes[0]
+
+
+def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
+    play = robot(record="run.mcap").starts()
+    play.deaf.add("@recorder")
+    play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))
+    play.wait(20.0)
+
+    assert play.failure() == "host '@recorder' has read nothing for 9 s"
+
+
+def covered(play: Play, stamp: int) -> tuple[int, int]:
+    """What the source is told when it has given everything up to a stamp."""
+    play.tell(play.progress("left", {"left": stamp}))
+    _, fields = sent(play.commands, "covered")[-1]
+    return fields["frontier"], fields["backlog"]
+
+
+OTHER = "other: {use: runtime_operators:Sum, inputs: {x: left/fast}}"
+DROPS = "sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {queue: newest, size: 1}}"
+
+
+def stopped_for_a_while(consumer: str) -> Play:
+    """A run in which the consumer `sum` was stopped at stamp 100, and is heard again at 900."""
+    play = Play(LEFT, consumer, OTHER, live=True).starts()
+    play.wait(0.1)
+    play.tell(play.progress("left", {"left": 100}))
+    play.tell(play.progress("sum", {"sum": 100}), play.progress("other", {"other": 100}))
+    play.deaf.add("sum")
+    play.tell(play.progress("other", {"other": 500}))
+    assert covered(play, 500)[1] == 100  # its backlog still counts
+
+    play.wait(3.2)
+    assert "host 'sum' gave no sign of life for 3.0 s; nobody waits for it" in play.core.status.notes
+    play.tell(play.progress("other", {"other": 900}))
+    assert covered(play, 900)[1] == 900
+
+    play.deaf.discard("sum")
+    play.tell(play.beat("sum"))
+    play.tell(play.progress("sum", {"sum": 300}), play.progress("other", {"other": 1000}))
+    assert killed(play.commands) == []
+    return play
+
+
+def test_a_stopped_consumer_holds_the_sources_back_for_nobody_and_begins_anew_when_it_is_back() -> None:
+    play = stopped_for_a_while(DROPS)
+
+    assert covered(play, 1100)[1] == 900  # what it owes counts from when it was back
+
+
+def test_one_that_drops_nothing_catches_up_first_since_nothing_else_bounds_what_it_holds() -> None:
+    play = stopped_for_a_while(SUM)
+
+    assert covered(play, 1100)[1] == 300
+
+
+def test_what_did_not_reach_a_consumer_is_counted_against_it() -> None:
+    play = Play(LEFT, SUM, live=True).starts()
+    gap = {"stream": "test/left/fast", "first": 10, "following": 15}
+    play.tell(play.progress("sum", {"sum": 9}), Said("sum", "gap", gap), play.progress("sum", {"sum": 20}))
+
+    assert play.core.status.drops["sum"] == {("x", "missed"): 5}
+    assert play.core.status.operators["sum"].dropped == 5
+
+
+def test_a_robot_at_which_nothing_happens_goes_on() -> None:
+    play = robot(stall_timeout=20.0).starts()
+
+    play.wait(300.0)
+
+    assert play.over is None
+
+
+@pytest.mark.parametrize("label", ["sum", "@recorder"])
+def test_a_process_that_gives_no_sign_of_life_for_too_long_ends_the_run(label: str) -> None:
+    play = Play(LEFT, SUM, live=True, record="run.mcap", stall_timeout=20.0).starts()
+    play.deaf.add(label)
+    play.state = {"idle": False}
+    for _ in range(60):
+        play.tell(play.progress("left", {"left": 5}))
+        play.wait(0.5)
+
+    assert play.failure() == f"host {label!r} gave no sign of life for 20 s"
+
+
+def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
+    play = robot(stall_timeout=20.0).starts()
+    play.beating = False
+    for k in range(50):
+        play.tell(play.beat("left"), play.beat("after"), play.beat("smooth", ("smooth", 5, 0.5 * k)))
+        play.wait(0.5)
+
+    assert play.failure() == "no progress for 20 s; still busy: host 'smooth', smooth at stamp 5 for 20 s"
+
+
+def test_after_a_restart_a_stuck_graph_is_proven_again() -> None:
+    play = robot().starts()
+    play.dies("smooth", -9)
+    play.state = {"sent": 9, "received": 7}
+    play.wait(4.0)
+    assert play.over is None  # that may still be on its way
+    play.wait(4.0)
+
+    assert play.failure() == "the graph is stuck: nothing is on its way and no operator can fire"
+
+
+def test_a_source_behind_the_clock_is_named_at_once_and_at_the_end() -> None:
+    play = Play(LEFT, SUM, live=True, record="run.mcap").starts()
+    play.wait(10.0)
+    counts = {"left": [100, 100, 0, 9_000_000_000, 5]}
+    play.tell(Said("left", "progress", {"done": {}, "counts": counts, "behind": {"left": [2.5, 2.5]}}))
+    play.tell(Said("left", "progress", {"done": {}, "counts": counts, "behind": {"left": [3.5, 3.5]}}))
+
+    told = "source 'left' has fallen behind the clock: reading it takes longer than real time"
+    assert play.core.status.notes == [told]
+    assert play.core.status.behind == {"left": 3.5}
+    assert [fields["name"] for _, fields in sent(play.commands, "event")] == ["behind"]
+    over = play.ends()
+    assert over.report is not None
+    assert over.report.notes[-1] == "source 'left' was 3.5 s behind the clock at the end, 3.5 s at most"
+
+
+def test_a_process_that_is_busy_is_named_as_what_holds_its_source_up() -> None:
+    play = Play(LEFT, SUM, live=True, placement="one_host").starts()
+    (label,) = play.hosts
+    counts = {"left": [1, 1, 0, 0, 5], "sum": [1, 1, 0, 0, 5]}
+    play.tell(Said(label, "progress", {"done": {}, "counts": counts, "behind": {"left": [0.1, 4.0]}}))
+
+    assert play.core.status.notes == ["source 'left' has fallen behind the clock: its process is busy with sum"]
+
+
+def test_a_source_whose_stamps_jumped_far_ahead_is_named() -> None:
+    play = Play(LEFT, SUM, live=True).starts()
+    play.tell(Said("left", "early", {"operator": "left", "last": 5, "stamp": 10**18, "seconds": 999_999_999.6}))
+
+    assert play.core.status.notes == [
+        "source 'left' waits 31.7 years for the clock, its stamps jump from 5 to 1000000000000000000: "
+        "nothing comes until then"
+    ]
+
+
+def test_planned_faults_happen_at_their_time_and_what_is_frozen_thaws() -> None:
+    freeze, kill = Fault(0.5, "freeze", "smooth", {"span": 0.3}), Fault(2.0, "kill", "left", {})
+    play = robot(faults=iter([freeze, kill, Fault(9.0, "raise", "smooth", {})])).starts()
+
+    given = [(c.label, c.number) for c in play.wait(1.5) if isinstance(c, Signal)]
+    assert given == [("smooth", signal.SIGSTOP), ("smooth", signal.SIGCONT)]
+    assert killed(play.wait(1.0)) == ["left"]
+
+
+def test_ctrl_c_while_a_process_is_away_ends_the_run() -> None:
+    play = robot().starts()
+    play.dies("smooth", -9)
+    play.tell()
+    play.stops()
+    play.wait(1.0)
+
+    assert play.failure() == "interrupted while host 'smooth' was to be started again"
+
+
+def test_records_of_a_failed_run_reach_the_recorder_when_the_others_have_left() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("after", 0, 5))
+    play.dies("left", 1)
+    play.tell()
+    play.wait(1.0)
+
+    told = [c.kind for c in play.commands if isinstance(c, Send) and c.label == "@recorder"]
+    assert [kind for kind in told if kind in ("records", "leave")] == ["records", "leave"]
+    assert play.over is not None
+
+
+def test_records_that_were_lost_on_their_way_come_again_from_the_process_that_made_them() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5))
+    told = play.tell(Said("@recorder", "lacks", {"operator": "smooth"}))
+
+    assert [(c.label, c.kind) for c in told if isinstance(c, Send)] == [("smooth", "lacks")]
+
+
+def test_records_that_were_lost_on_their_way_come_from_what_a_dead_process_left() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5))
+    play.dies("smooth", -9)
+    play.tell()
+    told = play.tell(Said("@recorder", "lacks", {"operator": "smooth"}))
+
+    assert [label for label, _ in sent(told, "records")] == ["@recorder"]
+
+
+def test_records_that_are_lacking_of_a_process_that_leaves_come_when_it_has_ended() -> None:
+    play = robot(record="run.mcap").starts()
+    play.keeps(record("smooth", 0, 5))
+    play.deaf.add("smooth")
+    play.tell(play.ended("left"), play.ended("smooth"), play.ended("after"), play.ended("@recorder"))
+    play.wait(0.2)
+    assert not sent(play.tell(Said("@recorder", "lacks", {"operator": "smooth"})), "records")
+    play.dies("smooth", 0)
+
+    assert [label for label, _ in sent(play.tell(), "records")] == ["@recorder"]
+
+
+def test_a_process_that_died_again_at_once_does_not_use_an_incarnation_twice() -> None:
+    play = robot().starts()
+    play.keeps(FiringRecord("smooth", 3, 0, "fire", 5, outputs=(Emission(0, 5, bytes(16)),)))
+    play.dies("smooth", -9)
+
+    ((_, config),) = sent(play.wait(0.3), "host")
+    assert config["resume"]["smooth"]["incarnation"] == 4
+
+
+def test_news_of_processes_that_ended_crosses_other_news_without_harm() -> None:
+    play = robot().starts()
+    play.tell(Died("smooth", -9), play.progress("smooth", {"smooth": FOREVER}), play.ended("smooth"), Tick())
+
+    assert play.over is None

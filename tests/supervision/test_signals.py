@@ -1,0 +1,34 @@
+"""Which signals end a run."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+ASKS = """
+import os, signal
+from dataflow.supervision.run import _interrupts
+
+stops = []
+with _interrupts(lambda: stops.append(1)):
+    for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
+        before = len(stops)
+        os.kill(os.getpid(), number)
+        print(signal.Signals(number).name, len(stops) - before)
+"""
+
+
+def asked(*ignored: str) -> list[str]:
+    """What each signal does to a run in a process that was begun with some signals ignored."""
+    ignore = "; ".join(f"trap '' {name}" for name in ignored) or ":"
+    command = ["sh", "-c", f'{ignore}; exec "$@"', "sh", sys.executable, "-c", ASKS]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.splitlines()
+
+
+def test_a_run_is_asked_to_end_by_each_of_three_signals() -> None:
+    assert asked() == ["SIGHUP 1", "SIGINT 1", "SIGTERM 1"]
+
+
+def test_signals_that_were_ignored_at_the_start_stay_ignored() -> None:
+    assert asked("HUP") == ["SIGHUP 0", "SIGINT 1", "SIGTERM 1"]  # as nohup does
+    assert asked("INT", "HUP") == ["SIGHUP 0", "SIGINT 0", "SIGTERM 1"]  # as a script's background job is begun

@@ -1,0 +1,58 @@
+"""Operators are divided among workers: each once, together with what must make its inputs, and evenly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.graph import load_graph
+from dataflow.verification.partition import START_NS, balanced, jobs_for, units, with_checks
+
+MIXED = Path(__file__).resolve().parent.parent / "runtime" / "mixed.yaml"
+OPERATORS = ("mix", "smooth", "merge", "sum")
+loads = st.lists(st.integers(0, 10**9), min_size=1, max_size=12)
+
+
+@given(loads, st.integers(1, 5))
+def test_every_group_is_in_one_part_and_no_part_is_much_heavier_than_another(work: list[int], jobs: int) -> None:
+    groups = [(f"operator {k}",) for k in range(len(work))]
+    by_name = {group[0]: load for group, load in zip(groups, work, strict=True)}
+
+    parts = balanced(groups, by_name, jobs)
+
+    assert sorted(name for part in parts for name in part) == sorted(by_name)
+    assert len(parts) == min(jobs, len(groups))
+    assert all(parts)
+    sums = [sum(by_name[name] for name in part) for part in parts]
+    assert max(sums) - min(sums) <= max(work)
+
+
+def test_an_operator_whose_input_was_not_recorded_is_with_the_one_that_makes_it() -> None:
+    graph = load_graph(MIXED)
+    everything = set(graph.streams)
+
+    assert units(graph, everything, OPERATORS) == [(name,) for name in OPERATORS]
+    assert units(graph, everything - {"test/mix/mixed"}, ["smooth", "sum"]) == [("smooth",), ("sum",)]
+    together = units(graph, everything - {"test/mix/mixed"}, OPERATORS)
+    assert sorted(map(len, together)) == [1, 3]  # mix feeds smooth and merge
+    assert units(graph, [], OPERATORS) == [OPERATORS]
+
+
+def test_a_stream_is_checked_by_a_part_that_reads_it_anyway_else_by_its_maker_else_by_the_first() -> None:
+    graph = load_graph(MIXED)
+    checks = ["test/left/slow", "test/merge/seen", "test/mix/mixed", "test/smooth/mean"]
+
+    parts = with_checks(graph, [("sum",), ("smooth", "merge")], checks)
+
+    assert [part.checks for part in parts] == [
+        ("test/left/slow", "test/merge/seen"),
+        ("test/mix/mixed", "test/smooth/mean"),
+    ]
+
+
+def test_no_worker_is_started_for_less_work_than_its_start() -> None:
+    assert jobs_for({"a": START_NS // 2}, 8) == 1
+    assert jobs_for({"a": START_NS, "b": START_NS}, 8) == 3
+    assert jobs_for({"a": 100 * START_NS}, 8) == 8

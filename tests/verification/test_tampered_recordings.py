@@ -1,0 +1,213 @@
+"""What was changed in a recording, or lost from it, is said by stream and number, and is never called identical."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tampering import Kept, as_it_is, duplicated, ended, tampered
+
+from dataflow.messages import FeatureVector, Imu, Message
+from dataflow.recording import Recorded, Recording
+from dataflow.records.firing import FiringRecord
+from dataflow.reexecution.recorded_run import recorded_graph
+from dataflow.verification.gate import Checked, check
+from dataflow.verification.verify import verify
+
+pytestmark = pytest.mark.usefixtures("in_process")
+
+
+def checked(path: Path) -> Checked:
+    return check(path, path.name, lambda file: verify(file))
+
+
+def verdicts(one: Checked) -> dict[str, str]:
+    assert one.report is not None, one.details or one.error
+    return {j.operator: j.verdict for j in one.judged}
+
+
+def at(stream: str, seq: int, change: Callable[[Recorded], Kept]) -> Callable[[Recorded], Kept]:
+    """What is done to one message; the others stay."""
+    return lambda found: change(found) if (found.stream, found.seq) == (stream, seq) else as_it_is(found)
+
+
+def moved(found: Recorded) -> Kept:
+    """The message with another value."""
+    message: Message = found.message
+    if isinstance(message, Imu):
+        return [(message.replace(linear_acceleration=np.array([-7.0, 0.0, 9.81])), found.seq)]
+    assert isinstance(message, FeatureVector)
+    return [(message.replace(vectors=message.vectors + 1), found.seq)]
+
+
+def test_an_untouched_copy_is_identical(kept: Path, tmp_path: Path) -> None:
+    one = checked(tampered(kept, tmp_path / "same.mcap"))
+
+    assert one.verdict == "identical", one.as_json()
+    assert set(verdicts(one)) == {"look", "smooth", "busy", "tally"}
+
+
+@pytest.mark.parametrize("stream", ["kept/look/seen", "kept/busy/y"])  # taken by another operator, taken by a sink
+def test_a_stored_output_that_was_changed_is_named_by_stream_and_number(
+    kept: Path, tmp_path: Path, stream: str
+) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", messages=at(stream, 20, moved)))
+
+    maker = stream.split("/")[1]
+    assert one.verdict == "different"
+    assert not one.passed
+    assert verdicts(one)[maker] == "changed"
+    assert one.changed == (f"{stream} #20",)
+    assert one.culprits == ()
+
+
+def test_a_source_message_that_was_changed_is_named_and_nobody_is_blamed_for_it(kept: Path, tmp_path: Path) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", messages=at("kept/robot/imu", 40, moved)))
+
+    assert one.changed == ("kept/robot/imu #40",)
+    assert verdicts(one)["robot"] == "changed"
+    assert verdicts(one)["busy"] == "downstream"
+    assert one.culprits == ()
+    assert one.as_json()["changed"] == ["kept/robot/imu #40"]
+
+
+def test_a_source_message_that_is_stored_twice_is_noticed(kept: Path, tmp_path: Path) -> None:
+    one = checked(duplicated(kept, tmp_path / "t.mcap", "kept/robot/imu", 40))
+
+    assert not one.passed
+    assert verdicts(one)["robot"] == "unverifiable"
+    assert one.report is not None
+    [robot] = [s for s in one.report.stand_ins if s.operator == "robot"]
+    assert robot.unaccounted == 1
+
+
+def test_a_source_message_that_was_added_is_noticed(kept: Path, tmp_path: Path) -> None:
+    def added(found: Recorded) -> Kept:
+        return [(found.message, 74), (found.message.replace(stamp=found.stamp + 1), 75)]
+
+    one = checked(tampered(kept, tmp_path / "t.mcap", messages=at("kept/robot/odometry", 74, added)))
+
+    assert verdicts(one)["robot"] == "unverifiable"
+    assert one.verdict == "not wholly verified"
+
+
+def test_a_source_message_that_nobody_misses_is_noted_all_the_same(kept: Path, tmp_path: Path) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", messages=at("kept/robot/odometry", 74, lambda found: [])))
+
+    assert one.report is not None
+    assert one.report.identical  # it may never have been sent
+    [robot] = [s for s in one.report.stand_ins if s.operator == "robot"]
+    assert robot.missing == 1
+    [stream] = [s for s in one.report.stored if s.missing]
+    assert (stream.stream, stream.first_missing) == ("kept/robot/odometry", (0, 74))
+
+
+def without(operator: str, first: int, last: int) -> Callable[[FiringRecord], bool]:
+    return lambda record: record.operator != operator or not first <= record.index <= last
+
+
+@pytest.mark.parametrize("operator", ["robot", "beacon", "look", "smooth", "tally"])
+@pytest.mark.parametrize(
+    ("first", "last"),
+    [(0, 10**6), (0, 3), (5, 9), (20, 10**6), (-1, -1)],
+    ids=["all", "first", "middle", "last", "none"],
+)
+def test_firing_records_that_are_lost_are_noticed_of_sources_as_of_operators(
+    kept: Path, tmp_path: Path, operator: str, first: int, last: int
+) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", records=without(operator, first, last)))
+
+    assert one.passed is (first < 0)
+    if first >= 0 and one.report is not None:
+        assert verdicts(one)[operator] == "unverifiable"
+
+
+def test_what_lies_after_a_cut_of_a_source_is_no_loss(kept: Path, tmp_path: Path) -> None:
+    path = tampered(
+        kept,
+        tmp_path / "t.mcap",
+        records=lambda r: r.operator != "robot" or r.index < 120,
+        metadata=ended("failed: on fire"),
+    )
+
+    one = checked(path)
+
+    assert one.passed
+    assert one.report is not None
+    [robot] = [s for s in one.report.stand_ins if s.operator == "robot"]
+    assert robot.cut
+    assert robot.unaccounted > 0
+
+
+def test_a_run_that_ended_before_anything_was_called_is_not_passed_as_verified(kept: Path, tmp_path: Path) -> None:
+    path = tampered(
+        kept,
+        tmp_path / "t.mcap",
+        messages=lambda found: [],
+        records=lambda r: r.kind == "setup",
+        metadata=ended("interrupted"),
+    )
+
+    one = checked(path)
+
+    assert one.verdict == "nothing verified"
+    assert not one.passed
+
+
+def test_a_run_that_failed_while_it_started_says_so(kept: Path, tmp_path: Path) -> None:
+    path = tampered(
+        kept,
+        tmp_path / "t.mcap",
+        messages=lambda found: [],
+        records=lambda r: r.operator == "robot" and r.kind == "setup",
+        metadata=ended("failed: operator 'look' failed in setup()"),
+    )
+
+    one = checked(path)
+
+    assert one.report is None
+    assert (
+        "the recorded run ended before operator 'look' began (it failed: operator 'look' failed in setup()" in one.error
+    )
+    assert not one.internal
+
+
+@pytest.mark.parametrize("operator", ["robot", "look"])
+@pytest.mark.parametrize("garbage", [b"\xc1\xff" + bytes(20), b"", b"\x91" * 5000, b"\x80"])
+def test_garbage_among_firing_records_names_file_and_operator(
+    kept: Path, tmp_path: Path, operator: str, garbage: bytes
+) -> None:
+    path = tampered(kept, tmp_path / "t.mcap", batches=lambda name, data: garbage if name == operator else data)
+
+    one = checked(path)
+
+    assert one.report is None
+    assert f"{path}: firing records of operator {operator!r} are damaged: not a batch of firing records (" in one.error
+    assert not one.internal
+
+
+@pytest.mark.parametrize("bundle", ["", "5", "[" * 100_000, '{"root": 5}', '{"format": 1, "file": "x", "files": 3}'])
+def test_what_stands_in_place_of_the_graph_ends_in_a_clear_error(kept: Path, tmp_path: Path, bundle: str) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:graph": {"bundle": bundle}}))
+
+    assert one.report is None
+    assert "graph" in one.error
+    assert not one.internal
+
+
+def test_an_end_of_a_stream_that_cannot_be_read_is_an_error_of_the_recording(kept: Path, tmp_path: Path) -> None:
+    one = checked(tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:ends": {"kept/robot/imu": "{"}}))
+
+    assert one.report is None
+    assert "how stream 'kept/robot/imu' ended cannot be read" in one.error
+    assert not one.internal
+
+
+def test_the_graph_in_the_file_is_not_even_read_where_another_is_named(kept: Path, tmp_path: Path) -> None:
+    with Recording(kept) as recording:
+        graph = recorded_graph(recording)
+    path = tampered(kept, tmp_path / "t.mcap", metadata={"dataflow:graph": {"bundle": "no graph"}})
+
+    assert verify(path, graph=graph).identical
