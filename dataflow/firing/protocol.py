@@ -95,7 +95,3 @@ class Runner:
     def restarted(self) -> int:
         """How often the operator was restarted in this process."""
         return 0
-
-    def report(self) -> Mapping[str, Any]:
-        """What the runner adds to the report of its process at the end."""
-        return {}

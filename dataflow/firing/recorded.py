@@ -63,9 +63,6 @@ class RecordedRunner(Runner):
         """What re-execution has come to so far."""
         return self.judge.result
 
-    def report(self) -> Mapping[str, Any]:
-        return {"verification": self.result.to_wire()}
-
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
         statics = self.calls.setup()
