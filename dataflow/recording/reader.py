@@ -222,8 +222,11 @@ class Recording:
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
         for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
             raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
-            info = stream.info
-            yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
+            info, data = stream.info, bytes(raw.data)
+            record = RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, data)
+            del raw, data  # it holds its chunk in memory
+            yield record
+            del record
 
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
