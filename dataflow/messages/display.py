@@ -106,13 +106,13 @@ def _depth(message: DepthImage) -> Pixels:
 
 
 def _scaled(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Values from 0 to 1 between their first and last percent; NaN stays."""
+    """Values from 0.05 to 0.95, between which colours are bright, from their first to their last percent; NaN stays."""
     finite = values[np.isfinite(values)]
     if not finite.size:
         return np.full(values.shape, np.nan)
     low, high = np.percentile(finite, (1, 99))
-    scaled: npt.NDArray[np.float64] = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
-    return scaled
+    share: npt.NDArray[np.float64] = np.clip((values - low) / max(high - low, 1e-9), 0.0, 1.0)
+    return 0.05 + 0.9 * share
 
 
 def _classes(message: SegmentationMap) -> Pixels:

@@ -16,6 +16,9 @@ import dataflow
 from dataflow.graph import GraphError, load_graph
 from dataflow.supervision.report import RunFailed, Status
 
+FINDS_OPERATORS = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+"""The environment of programs that import `watched`."""
+
 
 def watch(**camera: object) -> dataflow.Graph:
     graph = dataflow.Graph("watch", namespace="shop", seed=7)
@@ -59,7 +62,7 @@ def test_a_recording_made_here_replays_and_verifies_in_processes(tmp_path: Path)
     assert "identical" in found._repr_html_()
     assert dataflow.replay(path).digests() == run.digests()
     command = [sys.executable, "-m", "dataflow.cli.main", "replay", str(path), "--one-process", "--json", "--quiet"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    shown = subprocess.run(command, env=FINDS_OPERATORS, capture_output=True, text=True, check=True, timeout=60)
     streams = json.loads(shown.stdout)["streams"]
     assert {name: values["digest"] for name, values in streams.items()} == run.digests()
 
@@ -179,11 +182,8 @@ print(dataflow.verify("cell.mcap"))
 
 
 def test_an_operator_of_a_notebook_runs_replays_and_verifies_in_its_process(tmp_path: Path) -> None:
-    support = str(Path(__file__).parents[1] / "support")
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join([support, *(p for p in sys.path if p)])}
-    done = subprocess.run(
-        [sys.executable, "-c", NOTEBOOK], cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60
-    )
+    command = [sys.executable, "-c", NOTEBOOK]
+    done = subprocess.run(command, cwd=tmp_path, env=FINDS_OPERATORS, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines() == [
         "<verification: identical, 6 messages> True",

@@ -9,7 +9,7 @@ import pytest
 
 import dataflow
 
-HEAVY = ("torch", "open3d", "rerun", "zenoh", "cv2", "scipy", "pandas", "onnxruntime", "matplotlib", "rich", "typer")
+HEAVY = ("torch", "open3d", "rerun", "zenoh", "cv2", "scipy", "pandas", "onnxruntime", "matplotlib", "typer")
 
 
 def loaded_after(code: str) -> set[str]:

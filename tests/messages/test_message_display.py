@@ -87,11 +87,11 @@ def test_a_grid_has_free_occupied_and_unknown_cells_with_y_upwards() -> None:
 
 
 def test_a_cloud_is_seen_from_above_with_x_up_and_y_to_the_left() -> None:
-    ahead, left, behind = [3, 0, 0], [0, 3, 1], [-3, 0, 2]
-    shown = decoded(PointCloud(stamp=1, frame="base", points=[ahead, left, behind, [np.nan, 0, 0]]))
+    ahead, left, behind, right, none = [3, 0, 0], [0, 3, 1], [-3, 0, 2], [0, -3, 1], [np.nan, 0, 0]
+    shown = decoded(PointCloud(stamp=1, frame="base", points=[ahead, left, behind, right, none]))
 
     rows, columns = np.nonzero(shown.any(axis=2))
-    assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [(3, 179), (179, 3), (355, 179)]
+    assert sorted(zip(rows.tolist(), columns.tolist(), strict=True)) == [(3, 179), (179, 3), (179, 355), (355, 179)]
 
 
 def test_an_empty_cloud_is_black() -> None:
