@@ -21,17 +21,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dataflow.api.builder import Graph
+    from dataflow.api.join import Joined
     from dataflow.api.recordings import RecordedStreams, open
-    from dataflow.api.runs import Run, launch, replay, run, verify
+    from dataflow.api.runs import RunResult, Verified, launch, replay, run, verify
     from dataflow.api.stream import RecordedStream
     from dataflow.testing import Played, play
 
 _HOMES = {
     "Graph": "dataflow.api.builder",
+    "Joined": "dataflow.api.join",
     "Played": "dataflow.testing",
     "RecordedStream": "dataflow.api.stream",
     "RecordedStreams": "dataflow.api.recordings",
-    "Run": "dataflow.api.runs",
+    "RunResult": "dataflow.api.runs",
+    "Verified": "dataflow.api.runs",
     "launch": "dataflow.api.runs",
     "open": "dataflow.api.recordings",
     "play": "dataflow.testing",
@@ -43,10 +46,12 @@ _HOMES = {
 
 __all__ = [
     "Graph",
+    "Joined",
     "Played",
     "RecordedStream",
     "RecordedStreams",
-    "Run",
+    "RunResult",
+    "Verified",
     "launch",
     "open",
     "play",

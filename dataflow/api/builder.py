@@ -15,7 +15,7 @@ from dataflow.graph.problems import did_you_mean
 from dataflow.operator import Operator
 
 if TYPE_CHECKING:
-    from dataflow.api.runs import Run
+    from dataflow.api.runs import RunResult
 
 FILE = "graph.yaml"
 """What error messages call the text of a graph that was built here."""
@@ -101,7 +101,7 @@ class Graph:
         """The graph, checked wholly. Raises `GraphError` with everything that is wrong."""
         return load_text(self.yaml(), file=FILE)
 
-    def run(self, record: str | Path | None = None, **options: Any) -> Run:
+    def run(self, record: str | Path | None = None, **options: Any) -> RunResult:
         """Runs the graph in this process; see `dataflow.run`."""
         from dataflow.api.runs import run
 

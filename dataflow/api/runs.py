@@ -31,7 +31,7 @@ GraphLike = Graph | ResolvedGraph | str | Path
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class RunResult:
     """What came of a run: its report, and the recording if there is one."""
 
     report: RunReport
@@ -98,7 +98,7 @@ def run(
     settings: Mapping[str, Any] | None = None,
     paranoid: bool = False,
     watch: Watch | None = None,
-) -> Run:
+) -> RunResult:
     """Runs a graph in this process, on this thread, as fast as it goes, and returns when it is done.
 
     `graph`: a `Graph`, or the path of a YAML file; then `settings` are what `--set` takes: {"detector.threshold": 0.3}.
@@ -111,7 +111,7 @@ def run(
     report = LocalRun(built, paranoid=paranoid).execute(
         record=file, metadata=_metadata(built, "run"), overwrite=overwrite, watch=watch
     )
-    return Run(report, file)
+    return RunResult(report, file)
 
 
 def replay(
@@ -125,7 +125,7 @@ def replay(
     settings: Mapping[str, Any] | None = None,
     paranoid: bool = False,
     watch: Watch | None = None,
-) -> Run:
+) -> RunResult:
     """Replays a recording in this process, through the graph that made it or another one with the same sources.
 
     Recorded streams replace the sources; everything else runs again. `start`, `end`: seconds from the first message;
@@ -139,7 +139,7 @@ def replay(
     report = LocalRun(built, log=log, paranoid=paranoid).execute(
         record=file, metadata=_metadata(built, "replay"), overwrite=overwrite, watch=watch
     )
-    return Run(report, file)
+    return RunResult(report, file)
 
 
 def launch(
@@ -151,7 +151,7 @@ def launch(
     settings: Mapping[str, Any] | None = None,
     watch: Watch | None = None,
     **options: Any,
-) -> Run:
+) -> RunResult:
     """Runs a graph in processes of its own, as `dataflow run` does, and returns when it is done.
 
     `live`: sources run by the clock. Further options are the fields of `RunPlan`: `placement`, `rate`, `view_file`.
@@ -164,7 +164,7 @@ def launch(
         raise ValueError(f"{', '.join(here)}: defined in this program, where no other process finds them; use run()")
     file = None if record is None else Path(record)
     report = run_in_processes(built, watch=watch, live=live, record=file, overwrite=overwrite, **options)
-    return Run(report, file)
+    return RunResult(report, file)
 
 
 def verify(

@@ -38,6 +38,7 @@ class Recorded:
 
     @property
     def stamp(self) -> int:
+        """The timestamp of the message, nanoseconds since the epoch."""
         return self.message.stamp
 
 
@@ -283,6 +284,7 @@ class Recording:
         return found
 
     def close(self) -> None:
+        """Closes the file. Idempotent."""
         self._file.close()
 
     def __enter__(self) -> Self:
