@@ -18,12 +18,14 @@ _AXES = {3: "xyz", 4: "xyzw"}
 _SCALARS = {"bool": np.bool_, "int": np.int64, "float": np.float64}
 
 
-def column(field: Field, values: Sequence[Any]) -> Column:
-    """One field of N messages; `values` holds None where a message has none.
+def column(field: Field, values: Sequence[Any] | Column) -> Column:
+    """One field of N messages; `values` holds None where a message has none, or is the column already.
 
     Arrays that have one shape in all messages are stacked to (N, ...); those of different shapes stay apart, in an
     array of objects. Where some are None, floating-point fields hold NaN; others make an array of objects.
     """
+    if isinstance(values, np.ndarray):
+        return values
     if isinstance(field, ArrayField):
         return _stacked(field, values)
     if field.kind in ("str", "strs") or any(value is None for value in values):
@@ -128,17 +130,19 @@ def _is_strings(field: Field) -> bool:
     return not isinstance(field, ArrayField) and field.kind == "strs"
 
 
-def elements(fields: Sequence[Field], rows: Sequence[Mapping[str, Any]]) -> Elements:
-    """The elements of the parallel `fields` of messages given as {field: value}.
+def elements(fields: Sequence[Field], values: Mapping[str, Sequence[Any] | Column]) -> Elements:
+    """The elements of the parallel `fields` of messages; `values` by field as for `column`.
 
     A field that is None in a message which has elements is NaN there (floating point), else None; one that is None in
     all is left out, and so is a list of strings that does not have a string for each element.
     """
     arrays = [f for f in fields if isinstance(f, ArrayField)]
-    counts = np.array([next((len(row[f.name]) for f in arrays if f.name in row), 0) for row in rows], np.int64)
+    by_message = list(zip(*(values[f.name] for f in arrays), strict=True))
+    counts = np.array([next((len(v) for v in row if v is not None), 0) for row in by_message], np.int64)
     columns: dict[str, Column] = {}
     for field in fields:
-        parts = [(row.get(field.name), int(count)) for row, count in zip(rows, counts, strict=True) if count]
+        given = zip(values[field.name], counts.tolist(), strict=True)
+        parts = [(value, count) for value, count in given if count]
         if all(value is None for value, _ in parts):
             continue
         if not isinstance(field, ArrayField):
@@ -148,7 +152,7 @@ def elements(fields: Sequence[Field], rows: Sequence[Mapping[str, Any]]) -> Elem
         columns[field.name] = _joined(parts)
     starts = np.cumsum(counts) - counts
     return Elements(
-        np.repeat(np.arange(len(rows), dtype=np.int64), counts),
+        np.repeat(np.arange(len(counts), dtype=np.int64), counts),
         np.arange(int(counts.sum()), dtype=np.int64) - np.repeat(starts, counts),
         columns,
     )

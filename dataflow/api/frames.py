@@ -44,12 +44,12 @@ def element_frame(
     seconds: npt.NDArray[np.float64],
     found: Elements,
     columns: Mapping[str, Column],
-    class_names: Sequence[Sequence[str] | None],
+    class_names: Sequence[Sequence[str] | None] | Column,
 ) -> pd.DataFrame:
     """A table of the elements of messages, by the time of their message; `class_names` by message."""
     at = found.message
     table = {"stamp": stamps[at], "seconds": seconds[at], "message": at, "element": found.number, **flat(columns)}
-    if CLASS_IDS in columns and any(class_names):
+    if CLASS_IDS in columns and any(names for names in class_names):
         table["class_name"] = np.array(
             [_name(class_names[m], k) for m, k in zip(at.tolist(), columns[CLASS_IDS].tolist(), strict=True)], object
         )

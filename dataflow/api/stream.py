@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Field, Message
 from dataflow.recording import Recorded, Recording, StreamInfo
 from dataflow.recording.access import StreamIndex
+from dataflow.recording.json_columns import Values
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -137,8 +138,8 @@ class RecordedStream(Sequence[Message]):
     def columns(self, *fields: str) -> dict[str, Column]:
         """Several fields, read in one pass; without names, the scalars and the vectors of fixed length."""
         chosen = self._fields(fields) or tuple(f for f in self.message_type.FIELDS if is_narrow(f))
-        rows = self._rows(chosen)
-        return {f.name: column(f, [row.get(f.name) for row in rows]) for f in chosen}
+        values = self._values(chosen)
+        return {f.name: column(f, values[f.name]) for f in chosen}
 
     def frame(self, *fields: str) -> pd.DataFrame:
         """A pandas table with a row for each message, by time (UTC).
@@ -160,12 +161,11 @@ class RecordedStream(Sequence[Message]):
         chosen = self._fields(fields) or able
         lengths = next(f for f in able if f in self.message_type.ARRAYS)
         names = [f for f in self.message_type.FIELDS if f.name == frames.CLASS_NAMES]
-        rows = self._rows(tuple(dict.fromkeys((*chosen, lengths, *names))))
-        found = elements(tuple(dict.fromkeys((*chosen, lengths))), rows)
+        values = self._values(tuple(dict.fromkeys((*chosen, lengths, *names))))
+        found = elements(tuple(dict.fromkeys((*chosen, lengths))), values)
         columns = {f.name: found.columns[f.name] for f in chosen if f.name in found.columns}
-        return frames.element_frame(
-            self.stamps, self.seconds, found, columns, [row.get(frames.CLASS_NAMES) for row in rows]
-        )
+        class_names = values.get(frames.CLASS_NAMES, ())
+        return frames.element_frame(self.stamps, self.seconds, found, columns, class_names)
 
     def _fields(self, names: Sequence[str]) -> tuple[Field, ...]:
         known = {field.name: field for field in self.message_type.FIELDS}
@@ -176,9 +176,8 @@ class RecordedStream(Sequence[Message]):
                 )
         return tuple(known[name] for name in names)
 
-    def _rows(self, fields: Sequence[Field]) -> list[Mapping[str, Any]]:
-        names = frozenset(field.name for field in fields)
-        return [self._index.fields(place, names) for place in self._places.tolist()]
+    def _values(self, fields: Sequence[Field]) -> dict[str, Values]:
+        return self._index.columns(self._places, frozenset(field.name for field in fields))
 
     # ------------------------------------------------------------------------------------------------- display
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -24,6 +24,7 @@ from dataflow.recording.json_codec import (
     json_schema,
     timestamp_object,
 )
+from dataflow.recording.json_columns import Values, decode_json_columns
 from dataflow.recording.layout import FIELDS
 
 M = TypeVar("M", bound=Message)
@@ -61,6 +62,9 @@ class Codec(Protocol):
         Cheaper than the message, which checks them together. Raises `RecordingError`.
         """
 
+    def columns(self, messages: Sequence[tuple[Any, Any | None]], names: Collection[str]) -> dict[str, Values]:
+        """The named fields of many messages, each given as data and companion. Raises `RecordingError`."""
+
 
 class JsonCodec(Generic[M]):
     """Any message type as JSON."""
@@ -86,6 +90,10 @@ class JsonCodec(Generic[M]):
 
     def fields(self, data: Any, companion: Any | None, names: Collection[str]) -> dict[str, Any]:
         return decode_fields(decode_object(data), [f for f in self._message.FIELDS if f.name in names])
+
+    def columns(self, messages: Sequence[tuple[Any, Any | None]], names: Collection[str]) -> dict[str, Values]:
+        fields = [f for f in self._message.FIELDS if f.name in names]
+        return decode_json_columns((data for data, _ in messages), fields)
 
 
 class FoxgloveCodec(Generic[M]):
@@ -124,6 +132,10 @@ class FoxgloveCodec(Generic[M]):
     def fields(self, data: Any, companion: Any | None, names: Collection[str]) -> dict[str, Any]:
         found = self._decoded(data, companion)
         return {name: found[name] for name in names if found.get(name) is not None}
+
+    def columns(self, messages: Sequence[tuple[Any, Any | None]], names: Collection[str]) -> dict[str, Values]:
+        found = [self._decoded(data, companion) for data, companion in messages]
+        return {name: [fields.get(name) for fields in found] for name in names}
 
     def _decoded(self, data: Any, companion: Any | None) -> dict[str, Any]:
         fields = self._schema.decode(self._schema.parse(data))

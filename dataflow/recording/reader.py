@@ -23,6 +23,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.foreign import foreign_decoder
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
+from dataflow.recording.json_columns import Values
 from dataflow.recording.layout import Kind
 from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 
@@ -221,7 +222,7 @@ class Recording:
         return StreamIndex(
             rows(self._tracks(found, False), start, end),
             read=lambda row: self._recorded(found, row),
-            fields=lambda row, names: self._fields(found, row, names),
+            columns=lambda rows, names: self._columns(found, rows, names),
             stamped_by_log_time=found.own,
         )
 
@@ -433,17 +434,23 @@ class Recording:
         seq = channel.base + raw.sequence if stream.own else row[7]
         return Recorded(stream.info.name, message, seq, channel.incarnation)
 
-    def _fields(self, stream: _Stream, row: Row, names: Collection[str]) -> dict[str, Any]:
-        """The named fields of a message, those that are None left out."""
-        channel, raw, extra = self._stored(stream, row)
+    def _columns(self, stream: _Stream, rows: Sequence[Row], names: Collection[str]) -> dict[str, Values]:
+        """The named fields of some messages."""
         message_type = stream.info.message_type
-        if stream.own and message_type is not None:
-            try:
-                return codec_for(message_type).fields(raw.data, extra, names)
-            except RecordingError as error:
-                raise self._unreadable(stream.info.name, raw, str(error)) from error
-        values = dict(self._decode(stream.info.name, channel, raw, extra).items())
-        return {name: values[name] for name in names if values[name] is not None}
+        if not stream.own or message_type is None:
+            messages = [self._recorded(stream, row).message for row in rows]
+            return {name: [getattr(message, name) for message in messages] for name in names}
+        codec = codec_for(message_type)
+        stored = [self._stored(stream, row) for row in rows]
+        try:
+            return codec.columns([(raw.data, extra) for _, raw, extra in stored], names)
+        except RecordingError:
+            for _, raw, extra in stored:  # one of them is to blame
+                try:
+                    codec.fields(raw.data, extra, names)
+                except RecordingError as error:
+                    raise self._unreadable(stream.info.name, raw, str(error)) from error
+            raise
 
     def _stored(self, stream: _Stream, row: Row) -> tuple[_Channel, RawMessage, memoryview | None]:
         """The data of a message and of its companion, and the channel that holds it."""
