@@ -96,10 +96,10 @@ def detections(
 
 
 def velocity(thing: Thing, t: float) -> Array:
-    """Of a thing's own frame, m/s, in the world."""
+    """Of the middle of a thing's box, m/s, in the world: a limb that swings moves it too."""
     if thing.still:
         return np.zeros(3)
-    before, after = (thing.mover.frame(t + dt)[:3, 3] for dt in (-_STEP, _STEP))
+    before, after = (thing.box(t + dt)[0][:3, 3] for dt in (-_STEP, _STEP))
     return np.asarray((after - before) / (2 * _STEP))
 
 

@@ -25,7 +25,7 @@ class WheelModel:
         self._turned = np.zeros(2)  # metres at the rim: left, right
         self._counts = np.zeros(2, np.int64)
         self._pose = np.zeros(3)  # x, y, yaw as the controller believes
-        self._spread = np.zeros((3, 3))
+        self._spread = np.diag([0.0, 0.0, 0.0, wheels.scale_error**2, wheels.scale_error**2])  # pose, both scales
 
     def measure(
         self, path: Trajectory, t: float, rng: np.random.Generator, stamp: int, frame: str, base: str
@@ -60,26 +60,31 @@ class WheelModel:
             child_frame=base,
             position=np.array([self._pose[0], self._pose[1], 0.0]),
             orientation=quaternion_from_yaw(self._pose[2]),
-            pose_covariance=_spatial(self._spread),
+            pose_covariance=_spatial(self._spread[:3, :3]),
             linear=np.array([speed, 0.0, 0.0]),
             angular=np.array([0.0, 0.0, rate]),
         )
         return ticks, odometry
 
     def _advance(self, left: float, right: float) -> None:
-        """Second-order dead reckoning, and the covariance of what the wheels' errors do to it."""
+        """Second-order dead reckoning, and the covariance of what the wheels' errors do to it.
+
+        Slip is fresh at every step; a wheel's scale error is the same for ever, so it stays in the state: what it does
+        to the pose adds up along the way instead of averaging out.
+        """
         forward, turn = (left + right) / 2, (right - left) / self._wheels.track
         middle = self._pose[2] + turn / 2
         c, s = math.cos(middle), math.sin(middle)
         self._pose += [forward * c, forward * s, turn]
-        F = np.array([[1, 0, -forward * s], [0, 1, forward * c], [0, 0, 1]])
         b = self._wheels.track
         G = np.array([[c / 2 + forward * s / (2 * b), c / 2 - forward * s / (2 * b)],
                       [s / 2 - forward * c / (2 * b), s / 2 + forward * c / (2 * b)],
                       [-1 / b, 1 / b]])  # fmt: skip
-        scale, slip = self._wheels.scale_error, self._wheels.slip
-        noise = np.diag([slip**2 * abs(d) + scale**2 * abs(d) for d in (left, right)])
-        self._spread = F @ self._spread @ F.T + G @ noise @ G.T
+        F = np.eye(5)
+        F[:2, 2] = -forward * s, forward * c
+        F[:3, 3:] = G * [left, right]
+        self._spread = F @ self._spread @ F.T
+        self._spread[:3, :3] += self._wheels.slip**2 * (G * np.abs([left, right])) @ G.T
 
 
 def _rolled(path: Trajectory, track: float, start: float, end: float) -> Array:

@@ -52,7 +52,7 @@ def flat_view(z: float, cosine: float = 1.0, shape: tuple[int, int] = (120, 160)
     return View(full, np.full(shape, cosine, np.float32), zeros, zeros.astype(np.uint16), zeros.astype(np.uint8), None)
 
 
-@pytest.mark.parametrize("grain", [1, 4])
+@pytest.mark.parametrize("grain", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("z", [1.0, 2.0, 4.0])
 def test_depth_noise_grows_with_the_square_of_depth(z: float, grain: int) -> None:
     camera = DepthCamera(noise=0.004, quantum=0.0002, grain=grain, specks=0)
@@ -60,6 +60,16 @@ def test_depth_noise_grows_with_the_square_of_depth(z: float, grain: int) -> Non
     metres = depth.metres(levels, camera.quantum)
     assert metres.mean() == pytest.approx(z, rel=0.01)
     assert metres.std() == pytest.approx(0.004 * z * z, rel=0.15)
+
+
+@pytest.mark.parametrize("grain", [1, 2, 3, 4, 7, 16])
+def test_depth_noise_is_as_large_as_stated_whatever_its_grain(grain: int) -> None:
+    camera = DepthCamera(noise=0.004, quantum=0.0002, grain=grain, specks=0, edge_holes=0)
+    inverse = [
+        1 / depth.metres(depth.measure(flat_view(1.0), camera, POOL, np.random.default_rng(k)), camera.quantum)
+        for k in range(120)
+    ]
+    assert np.std(inverse) == pytest.approx(0.004, rel=0.02)
 
 
 def test_depth_is_quantised_in_steps_of_inverse_depth() -> None:
@@ -332,6 +342,35 @@ def test_a_wheel_with_a_bias_counts_too_much_by_that_share() -> None:
         for bias in ({}, {"bias": [0.05, -0.02]})
     ]
     np.testing.assert_allclose(ends[1].ticks / ends[0].ticks, [1.05, 0.98], atol=1e-3)
+
+
+def test_wheel_odometry_errs_as_its_covariance_says() -> None:
+    """Over many seeds, after rounds in which the constant scale errors add up, against wheels without error."""
+
+    path, steps = Trajectory(SQUARE, speed=0.6), 51
+    fine: dict[str, Any] = {"rate": 2, "ticks_per_turn": 1 << 20}
+
+    def end(wheels: Wheels, seed: int) -> tuple[Array, Array]:
+        """Where the wheels say that they are after 25 s, and the covariance."""
+        model, rng = WheelModel(wheels, seed), np.random.default_rng(seed)
+        odometry = [model.measure(path, k * 0.5, rng, k, "odom", "base")[1] for k in range(steps)][-1]
+        assert odometry.pose_covariance is not None
+        yaw = 2 * math.atan2(odometry.orientation[2], odometry.orientation[3])
+        return np.array([*odometry.position[:2], yaw]), odometry.pose_covariance[np.ix_([0, 1, 5], [0, 1, 5])]
+
+    exact, _ = end(Wheels(**fine, scale_error=0, slip=0), 0)
+
+    def errors(wheels: Wheels) -> list[tuple[Array, Array]]:
+        found = [end(wheels, seed) for seed in range(50)]
+        turn = [0, 0, 2 * math.pi]
+        return [
+            (e - turn * np.round(e / (2 * math.pi)), covariance) for where, covariance in found for e in [where - exact]
+        ]
+
+    yaws = [(error[2], math.sqrt(covariance[2, 2])) for error, covariance in errors(Wheels(**fine))]
+    assert np.std([yaw for yaw, _ in yaws]) == pytest.approx(np.mean([claimed for _, claimed in yaws]), rel=0.3)
+    small = errors(Wheels(**fine, scale_error=0.001, slip=0.002))  # so small that they are linear in their causes
+    assert 0.7 < np.mean([error @ np.linalg.solve(covariance, error) / 3 for error, covariance in small]) < 1.4
 
 
 def test_wheel_errors_are_as_large_as_stated() -> None:
