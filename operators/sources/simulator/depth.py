@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.sources.simulator.noise import NoisePool
-from operators.sources.simulator.renderer import View
+from operators.sources.simulator.optics import View
 from operators.sources.simulator.settings import DepthCamera
 
 F32 = NDArray[np.float32]
@@ -40,6 +40,8 @@ def measure(view: View, camera: DepthCamera, pool: NoisePool, rng: np.random.Gen
         seen &= ~(brink & (_uniform(pool, rng, truth.shape) < camera.edge_holes))
     if camera.specks > 0:
         seen &= _uniform(pool, rng, truth.shape) >= camera.specks
+    if camera.missing > 0:
+        seen &= ~_patches(rng, truth.shape, camera.missing)
     return np.where(seen, levels, 0).astype(np.uint16)
 
 
@@ -81,6 +83,12 @@ def interpolated_deviation(grain: int) -> float:
     """
     f = ((np.arange(grain) + 0.5) / grain - 0.5) % 1
     return float(np.mean((1 - f) ** 2 + f**2))
+
+
+def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> NDArray[np.bool_]:
+    """Patches (H, W) that cover a share of the image, each a few tenths of it wide."""
+    field = cv2.resize(rng.standard_normal((6, 8)), shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return np.asarray(field <= np.quantile(field, share))
 
 
 def _uniform(pool: NoisePool, rng: np.random.Generator, shape: tuple[int, ...]) -> F32:

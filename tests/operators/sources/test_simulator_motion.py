@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from operators.sources.simulator import corridor, office, table_top
+from operators.sources.simulator.drive import Drive
 from operators.sources.simulator.inertial import true_reading
 from operators.sources.simulator.movers import STANDING, Driving, Person
 from operators.sources.simulator.native import open3d
@@ -69,7 +70,7 @@ def test_speed_and_turning_stay_within_limits(name: str) -> None:
 
 def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> None:
     path, imu = world("office", 0).path, Inertial(mount=(0.2, -0.1, 0.4, 0.0, 0.0, 0.5))
-    lever = np.array([0.2, -0.1])
+    drive, lever = Drive(path), np.array([0.2, -0.1])
     dt, steps = 0.005, 2000
     start = path.at([0.0])
     R0 = start.T_world_base()[0][:2, :2]
@@ -77,7 +78,7 @@ def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> 
     p = start.position[0] + R0 @ lever
     v = start.velocity[0] + R0 @ (float(start.yaw_rate[0]) * np.array([-lever[1], lever[0]]))
     for k in range(steps):
-        omega, force = true_reading(path, imu, (k + 0.5) * dt)
+        omega, force = true_reading(drive, imu, (k + 0.5) * dt)
         assert force[2] == pytest.approx(9.80665)
         middle = yaw + omega[2] * dt / 2
         a = np.array(

@@ -18,8 +18,9 @@ from operators.sources.simulator.classes import ACTIVITIES, THINGS
 from operators.sources.simulator.furnishing import FLOOR
 from operators.sources.simulator.furniture import rover
 from operators.sources.simulator.movers import Carried, Person
+from operators.sources.simulator.optics import Optics
 from operators.sources.simulator.relations import PLACEMENT, SPATIAL
-from operators.sources.simulator.renderer import Optics, Renderer
+from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Builder, Light, Still, World
 from operators.sources.simulator.shapes import Material, bounds, box, pose
 from operators.sources.simulator.trajectory import Trajectory
