@@ -34,7 +34,7 @@ HERE = Path(__file__).resolve().parent
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One graph: `operators` without the source; `recorded` with a recorder of all streams; a fan instead of a chain."""
+    """One graph: `operators` without the source, in a chain or a fan; `recorded`: all streams are."""
 
     name: str
     operators: int

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import random
 import sys
 from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
 import xxhash
+
+from dataflow.firing.lazy_random import seed_lazily
 
 VERSION: Final = 2
 """The scheme by which calls are seeded; recordings name it, and re-execution follows the one they name.
@@ -43,7 +44,7 @@ def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, sta
 
 def seed_generators(seed: int) -> None:
     """Seeds the global generators of Python, numpy and the libraries that are loaded."""
-    random.seed(seed)
+    seed_lazily(seed)
     np.random.seed(seed & 0xFFFFFFFF)
     modules: dict[str, Any] = sys.modules  # a library that is not loaded is not loaded for this
     if (torch := modules.get("torch")) is not None:

@@ -8,12 +8,13 @@ operator is at work, where nobody else can have drawn. (OpenCV has a generator f
 
 from __future__ import annotations
 
-import random
 import sys
 from types import TracebackType
 from typing import Any
 
 import numpy as np
+
+from dataflow.firing.lazy_random import peek
 
 
 class SharedGenerators(RuntimeError):
@@ -71,4 +72,4 @@ def _state() -> tuple[object, ...]:
     modules: dict[str, Any] = sys.modules
     torch = modules.get("torch")
     drawn = None if torch is None else torch.default_generator.get_state().numpy().tobytes()
-    return random.getstate(), mersenne["state"]["key"].tobytes(), mersenne["state"]["pos"], drawn
+    return peek(), mersenne["state"]["key"].tobytes(), mersenne["state"]["pos"], drawn
