@@ -231,11 +231,14 @@ def validate_parameters(cls: type[Operator], params: Mapping[str, Any]) -> pydan
 
 def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
     """What `process()` returned, as port → message; checked against the declared ports. Raises `OutputError`."""
-    spec = operator.spec
-    dynamic = [p for p in spec.outputs.values() if not p.static]
     if returned is None:
         return {}
+    spec = operator.spec
     if isinstance(returned, Message):
+        only = spec.only_output
+        if only is not None and isinstance(returned, only.types):
+            return {only.name: returned}
+        dynamic = [p for p in spec.outputs.values() if not p.static]
         if len(dynamic) != 1:
             raise OutputError(
                 f"{spec.name} returned one {returned.SCHEMA}, but has {len(dynamic)} outputs "

@@ -113,6 +113,9 @@ class LiveRunner(OperatorRunner):
         theirs, others = super().take_drops()
         return [*mine, *theirs], more + Counter(others)
 
+    def has_drops(self) -> bool:
+        return self._log.pending or super().has_drops()
+
     # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:

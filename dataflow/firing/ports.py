@@ -57,6 +57,7 @@ class OutputPorts:
         self.withheld: Counter[str] = Counter()
         """Messages that were not sent because their stamps did not increase, by port."""
         self._prepared: list[tuple[str, Entry]] = []
+        self._nothing = (None,) * len(self.states)
 
     def prepare(self, messages: Mapping[str, Message], firing: int) -> tuple[Emission | None, ...]:
         """Checks and numbers what one firing emitted; `publish` sends it, after the firing was recorded.
@@ -64,6 +65,8 @@ class OutputPorts:
         Raises `OutputError` for a stamp that the port may not carry. With `lossy`, a stamp that does not increase is
         no error: the message is not sent, and its emission is marked `withheld`.
         """
+        if not messages:
+            return self._nothing
         self.check(messages, firing)
         emissions: list[Emission | None] = []
         for name, state in self.states.items():
@@ -121,6 +124,8 @@ class OutputPorts:
 
     def publish(self) -> None:
         """Sends what was prepared, in order."""
+        if not self._prepared:
+            return
         prepared, self._prepared = self._prepared, []
         for stream, entry in prepared:
             self.emitter.message(stream, entry)

@@ -326,6 +326,10 @@ class Aligner:
         `late`; Sampled and Batch messages still serve the firings to come."""
         return self._drop_log.late
 
+    def has_drops(self) -> bool:
+        """Whether there is a drop that was not taken."""
+        return self._drop_log.pending
+
     def take_drops(self) -> list[Drop]:
         """The drops since this was last asked, at most the last `KEPT`."""
         return self._drop_log.take()
