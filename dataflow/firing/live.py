@@ -37,6 +37,8 @@ class LiveRunner(OperatorRunner):
     new incarnation. `on_failure` is told of every failure that is outlived.
     """
 
+    keeps_time = True
+
     def __init__(
         self,
         node: Node,
@@ -146,6 +148,7 @@ class LiveRunner(OperatorRunner):
         self._arrive(stream, Arrival("end", NEVER if final_stamp is None else final_stamp, None, reason))
 
     def _arrive(self, stream: str, arrival: Arrival) -> None:
+        self.wake()
         if stream in self.queue.triggers:
             self.queue.put(stream, arrival)
         else:

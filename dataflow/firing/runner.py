@@ -104,12 +104,17 @@ class OperatorRunner(Runner):
 
     def push(self, stream: str, entry: Entry) -> None:
         self.aligner.push(stream, entry)
+        if not self.awake:
+            self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         self.aligner.advance(stream, frontier)
+        if not self.awake:
+            self.wake()
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self.aligner.end(stream, final_stamp, reason)
+        self.wake()
 
     def step(self) -> bool:
         if self.ended:
@@ -136,6 +141,7 @@ class OperatorRunner(Runner):
             self.ended, self.done = True, FOREVER
             self.ports.end(self.aligner.final_stamp(), "end of input")
         else:
+            self.ports.promise(firing.stamp)
             self.done = max(self.done, firing.stamp)
         return True
 
