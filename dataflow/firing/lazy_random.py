@@ -12,10 +12,9 @@ from __future__ import annotations
 import _random
 import random
 import sys
-from collections.abc import Callable
 from typing import Any
 
-_GENERATOR: random.Random = random._inst  # type: ignore[attr-defined]
+_GENERATOR = random._inst
 _BOUND = {"random": random.random, "getrandbits": random.getrandbits}
 _REFERENCES = 4
 """Those to a bound method of `random`, of `_BOUND`, and of the loop and the call that count them."""
@@ -24,7 +23,7 @@ _REFERENCES = 4
 class _State:
     """What is pending, and how often the generator was seeded after all."""
 
-    seed: Callable[[], int] | int = 0
+    seed = 0
     settled = 0
 
 
@@ -37,8 +36,12 @@ def seed_lazily(seed: int) -> None:
         random.seed(seed)
         return
     _State.seed = seed
-    _GENERATOR.__class__ = _Pending
+    _change_class(_Pending)
     random.__dict__.update(_SETTLING)
+
+
+def _change_class(to: type[random.Random]) -> None:
+    object.__setattr__(_GENERATOR, "__class__", to)
 
 
 def peek() -> tuple[object, ...]:
@@ -50,7 +53,7 @@ def _restore() -> random.Random:
     """Makes the generator an ordinary one again, in the state that it has."""
     if _GENERATOR.__class__ is _Pending:
         _State.settled += 1
-        _GENERATOR.__class__ = random.Random
+        _change_class(random.Random)
         random.__dict__.update(_BOUND)
     return _GENERATOR
 
