@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.firing.failure import RAISED, InputMutated, OperatorFailure
-from dataflow.firing.seeding import VERSION, change_seed, firing_seed, seed_generators
+from dataflow.firing.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
 from dataflow.firing.shared_generators import AT_WORK
 from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.firing.threads import limit_threads_again
@@ -30,6 +30,7 @@ class Calls:
 
     def __init__(self, node: Node, operator: Operator, seed: int, *, version: int = VERSION) -> None:
         self.node, self.operator, self.seed, self.version = node, operator, seed, version
+        self._seeded_by = f"{seed}/{node.name}/"
 
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
@@ -56,7 +57,7 @@ class Calls:
         AT_WORK.fires = True
         AT_WORK.begun += 1
         try:
-            seed = firing_seed(self.seed, self.node.name, firing.stamp)
+            seed = FiringSeed(self._seeded_by, firing.stamp)
             seed_generators(seed)
             self.operator.seed_rng(seed)
             return outputs_of(self.operator, _call(self.operator, firing))

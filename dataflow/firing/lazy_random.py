@@ -12,7 +12,7 @@ from __future__ import annotations
 import _random
 import random
 import sys
-from typing import Any
+from typing import Any, SupportsInt
 
 _GENERATOR = random._inst
 _BOUND = {"random": random.random, "getrandbits": random.getrandbits}
@@ -23,17 +23,17 @@ _REFERENCES = 4
 class _State:
     """What is pending, and how often the generator was seeded after all."""
 
-    seed = 0
+    seed: SupportsInt = 0
     settled = 0
 
 
-def seed_lazily(seed: int) -> None:
+def seed_lazily(seed: SupportsInt) -> None:
     """Seeds the global generator, as `random.seed(seed)` does, as soon as anybody asks something of it."""
     if _GENERATOR.__class__ is _Pending:
         _State.seed = seed
         return
     if any(sys.getrefcount(method) > _REFERENCES for method in _BOUND.values()):
-        random.seed(seed)
+        random.seed(int(seed))
         return
     _State.seed = seed
     _change_class(_Pending)
@@ -61,7 +61,7 @@ def _restore() -> random.Random:
 def _settle() -> random.Random:
     """Seeds the generator with what is pending, if it still is."""
     if _GENERATOR.__class__ is _Pending:
-        _restore().seed(_State.seed)
+        _restore().seed(int(_State.seed))
     return _GENERATOR
 
 

@@ -163,6 +163,7 @@ class LiveRunner(OperatorRunner):
                 return False
             self._start_again()
         if super().step():
+            self.wake()
             return True
         while not self.ended:
             taken = self.queue.take()
@@ -171,6 +172,7 @@ class LiveRunner(OperatorRunner):
             elif not self._give_up():
                 return False
             if super().step():
+                self.wake()
                 return True
         return False
 

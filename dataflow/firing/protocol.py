@@ -40,7 +40,7 @@ class Runner:
         """Its place in the graph and where it puts itself when it wakes (`dataflow.firing.ready`)."""
 
     def wake(self) -> None:
-        """Asks to be stepped: something was given that may decide a firing."""
+        """Asks to be stepped: something was given that may decide a firing, or there may be another one."""
         if not self.awake:
             self.awake = True
             self.wakes_in.append(self)
@@ -62,7 +62,10 @@ class Runner:
         raise NotImplementedError
 
     def step(self) -> bool:
-        """Makes the next firing if it is decided; False when there is nothing to do. Raises `OperatorFailure`."""
+        """Makes the next firing if it is decided; False when there was nothing to do. Raises `OperatorFailure`.
+
+        Where there may be more to do it wakes.
+        """
         raise NotImplementedError
 
     def next_due(self) -> float | None:

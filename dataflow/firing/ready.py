@@ -1,4 +1,4 @@
-"""Which operators of a process have something to do: those that were given something, and those whose time has come.
+"""Which operators of a process have something to do: those that woke, and those whose time has come.
 
 A process asks nobody else, so that an operator which is given nothing costs nothing, however many there are.
 """
@@ -52,7 +52,6 @@ class Ready:
             runner.awake = False
             if runner.step():
                 worked = True
-                runner.wake()
             elif runner.keeps_time:
                 self._note(runner)
         return worked

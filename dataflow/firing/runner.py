@@ -126,6 +126,8 @@ class OperatorRunner(Runner):
             frontier = self.aligner.output_frontier()
             self.ports.promise(frontier)
             self.done = max(self.done, frontier)
+            if self.aligner.paused:
+                self.wake()
             return self.aligner.paused
         work = self.work
         if work.mean_ns > SHORT:
@@ -140,9 +142,14 @@ class OperatorRunner(Runner):
         if firing.kind == "finish":
             self.ended, self.done = True, FOREVER
             self.ports.end(self.aligner.final_stamp(), "end of input")
-        else:
-            self.ports.promise(firing.stamp)
-            self.done = max(self.done, firing.stamp)
+            return True
+        frontier = self.aligner.idle_frontier()
+        if frontier == NEVER:
+            frontier = firing.stamp
+            self.wake()
+        self.ports.promise(frontier)
+        if frontier > self.done:
+            self.done = frontier
         return True
 
     def _bound_ticks(self, period: int) -> None:

@@ -129,7 +129,6 @@ class Progress:
         streams: dict[str, list[Any]] = {}
         for maker in self._runners.all:
             for state in maker.ports.states.values():
-                assert state.digest is not None
                 streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
         for log in self._feeding.logs:
             streams |= {name: [count, digest] for name, count, digest in log.counts()}

@@ -299,6 +299,15 @@ class Aligner:
             self._decided = frontier
         return self._decided
 
+    def idle_frontier(self) -> int:
+        """The output frontier, where no firing is held back and none is left: nothing will come before somebody says
+        more. NEVER where `poll` is to be asked."""
+        if not self._settled:
+            self._settle()
+        if self._stamp is not None or not self._settled or self._triggers.bound == FOREVER:
+            return NEVER
+        return self.output_frontier()
+
     @property
     def next_undecided(self) -> int | None:
         """The first stamp of a trigger or tick that is not decided; None if there is none yet."""
