@@ -21,7 +21,10 @@ from simulation.world import EPOCH, Process, Task, World
 
 FIRST = 1_000_000
 """Descriptors from here on are the simulated machine's."""
-PIPE_BYTES = 65536
+PIPE_BYTES = 212_992
+"""Bytes that a socket holds by Linux's defaults."""
+OVERHEAD = 704
+"""Bytes that Linux adds to each message, however small."""
 
 
 class Waiters:
@@ -219,7 +222,7 @@ class Pipe:
 
     @property
     def free(self) -> int:
-        return self._room - self._size
+        return max(0, self._room - self._size - OVERHEAD)
 
     @property
     def readable(self) -> bool:
@@ -230,7 +233,7 @@ class Pipe:
     def write(self, data: bytes) -> None:
         self._due = max(self._due, self._world.now + self._world.latency())
         self._chunks.append((self._due, data))
-        self._size += len(data)
+        self._size += len(data) + OVERHEAD
         self._world.at(self._due, self.changed.notify)
 
     def read(self, most: int) -> bytes:
@@ -238,8 +241,10 @@ class Pipe:
         parts: list[bytes] = []
         while most and self._chunks and self._chunks[0][0] <= self._world.now:
             due, data = self._chunks.popleft()
+            self._size -= OVERHEAD
             if len(data) > most:
                 self._chunks.appendleft((due, data[most:]))
+                self._size += OVERHEAD
                 data = data[:most]
             parts.append(data)
             most -= len(data)
@@ -332,7 +337,7 @@ class Sockets:
         self._system = system
 
     def socketpair(self) -> tuple[Socket, Socket]:
-        one, other = Pipe(self._system.world), Pipe(self._system.world)
+        one, other = (Pipe(self._system.world, self._system.socket_bytes) for _ in range(2))
         return Socket(self._system, one, other), Socket(self._system, other, one)
 
     def socket(self, *, fileno: int) -> Any:
@@ -366,8 +371,9 @@ class WriteEnd:
 class System:
     """Descriptors, and the module `os`: what is not here is the real one."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, *, socket_room: int = 278) -> None:
         self.world = world
+        self.socket_bytes = socket_room * PIPE_BYTES // 278
         self.things: dict[int, Any] = {}
         self._next = FIRST
 

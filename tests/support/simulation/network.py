@@ -1,8 +1,9 @@
 """The simulated network: a link from each process to each that takes from it.
 
 A link keeps its order; links know nothing of each other. A process that is frozen takes nothing: its links fill, and
-whoever writes to one that is full waits, as Zenoh does, for so long and no longer; then the link is broken, and what
-was on it, and what is sent until it stands again, is lost. A partition breaks links, too. Only live runs outlive that.
+whoever writes to one that is full waits for so long and no longer; then the link is broken, and what was on it, and
+what is sent until it stands again, is lost, but for ends and frontiers of streams. A partition breaks links, too. Only live runs
+outlive that.
 """
 
 from __future__ import annotations
@@ -29,14 +30,15 @@ class Link:
 
     def __init__(self, world: World, taker: Bus) -> None:
         self._world, self._taker = world, taker
-        self._on_its_way: deque[tuple[str, bytes]] = deque()
+        self._on_its_way: deque[tuple[str, bytes, bool]] = deque()
         self._due = 0.0
         self._broken_until = 0.0
         self._room = Waiters(world)
         taker.process.thawed.append(self._deliver)
         self.lost = 0
 
-    def send(self, key: str, payload: bytes, blocked: float) -> None:
+    def send(self, key: str, payload: bytes, blocked: float, *, kept: bool) -> None:
+        """Sends a message; one that is `kept` outlives a broken link."""
         world = self._world
         until = world.now + blocked
         while len(self._on_its_way) >= ROOM and not self._taker.process.dead and world.now >= self._broken_until:
@@ -44,30 +46,32 @@ class Link:
                 self.cut(STANDS_AGAIN)
                 break
             self._room.wait(until - world.now)
-        if self._taker.process.dead or world.now < self._broken_until:
+        broken = world.now < self._broken_until
+        if self._taker.process.dead or (broken and not kept):
             self.lost += 1
             return
-        self._on_its_way.append((key, payload))
-        self._due = max(self._due, world.now + world.latency())
+        self._on_its_way.append((key, payload, kept))
+        self._due = max(self._due, self._broken_until, world.now + world.latency())
         world.at(self._due, self._deliver)
 
     def cut(self, span: float) -> None:
         """Breaks the link for so many seconds."""
-        self.lost += len(self._on_its_way)
-        self._on_its_way.clear()
+        before, self._on_its_way = self._on_its_way, deque(each for each in self._on_its_way if each[2])
+        self.lost += len(before) - len(self._on_its_way)
         self._broken_until = max(self._broken_until, self._world.now + span)
+        self._due = max(self._due, self._broken_until)
+        self._world.at(self._due, self._deliver)
         self._room.notify()
 
     def _deliver(self) -> None:
         """Hands over what has arrived; each message has its own moment, but the frozen take all at once."""
         process = self._taker.process
-        if process.frozen or process.dead or not self._on_its_way:
+        if process.frozen or process.dead or self._world.now < self._broken_until or not self._on_its_way:
             return
-        key, payload = self._on_its_way.popleft()
-        self._taker.take(key, payload)
+        self._taker.take(*self._on_its_way.popleft()[:2])
         if self._due <= self._world.now:
             while self._on_its_way:
-                self._taker.take(*self._on_its_way.popleft())
+                self._taker.take(*self._on_its_way.popleft()[:2])
         self._room.notify()
 
 
@@ -109,7 +113,9 @@ class Publisher:
         self.matched = False
 
     def put(self, envelope: Envelope) -> int:
-        return self.put_bytes(encode(envelope))
+        payload = encode(envelope)
+        self._bus.send(self._stream, payload, kept=envelope.kind is not Kind.MESSAGE)
+        return len(payload)
 
     def put_bytes(self, payload: bytes) -> int:
         self._bus.send(self._stream, bytes(payload))
@@ -146,11 +152,11 @@ class Bus:
         world.call()
         world.after(world.latency(), lambda: self._taken.setdefault(stream, receive))
 
-    def send(self, key: str, payload: bytes) -> None:
+    def send(self, key: str, payload: bytes, *, kept: bool = False) -> None:
         world = self.network.world
         for bus in self._takers(key):
             world.call()
-            self.network.link(self.process, bus).send(key, payload, self.config.blocked)
+            self.network.link(self.process, bus).send(key, payload, self.config.blocked, kept=kept)
             self.counted.moved("sent", len(payload))
 
     def _takers(self, key: str) -> Iterator[Bus]:

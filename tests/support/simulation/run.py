@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import sys
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ MEGABYTES = 50_000_000
 
 @dataclass(frozen=True, slots=True)
 class Happening:
-    """What happens to a run from outside, `at` so many seconds after its beginning.
+    """What happens to a run from outside, `at` so many seconds after its sources were released.
 
     `kill`, `freeze` (for `span` s), `kill_at_call` (at its `call`-th call to the operating system, of the `life`-th
     process with that label) happen to the process `target`; `cut` breaks the link from it to the process `other`
@@ -54,6 +55,8 @@ class Machine:
     preempt: float = 0.02
     room: int | None = None
     slow_disk: float = 0.0
+    socket_room: int = 278
+    """Messages that fit into a socket pair: 278 on a real machine, with Linux's defaults."""
 
 
 @dataclass(slots=True)
@@ -84,7 +87,7 @@ class Simulation:
 
     def __init__(self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str) -> None:
         self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
-        self.system = machine.System(self.world)
+        self.system = machine.System(self.world, socket_room=machine_.socket_room)
         self.network = network.Network(self.world)
         self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
         self.outcome = Outcome()
@@ -115,13 +118,17 @@ class Simulation:
         if plan.record is not None:
             plan = replace(plan, metadata=_metadata(plan, self._mode))
         self._supervisor = Supervisor(plan, on_output=lambda label, line: self.outcome.words.append(f"{label}: {line}"))
-        for happening in self._happenings:
-            self.world.at(happening.at, lambda happening=happening: self._happen(happening))
         process = self.world.process(SUPERVISOR)
         process.on_line = lambda line: self.outcome.words.append(line)
         ended: list[bool] = []
         self.world.start("main", process, lambda: self._supervise(ended))
         self.world.run(lambda: bool(ended), LIMIT)
+
+    def _released(self, *_: Any, **__: Any) -> Any:
+        """The graph is announced: its sources are released."""
+        for happening in self._happenings:
+            self.world.after(happening.at, functools.partial(self._happen, happening))
+        return contextlib.nullcontext()
 
     def _supervise(self, ended: list[bool]) -> None:
         assert self._supervisor is not None
@@ -158,7 +165,7 @@ class Simulation:
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
             (f"{supervision}.supervisor", "Nursery"): lambda environment: Nursery(system, self._named, self._born),
             (f"{supervision}.supervisor", "Words"): _Shown,
-            (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=_nothing_to_close),
+            (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
             (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
             (f"{supervision}.supervisor", "environment"): _nothing,
             (f"{supervision}.supervisor", "make_black_box"): self._make_box,
@@ -263,10 +270,6 @@ class _NoTripwire:
 
 def _nothing(*_: Any, **__: Any) -> dict[str, str]:
     return {}
-
-
-def _nothing_to_close(*_: Any, **__: Any) -> Any:
-    return contextlib.nullcontext()
 
 
 def _reserved(reserved: Any, number: int) -> Any:
