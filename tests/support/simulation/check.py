@@ -8,6 +8,7 @@ goes. A replay, placed otherwise and on another machine, has the same digests.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import os
 from collections import Counter
@@ -17,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph import Graph
+from dataflow.graph.load import load_bundle
 from dataflow.recording import Recording, RecordingError
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError
@@ -131,10 +133,15 @@ def verified(path: Path) -> VerifyReport:
     bindings = {
         ("dataflow.verification.verify", "call_workers"): _call_here,
         ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
+        ("dataflow.reexecution.recorded_run", "load_bundle"): _load_bundle,
     }
     importlib.import_module("dataflow.verification.verify")
     with bound(bindings):
         return verify(path, jobs=1)
+
+
+_load_bundle = functools.lru_cache(maxsize=1024)(load_bundle)
+"""The graph in a recording; the same ones come again and again."""
 
 
 def _call_here(calls: list[Call], **options: Any) -> list[Any]:

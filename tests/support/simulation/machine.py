@@ -449,7 +449,7 @@ class Selector(selectors._BaseSelectorImpl):  # type: ignore[name-defined,misc]
             task = world.task
             assert task is not None
             waiters = [
-                each for fd in self.get_map() if fd in self._system.things for each in self._system.things[fd].waiters
+                each for fd in self._fd_to_key if fd in self._system.things for each in self._system.things[fd].waiters
             ]
             for each in waiters:
                 each.add(task)
@@ -462,15 +462,16 @@ class Selector(selectors._BaseSelectorImpl):  # type: ignore[name-defined,misc]
         return found
 
     def _ready(self) -> list[tuple[selectors.SelectorKey, int]]:
-        found = []
-        for fd, key in self.get_map().items():
-            thing = self._system.things.get(fd)
+        found, things = [], self._system.things
+        for fd, key in self._fd_to_key.items():
+            thing = things.get(fd)
             if thing is None:
                 continue
             mask = selectors.EVENT_READ if thing.readable else 0
-            mask |= selectors.EVENT_WRITE if thing.writable else 0
-            if mask & key.events:
-                found.append((key, mask & key.events))
+            if key.events & selectors.EVENT_WRITE and thing.writable:
+                mask |= selectors.EVENT_WRITE
+            if mask:
+                found.append((key, mask))
         return found
 
 

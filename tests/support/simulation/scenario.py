@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import functools
 import random
-import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from dataflow.chaos.plan import Fault
-from dataflow.graph import Graph, load_graph
+from dataflow.graph import Graph, load_text
 from simulation.run import Happening, Machine
 
 _USE = "use: simulation.operators"
@@ -38,6 +36,19 @@ GRAPHS: Mapping[str, str] = {
   merge: {{{_USE}:Merge, inputs: {{all: [one/y, two/y, left/slow]}}, {_WORK}LIVE}}
 """,
 }  # noqa: E501
+_RESTART = "restart: {max: 5, backoff: 10ms}"
+POLICIES = (
+    "",
+    _RESTART,
+    "queue: block, size: 16",
+    "queue: newest, size: 1",
+    "queue: oldest, size: 2, wait: 15ms",
+    f"queue: block, size: 16, {_RESTART}",
+    f"queue: newest, size: 1, {_RESTART}",
+    f"queue: newest, size: 16, wait: forever, {_RESTART}",
+    f"queue: oldest, size: 2, wait: 15ms, deadline: 200ms, {_RESTART}",
+    "wait: 0ms, restart: {max: 1, backoff: 100ms}",
+)
 FOREVER = 1e6
 """Seconds that a process is frozen for good."""
 PATIENCE = 2.5
@@ -112,10 +123,7 @@ def load(
     }
     for word, meaning in words.items():
         text = text.replace(word, meaning)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "graph.yaml"
-        file.write_text(text)
-        return load_graph(file, live=live)
+    return load_text(text)
 
 
 def scenario_of(seed: int) -> Scenario:
@@ -137,29 +145,15 @@ def scenario_of(seed: int) -> Scenario:
         live=live,
         count=r.choice((6, 12)),
         period=r.choice((5_000_000, 20_000_000)),
-        work=r.choice((0.0, 0.01, 0.05)),
-        reading=r.choice((0.0, 0.005)),
-        policy=_policy(r) if live else "",
+        work=r.choice((0.0, 0.05)),
+        reading=0.005 if not live and r.random() < 0.3 else 0.0,
+        policy=r.choice(POLICIES) if live else "",
         placement=r.choice(("host_each", "host_each", "one_host")),
         window=r.choice((2, 4, 256)),
         snapshots=r.random() < 0.3,
         machine=machine,
     )
     return _with_events(plain, r)
-
-
-def _policy(r: random.Random) -> str:
-    parts = []
-    if r.random() < 0.7:
-        parts.append(f"queue: {r.choice(('newest', 'oldest', 'block'))}")
-        parts.append(f"size: {r.choice((1, 2, 16))}")
-    if r.random() < 0.5:
-        parts.append(f"wait: {r.choice(('0ms', '15ms', 'forever'))}")
-    if r.random() < 0.7:
-        parts.append(f"restart: {{max: {r.choice((1, 5))}, backoff: {r.choice((10, 100))}ms}}")
-    if r.random() < 0.2:
-        parts.append("deadline: 200ms")
-    return ", ".join(parts)
 
 
 def _with_events(plain: Scenario, r: random.Random) -> Scenario:
