@@ -232,7 +232,7 @@ def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunRepor
         for record in log.of(name)
         if not node.source and record.kind in ("fire", "tick")
     ]
-    for label, nodes in graph.hosts(scenario.placement).items():
+    for label, nodes in graph.processes(scenario.placement).items():
         given = sorted(
             (record.wall_start, record.stamp, sum(1 for made in record.outputs if made is not None))
             for name in nodes
@@ -273,7 +273,7 @@ def _replay(scenario: Scenario, path: Path, number: int) -> RunReport:
     graph = scenario.load()
     with Recording(path) as recording:
         log = plan_replay(recording, graph)
-    placement: Any = "host_each" if (scenario.placement == "one_host") == (number == 1) else "one_host"
+    placement: Any = "process_each" if (scenario.placement == "one_process") == (number == 1) else "one_process"
     plan = RunPlan(graph, placement=placement, log=log, window=(scenario.window, 1 << 20), stall_timeout=TIMEOUT)
     machine = replace(Machine(scenario.seed + 7919 * number), preempt=0.05)
     outcome = simulate(plan, machine, mode="replay")

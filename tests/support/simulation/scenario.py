@@ -13,7 +13,7 @@ from simulation.run import Happening, Machine
 
 _USE = "use: simulation.operators"
 _SOURCE = f"{_USE}:Counter, params: {{count: COUNT, period: PERIOD, work: READING}}"
-_DEVICE = f"{_USE}:Device, params: {{count: COUNT, period: PERIOD}}"
+_DEVICE = f"{_USE}:Device, params: {{count: COUNT, period: PERIOD}}RESTARTED"
 _WORK = "params: {work: WORK}"
 
 GRAPHS: Mapping[str, str] = {
@@ -116,6 +116,7 @@ def load(
     words = {
         "SOURCE": _DEVICE if live else _SOURCE,
         "LIVE": f", live: {{{policy}}}" if policy else "",
+        "RESTARTED": f", live: {{{_RESTART}}}" if "restart" in policy else "",
         "COUNT": str(count),
         "PERIOD": str(period),
         "READING": str(reading),
@@ -148,7 +149,7 @@ def scenario_of(seed: int) -> Scenario:
         work=r.choice((0.0, 0.05)),
         reading=0.005 if not live and r.random() < 0.3 else 0.0,
         policy=r.choice(POLICIES) if live else "",
-        placement=r.choice(("host_each", "host_each", "one_host")),
+        placement=r.choice(("process_each", "process_each", "one_process")),
         window=r.choice((2, 4, 256)),
         snapshots=r.random() < 0.3,
         machine=machine,
@@ -158,7 +159,7 @@ def scenario_of(seed: int) -> Scenario:
 
 def _with_events(plain: Scenario, r: random.Random) -> Scenario:
     graph = plain.load()
-    labels = [*graph.hosts(plain.placement), "@recorder"]
+    labels = [*graph.processes(plain.placement)]
     happenings = [_happening(plain, labels, r) for _ in range(r.choice((0, 0, 1, 1, 2, 3)))]
     faults = [_fault(graph, r) for _ in range(r.choice((0, 0, 1, 2)))] if plain.live else []
     return replace(
@@ -171,14 +172,14 @@ def _with_events(plain: Scenario, r: random.Random) -> Scenario:
 def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happening:
     at = round(r.random() * 0.4, 4)
     kinds = ["freeze", "freeze", "kill_at_call", "kill", "stop"] + (["cut"] if plain.live else [])
-    kind, target = r.choice(kinds), r.choice(labels)
+    kind, target = r.choice(kinds), r.choice(labels) if r.random() < 0.9 else "@recorder"
     match kind:
         case "freeze":
             return Happening(at, kind, target, {"span": r.choice((round(0.3 * r.random(), 4), round(2 * r.random(), 4), 6.0, FOREVER))})
         case "kill_at_call":
             return Happening(0.0, kind, target, {"call": r.randint(1, 1200), "life": r.choice((1, 1, 1, 2))})
         case "cut":
-            return Happening(at, kind, target, {"other": r.choice(labels), "span": round(0.3 * r.random(), 4)})
+            return Happening(at, kind, target, {"other": r.choice([*labels, "@recorder"]), "span": round(0.3 * r.random(), 4)})
         case "stop":
             return Happening(at, kind)
         case _:
