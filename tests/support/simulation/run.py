@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,7 +18,7 @@ from dataflow.supervision.supervisor import Supervisor
 from simulation import bindings, machine, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
-from simulation.world import EPOCH, Process, Violation, World
+from simulation.world import Process, Violation, World
 
 LIMIT = 600.0
 """Simulated seconds after which a run hangs: far above the sum of all timeouts."""

@@ -35,7 +35,7 @@ GRAPHS: Mapping[str, str] = {
   two: {{{_USE}:Smooth, inputs: {{x: left/fast}}LIVE}}
   merge: {{{_USE}:Merge, inputs: {{all: [one/y, two/y, left/slow]}}, {_WORK}LIVE}}
 """,
-}  # noqa: E501
+}
 _RESTART = "restart: {max: 5, backoff: 10ms}"
 POLICIES = (
     "",
