@@ -123,7 +123,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No pro
 
 @dataclass(frozen=True, slots=True)
 class _Outputs:
-    """What a run leaves behind or shows, checked before anything starts."""
+    """Outputs of a run, checked before anything starts."""
 
     record: Path | None
     view_file: Path | None

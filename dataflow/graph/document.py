@@ -163,7 +163,7 @@ def moved(tree: Tree, place: Place) -> Tree:
 
 
 def describe(tree: Tree) -> str:
-    """What a value is, for messages: `text 'abc'`, `number 3`, `a list`."""
+    """Returns what a value is, for messages: `text 'abc'`, `number 3`, `a list`."""
     match tree:
         case Items():
             return "a list"

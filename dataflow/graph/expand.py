@@ -106,7 +106,7 @@ class Expansion:
 
 @dataclass(frozen=True, slots=True)
 class _Scope:
-    """Where in the nesting a file stands. `prefix` is "" or "front/"; `key` the absolute key prefix."""
+    """Says where in the nesting a file stands. `prefix` is "" or "front/"; `key` the absolute key prefix."""
 
     file: str
     shown: str

@@ -109,7 +109,7 @@ class Resolver:
             waiting = later
 
     def check_graph_inputs(self) -> None:
-        """What an outer graph binds to a nested graph's typed input must carry that type."""
+        """Checks that what an outer graph binds to a nested graph's typed input carries that type."""
         for name, graph_input in self.expansion.graph_inputs:
             if graph_input.type is not None:
                 for pattern in graph_input.patterns:

@@ -73,7 +73,7 @@ COVARIANCE_TYPES = ("unknown", "approximated", "diagonal_known", "known")
 
 @dataclass(frozen=True, slots=True)
 class FoxgloveSchema:
-    """How one message type is written as a Foxglove protobuf."""
+    """Mapping of one message type to a Foxglove protobuf."""
 
     message: type[Message]
     proto: type[Any]
@@ -152,7 +152,7 @@ def _as_doubles(data: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def _bits_survive(data: npt.NDArray[Any], wider: npt.NDArray[Any]) -> bool:
-    """Whether `wider` cast back has the bits of `data`."""
+    """Tells whether `wider` cast back has the bits of `data`."""
     return wider.astype(data.dtype).tobytes() == data.tobytes()
 
 

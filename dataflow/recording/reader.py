@@ -63,7 +63,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class StreamInfo:
-    """What a recording knows of one stream without decoding it.
+    """Facts about one stream, known without decoding it.
 
     - `schema`, `encoding`: of the file, such as foxglove.RawImage and protobuf.
     - `declaration`: of a type that the recording itself declares, since it is not of `dataflow.messages`.
@@ -97,13 +97,14 @@ class StreamInfo:
 
     @property
     def generic(self) -> bool:
-        """Whether its messages are read by the recording's declaration, without the class that made them."""
+        """Tells whether its messages are read by the recording's declaration, without the class that made them."""
         found = self.message_type
         return found is not None and issubclass(found, GenericMessage)
 
     @property
     def declared_otherwise(self) -> bool:
-        """Whether the type's declaration in this program differs from the one that the messages were written with."""
+        """Tells whether the type's declaration in this program differs from the one that the messages were written
+        with."""
         if self.declaration is not None:
             return self.generic and registered_type(self.declaration.schema) is not None
         written = self.metadata.get("declaration", "")
@@ -163,7 +164,8 @@ class Recording:
 
     @property
     def torn(self) -> bool:
-        """Whether the file has no proper end: its writer died. Everything up to the last whole chunk is readable."""
+        """Tells whether the file has no proper end: its writer died. Everything up to the last whole chunk is
+        readable."""
         return self._file.torn
 
     @property
@@ -173,7 +175,7 @@ class Recording:
 
     @property
     def damage(self) -> tuple[str, ...]:
-        """What in the file is damaged, for people: it was read by other means, or is left out as the note says.
+        """Returns what in the file is damaged, for people: it was read by other means, or is left out as the note says.
 
         Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read.
         """
@@ -498,7 +500,7 @@ class Recording:
 
 
 def _key(channel: Channel, stream: str) -> tuple[str, str, str]:
-    """What a channel and its companion have in common."""
+    """Returns what a channel and its companion have in common."""
     return stream, channel.metadata.get("incarnation", "0"), channel.metadata.get("sequence_base", "0")
 
 

@@ -1,4 +1,4 @@
-"""What goes into an aligner and what comes out: entries, firings and drops."""
+"""Inputs and outputs of an aligner: entries, firings and drops."""
 
 from __future__ import annotations
 

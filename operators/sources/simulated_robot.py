@@ -214,7 +214,7 @@ class SimulatedRobot(Source):
         return ticks(name, sensor.rate, self.first_stamp + sensor.phase, self.first_stamp + self.duration)
 
     def _measured(self, sensor: Sensor, measure: Callable[[float, Tick, Rng], Messages], tick: Tick) -> Messages:
-        """What a sensor emits at a tick; truth about an image comes also where the image is missing."""
+        """Returns what a sensor emits at a tick; truth about an image comes also where the image is missing."""
         rng = generator(self.seed, tick.sensor, tick.index)
         elapsed = (tick.stamp - self.first_stamp) * 1e-9
         missing = rng.random() < sensor.dropout or any(a <= elapsed < b for a, b in sensor.outages)
@@ -262,7 +262,7 @@ class SimulatedRobot(Source):
         return messages
 
     def _smear(self, t: float) -> tuple[float, float]:
-        """How far the image moves while the shutter is open, in pixels: by the robot's turning alone."""
+        """Tells how far the image moves while the shutter is open, in pixels: by the robot's turning alone."""
         rate = float(self._stage.world.path.at([t]).yaw_rate[0])
         omega = self._T_base_color[:3, :3].T @ [0, 0, rate]
         focal, seconds = self._color_optics.fx, self.color_camera.shutter * 1e-9

@@ -391,7 +391,7 @@ def _every(training: Sequence[Sample], validation: Sequence[Sample]) -> tuple[Sa
 
 
 def _scored(count: int, total: int, everything: bool) -> str:
-    """Which of the `total` images are scored on."""
+    """Tells which of the `total` images are scored on."""
     return f"all {total} images" if everything else f"{count} validation images of {total}"
 
 

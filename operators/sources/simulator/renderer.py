@@ -34,7 +34,7 @@ _SILHOUETTE_RAYS = 600  # about so many rays judge how much of a thing would be 
 
 
 class _Scene(Protocol):
-    """What is used of Open3D's RaycastingScene; tensors are its own."""
+    """Holds what is used of Open3D's RaycastingScene; tensors are its own."""
 
     def add_triangles(self, vertices: Any, triangles: Any) -> int: ...
 
@@ -83,7 +83,7 @@ def _rays(T_world_camera: Array, optics: Optics) -> F32:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a camera sees, without noise.
+    """View of a camera, without noise.
 
     `depth` (H, W) metres along z, infinite where nothing is hit; `cosine` (H, W) of the angle between ray and surface
     normal; `triangle` (H, W) index of what is hit; `instances` and `classes` (H, W), 0 and `VOID` where nothing is
@@ -100,7 +100,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays (N) end: `distance` in units of the rays' directions (infinite for none), `things` index or -1."""
+    """Ends of rays (N): `distance` in units of the rays' directions (infinite for none), `things` index or -1."""
 
     distance: F32
     normals: F32
@@ -213,7 +213,7 @@ class Renderer:
         self._set_light(self._floor.triangles, self._mesh.triangles[self._floor.triangles], shaded)
 
     def view(self, T_world_camera: Array, optics: Optics, *, color: bool = True) -> View:
-        """What a camera at `T_world_camera` (optical frame) sees now."""
+        """Returns what a camera at `T_world_camera` (optical frame) sees now."""
         rays = _rays(T_world_camera, optics)
         depth, triangle, weights, normals = self._first_hit(self._scene, rays)
         for rows, columns in self._rectangles(T_world_camera, optics):
@@ -246,7 +246,7 @@ class Renderer:
         return Hits(distance, normals, things.astype(np.int32), tint.mean(axis=1).astype(np.float32) / 255)
 
     def blocked(self, rays: F32) -> NDArray[np.bool_]:
-        """Whether something lies on each ray (N, 6) before its direction's full length."""
+        """Tells whether something lies on each ray (N, 6) before its direction's full length."""
         return np.asarray(self.cast(rays).distance < 1.0)
 
     def silhouette(self, things: list[int], T_world_camera: Array, optics: Optics) -> Array:
