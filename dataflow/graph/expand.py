@@ -14,13 +14,14 @@ from typing import Any
 import pydantic
 
 from dataflow.graph import document
-from dataflow.graph.document import Entry, Items, Leaf, Reference, Table, Tree, plain
 from dataflow.graph.fields import Fields
 from dataflow.graph.keys import NAME_RULE, canonical, has_wildcard, key_fault, name_fault
 from dataflow.graph.limits import MAX_DEPTH, MAX_OPERATORS, REFERENCE_COST, SCALAR_COST, Budget
 from dataflow.graph.lookup import NotFound, find_operator
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
+from dataflow.graph.references import Lookup, Reference, substitute
 from dataflow.graph.settings import Setting, put, read_settings
+from dataflow.graph.tree import Entry, Items, Leaf, Table, Tree, at, describe, plain, unknown
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Operator
 
@@ -192,7 +193,7 @@ class Expander:
             return None
         declared, values = self.parameters(table, scope)
         rest = Table({k: e for k, e in table.entries.items() if k != "params"}, table.place)
-        done = document.substitute(rest, self.lookup(scope, declared, values), self.problems, self.budget)
+        done = substitute(rest, self.lookup(scope, declared, values), self.problems, self.budget)
         assert isinstance(done, Table)
         return done
 
@@ -303,7 +304,7 @@ class Expander:
                 self.problems.add(entry.key.place, f"parameter name {fault}", NAME_RULE)
             value = given.get(name, entry.value)
             if name not in given:  # what comes from outside is complete already
-                value = document.substitute(value, self.lookup(scope, seen, values, later), self.problems, self.budget)
+                value = substitute(value, self.lookup(scope, seen, values, later), self.problems, self.budget)
             seen.append(name)
             if not (isinstance(value, Leaf) and value.value is None):
                 values[name] = value
@@ -311,7 +312,7 @@ class Expander:
 
     def lookup(
         self, scope: _Scope, declared: Sequence[str], values: Mapping[str, Tree], later: Sequence[str] = ()
-    ) -> document.Lookup:
+    ) -> Lookup:
         """Answers `${...}` where `declared` names are in force."""
 
         def find(reference: Reference) -> Tree | None:
@@ -449,7 +450,7 @@ class Expander:
         entry = table.entries.get("params")
         tree = self.overridden(full, entry.value if entry else None, place)
         given = self.fields.table(tree, "params") or Table({}, place)
-        known = {key: e for key, e in given.entries.items() if not document.unknown(e.value)}
+        known = {key: e for key, e in given.entries.items() if not unknown(e.value)}
         reported = given.entries.keys() - known.keys()
         try:
             values = cls.spec.parameters(**plain(Table(known, given.place)))
@@ -476,7 +477,7 @@ class Expander:
                 doc = fields[name].description or ""
                 self.problems.add(place, f"{full}: parameter {name!r} must be given", f"{name}: {doc}")
             case _:
-                value = document.at(given, path)
+                value = at(given, path)
                 message = str(fault["msg"]).removeprefix("Value error, ")
                 message = message[:1].lower() + message[1:]
                 hint = f"{path[0]}: {fields[str(path[0])].description}" if path and str(path[0]) in fields else ""
@@ -485,7 +486,7 @@ class Expander:
                 elif fault["type"] in ("literal_error", "enum") and isinstance(value, Leaf):
                     near = nearest(str(value.value), re.findall(r"'([^']*)'", message))
                     hint = f"did you mean {near!r}?" if near else hint
-                said = value.raw if isinstance(value, Leaf) else document.describe(value)
+                said = value.raw if isinstance(value, Leaf) else describe(value)
                 self.problems.add(value.place, f"{full}: parameter {name!r}: {message}, got {said}", hint)
 
     def label(self, tree: Tree | None, what: str) -> Leaf | None:

@@ -6,8 +6,8 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
-from dataflow.graph.document import UNKNOWN, Items, Leaf, Table, Tree, describe
 from dataflow.graph.problems import Problems, did_you_mean
+from dataflow.graph.tree import UNKNOWN, Items, Leaf, Table, Tree, describe
 from dataflow.sync.stamps import parse_duration
 
 Choice = TypeVar("Choice", bound=str)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dataflow.graph.document import Leaf, Table, Tree
 from dataflow.graph.expand import Draft
 from dataflow.graph.fields import Fields
 from dataflow.graph.model import Live, QueuePolicy, Restart, StalePolicy
 from dataflow.graph.problems import did_you_mean
+from dataflow.graph.tree import Leaf, Table, Tree
 from dataflow.operator import InputPort, OperatorSpec
 
 QUEUE_SIZE = 16

@@ -6,7 +6,6 @@ import heapq
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dataflow.graph.document import Leaf, Tree
 from dataflow.graph.expand import Draft, Expansion, GraphInput, Pattern
 from dataflow.graph.fields import Fields
 from dataflow.graph.keys import canonical, has_wildcard, key_fault, matching, may_reach
@@ -21,6 +20,7 @@ from dataflow.graph.model import (
 from dataflow.graph.network import read_network
 from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
+from dataflow.graph.tree import Leaf, Tree
 from dataflow.messages.base import Message, is_built_in
 from dataflow.messages.declaration import Declaration
 from dataflow.operator import InputPort, Source, is_source

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from dataflow.graph import document
-from dataflow.graph.document import UNKNOWN, Entry, Leaf, Table, Tree
 from dataflow.graph.problems import Place, Problems
+from dataflow.graph.tree import UNKNOWN, Entry, Leaf, Table, Tree
 
 
 @dataclass(slots=True)
