@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dataflow.graph.expand import Draft
+from dataflow.graph.drafts import Draft
 from dataflow.graph.fields import Fields
 from dataflow.graph.model import Live, QueuePolicy, Restart, StalePolicy
 from dataflow.graph.problems import did_you_mean

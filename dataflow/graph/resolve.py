@@ -6,7 +6,7 @@ import heapq
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dataflow.graph.expand import Draft, Expansion, GraphInput, Pattern
+from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern
 from dataflow.graph.fields import Fields
 from dataflow.graph.keys import canonical, has_wildcard, key_fault, matching, may_reach
 from dataflow.graph.model import (
