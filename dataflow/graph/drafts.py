@@ -94,3 +94,12 @@ class Scope:
     process: Leaf | None
     machine: Leaf | None
     stack: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Wired:
+    """A draft with the streams of its inputs; `places` says where each came from."""
+
+    draft: Draft
+    inputs: dict[str, tuple[str, ...]]
+    places: dict[tuple[str, str], Place]
