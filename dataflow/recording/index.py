@@ -48,6 +48,7 @@ class McapFile:
         self.lost_bytes = 0
         self.damage: list[str] = []
         self._sealed = False
+        self.path = path
         self._file = RawFile(path)
         try:
             contents = self._load()
