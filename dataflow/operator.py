@@ -213,7 +213,7 @@ class Source(Operator, abstract=True):
         raise TypeError(f"{type(self).__name__} is a source without stream()")
 
     def length(self) -> int | None:
-        """How many times `stream()` will yield, if known: for progress bars."""
+        """Tells how many times `stream()` will yield, if known: for progress bars."""
         return None
 
 
@@ -230,7 +230,7 @@ def validate_parameters(cls: type[Operator], params: Mapping[str, Any]) -> pydan
 
 
 def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
-    """What `process()` returned, as port → message; checked against the declared ports. Raises `OutputError`."""
+    """Returns what `process()` returned as port → message, checked against the declared ports. Raises `OutputError`."""
     if returned is None:
         return {}
     spec = operator.spec

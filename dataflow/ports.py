@@ -216,7 +216,7 @@ class OperatorSpec:
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a firing is besides its messages: given to `process()` when it has a parameter named `context`.
+    """Holds what a firing is besides its messages: given to `process()` when it has a parameter named `context`.
 
     `stale` names the inputs whose message is marked stale, `late` those that hold a message that arrived late (live
     runs only), `tick` says that the timer fired.

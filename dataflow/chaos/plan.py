@@ -15,9 +15,10 @@ from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 
-from dataflow.graph.document import at, parse, plain
+from dataflow.graph.document import parse
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.problems import Place, Problems, did_you_mean
+from dataflow.graph.tree import at, plain
 from dataflow.operator import ParameterError, is_live, validate_parameters
 from dataflow.sync.stamps import parse_duration
 

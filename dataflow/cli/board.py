@@ -132,7 +132,7 @@ def _lags(counts: Mapping[str, Sequence[int]]) -> dict[str, float | None]:
 
 
 def _late_sources(rows: Sequence[Row], told: Mapping[str, ProcessStatus]) -> dict[str, str]:
-    """Who is behind the clock, and who holds it up."""
+    """Names the sources that are behind the clock, and who holds each up."""
     said = {}
     for row in rows:
         if row.behind_clock is None or row.behind_clock <= LATE or row.state == "ended":

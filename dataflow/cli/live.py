@@ -201,7 +201,8 @@ def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> 
 
 @dataclass(slots=True)
 class _Rate:
-    """What was seen of one stream: arrival (s), stamp (ns), number in the stream and bytes of the latest messages."""
+    """Holds what was seen of one stream: arrival (s), stamp (ns), number in the stream and bytes of the latest
+    messages."""
 
     seen: deque[tuple[float, int, int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY))
 

@@ -31,7 +31,7 @@ class Refused(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class ProcessStatus:
-    """What one process says of its operators.
+    """Status that one process gives of its operators.
 
     `counts`: per operator firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns).
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
@@ -63,7 +63,7 @@ class Processes:
         self._bus, self._namespace = bus, namespace
 
     def connected(self, number: int, timeout: float) -> bool:
-        """Whether so many processes are reached by now."""
+        """Tells whether so many processes are reached by now."""
         deadline = time.monotonic() + timeout
         while len(self._bus.peers()) < number:
             if time.monotonic() > deadline:

@@ -1,4 +1,4 @@
-"""How far a recorded stream may be promised, when the clock behind it went back in the recorded run.
+"""Bounds what a recorded stream may promise, when the clock behind it went back in the recorded run.
 
 Where a stream begins a new incarnation with earlier stamps, an aligner drops what lies at or before the stamp that the
 stream had reached, as late. A promise must therefore hold against every later message that is not late, and against

@@ -53,7 +53,7 @@ class Calls:
             raise OperatorFailure(self.node.name, "static_outputs()", error) from error
 
     def process(self, firing: Firing) -> dict[str, Message]:
-        """What `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
+        """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
         AT_WORK.fires = True
         AT_WORK.begun += 1
         try:
@@ -100,7 +100,7 @@ class Calls:
             raise OperatorFailure(self.node.name, "restore()", error) from error
 
     def summary(self, place: Place) -> dict[str, float | int | str]:
-        """What the operator sums up, as plain values. Raises `OperatorFailure`."""
+        """Returns what the operator sums up, as plain values. Raises `OperatorFailure`."""
         with AT_WORK:
             self._seed_change("summary", place)
             return summary_of(self.operator, self.node.name)
@@ -125,7 +125,7 @@ class Calls:
 
 
 def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
-    """What an operator sums up, as plain values. Raises `OperatorFailure`."""
+    """Returns what an operator sums up, as plain values. Raises `OperatorFailure`."""
     try:
         found = dict(operator.summary())
         return {str(key): item if isinstance(item, str) else np.asarray(item).item() for key, item in found.items()}
@@ -173,7 +173,7 @@ def _call(operator: Operator, firing: Firing) -> Outputs:
 
 
 def _value_of(given: InputValue) -> Any:
-    """What `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
+    """Returns what `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
     match given:
         case None:
             return None

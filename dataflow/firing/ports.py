@@ -16,7 +16,7 @@ from dataflow.sync import FOREVER, NEVER, Entry
 
 
 class Emitter(Protocol):
-    """Where a runner's output goes. Calls come in stream order."""
+    """Takes a runner's output. Calls come in stream order."""
 
     def message(self, stream: str, entry: Entry) -> None:
         """A message was emitted; `entry.value` is the message."""

@@ -105,10 +105,11 @@ class Runner:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """What streams said against their own promises and was left aside, by stream; where it is not raised."""
+        """Returns what streams said against their own promises and was left aside, by stream; where it is not
+        raised."""
         return {}
 
     @property
     def restarted(self) -> int:
-        """How often the operator was restarted in this process."""
+        """Tells how often the operator was restarted in this process."""
         return 0

@@ -83,7 +83,7 @@ class OperatorRunner(Runner):
         return self.aligner.late
 
     def take_drops(self) -> tuple[list[Drop], Mapping[tuple[str, str], int]]:
-        """What was dropped since the last record, and the number of what was too much to be listed."""
+        """Returns what was dropped since the last record, and the number of what was too much to be listed."""
         return self.aligner.take_drops(), self.aligner.take_unlisted()
 
     def has_drops(self) -> bool:

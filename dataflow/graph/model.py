@@ -54,7 +54,7 @@ def import_operator(use: str) -> type[Operator]:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """How often a failed operator is started again in a live run, and how long to wait before each attempt (ns)."""
+    """Restart policy of an operator in a live run: the most restarts, and the pause before each attempt (ns)."""
 
     max: int = 0
     backoff: int = 1_000_000_000
@@ -62,7 +62,7 @@ class Restart:
 
 @dataclass(frozen=True, slots=True)
 class Live:
-    """How an operator behaves in a live run; replay and verify ignore all of it.
+    """Policies of an operator in a live run; replay and verify ignore all of it.
 
     - `queue`, `size`: at most `size` undecided messages on each stream of a trigger; beyond that the oldest is dropped
       (`newest` is kept), the arriving one is dropped (`oldest` is kept), or the producer waits (`block`).
@@ -118,7 +118,7 @@ class Node:
 
     @property
     def spec(self) -> OperatorSpec:
-        """What the class declares. Mind `tolerance` and `every`, which the graph may change: the node's count."""
+        """The declaration of the class. Mind `tolerance` and `every`, which the graph may change: the node's count."""
         return self.operator.spec
 
     @property
@@ -154,7 +154,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Which streams a recording holds. `thin`: not all of them; firing records are always written.
+    """Choice of the streams that a recording holds. `thin`: not all of them; firing records are always written.
 
     `snapshots`: nanoseconds of event time between two snapshots of an operator's state; None for none.
     """
@@ -166,7 +166,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the viewer leaves out: stream names."""
+    """Streams that the viewer leaves out, by name."""
 
     hide: tuple[str, ...] = ()
 

@@ -82,7 +82,7 @@ def type_path(message: type[Message]) -> str:
 
 
 def is_built_in(message: type[Message]) -> bool:
-    """Whether the class is one of `dataflow.messages`, which every process knows."""
+    """Tells whether the class is one of `dataflow.messages`, which every process knows."""
     return message is Message or message.__module__.startswith("dataflow.messages.")
 
 

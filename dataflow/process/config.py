@@ -1,4 +1,4 @@
-"""What the supervisor tells an operator process to be, in plain values."""
+"""Configuration of an operator process, as plain values."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """Where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp of
-    each port, the parameters that were changed, and how often it has been restarted."""
+    """Says where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp
+    of each port, the parameters that were changed, and how often it has been restarted."""
 
     incarnation: int = 0
     last: Mapping[str, int] = field(default_factory=dict)
@@ -20,7 +20,7 @@ class Resumed:
 
 @dataclass(frozen=True, slots=True)
 class ProcessConfig:
-    """What the supervisor tells an operator process to be. Travels as plain values.
+    """Configuration of an operator process, from its supervisor. Travels as plain values.
 
     `publish` maps the local streams that other processes take (firing records included) to how many take them;
     `subscribe` are the remote ones taken here. `secret` is the run's: only messages that were sealed with it count.
@@ -50,5 +50,5 @@ class ProcessConfig:
     warm: dict[str, Any] | None = None
 
     def resumed(self, operator: str) -> Resumed:
-        """Where an operator had got to in the process before this one."""
+        """Tells where an operator had got to in the process before this one."""
         return Resumed(**(self.resume or {}).get(operator, {}))

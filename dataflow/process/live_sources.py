@@ -156,7 +156,7 @@ class LiveSources:
             self._read(runner, behind=self._resumed)
 
     def restarts_of(self, name: str) -> int:
-        """How often a source of this process was restarted here."""
+        """Tells how often a source of this process was restarted here."""
         return self._restarts[name].total if name in self._restarts else 0
 
     def begin_fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> bool:

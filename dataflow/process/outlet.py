@@ -1,4 +1,4 @@
-"""Where the operators of a process put what they make: messages, frontiers and firing records."""
+"""The outlet takes what the operators of a process make: messages, frontiers and firing records."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ class Consumer(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Links:
-    """What an outlet publishes through: the bus, its taps, a publisher for each stream that other processes take, and
-    how many of them do."""
+    """Holds what an outlet publishes through: the bus, its taps, a publisher for each stream that other processes take,
+    and how many of them do."""
 
     bus: Bus
     taps: TapServer

@@ -125,7 +125,7 @@ class Progress:
         return {r.node.name: list(r.waiting()) for r in self._runners.operators if not r.ended}
 
     def final_report(self, transport: Mapping[str, int]) -> dict[str, Any]:
-        """What came of everything; `transport`: what the process has moved."""
+        """Returns what came of everything; `transport`: what the process has moved."""
         streams: dict[str, list[Any]] = {}
         for maker in self._runners.all:
             for state in maker.ports.states.values():

@@ -75,7 +75,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(status))
 
     def _restarts_of(self, maker: Maker) -> int:
-        """How often an operator was restarted, by this process and in the processes before it."""
+        """Tells how often an operator was restarted, by this process and in the processes before it."""
         here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
         return self._config.resumed(maker.node.name).restarts + here
 

@@ -36,7 +36,8 @@ DRAIN_WITHIN = 5.0
 
 @dataclass(frozen=True, slots=True)
 class SinkConfig:
-    """What the supervisor tells a sink process to be: `kind` is "record" or "view", `options` belong to the kind."""
+    """Configuration of a sink process, from its supervisor: `kind` is "record" or "view", `options` belong to the
+    kind."""
 
     label: str
     kind: str
@@ -62,7 +63,7 @@ class StreamSink(Protocol):
         """Something happened to the run: an operator was restarted, a fault was planned."""
 
     def diagnostics(self, message: Diagnostics) -> None:
-        """How every operator fares."""
+        """Tells how every operator fares."""
 
     def flush(self) -> None: ...
 

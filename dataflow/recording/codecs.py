@@ -1,4 +1,4 @@
-"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON."""
+"""Codecs between message types and MCAP messages: Foxglove protobuf with a companion, or JSON."""
 
 from __future__ import annotations
 
@@ -172,7 +172,8 @@ def codec_for(message: type[Message]) -> Codec:
 
 
 def declaration_metadata(message: type[Message]) -> dict[str, str]:
-    """What a stream's channel says of its type: a digest of the declaration, and the whole of it for an own type."""
+    """Returns what a stream's channel says of its type: a digest of the declaration, and the whole of it for an own
+    type."""
     declared = {"declaration": declaration_digest(message)}
     if not is_built_in(message):
         declared[FIELDS] = json.dumps(Declaration.of(message).to_json(), ensure_ascii=False)

@@ -188,7 +188,7 @@ def _encode_array(spec: ArrayField, data: npt.NDArray[Any], plain: dict[str, Any
 
 
 def _listable(data: npt.NDArray[Any]) -> bool:
-    """Whether JSON numbers hold every element."""
+    """Tells whether JSON numbers hold every element."""
     if data.dtype.kind == "f":
         return bool(np.isfinite(data).all())
     if data.dtype.itemsize == 8 and data.size:

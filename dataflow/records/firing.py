@@ -33,7 +33,7 @@ class FiringRecordError(ValueError):
 
 @dataclass(slots=True)
 class Emission:
-    """What came out of one port: its place in the stream (or `WITHHELD`), its stamp and its digest (16 bytes)."""
+    """Output of one port: its place in the stream (or `WITHHELD`), its stamp and its digest (16 bytes)."""
 
     seq: int
     stamp: int
@@ -71,7 +71,7 @@ class FiringRecord:
     duration: int = 0
 
     def firing(self) -> FiringInputs:
-        """What an aligner that is driven by records needs. Only for the kinds fire, tick and finish."""
+        """Returns what an aligner that is driven by records needs. Only for the kinds fire, tick and finish."""
         kind = self.kind
         if kind not in ("fire", "tick", "finish"):
             raise FiringRecordError(f"{self.operator}: record {self.index} is a {kind!r}, which no message made")

@@ -53,7 +53,7 @@ class Unwatched:
 
 @dataclass(frozen=True, slots=True)
 class Feeding:
-    """What is re-executed and what is read: operators in graph order, and the recorded streams that feed them."""
+    """Holds what is re-executed and what is read: operators in graph order, and the recorded streams that feed them."""
 
     operators: tuple[str, ...]
     streams: tuple[str, ...]

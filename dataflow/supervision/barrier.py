@@ -55,7 +55,7 @@ class Barrier:
         return False
 
     def _missing(self, process: Supervised) -> bool:
-        """Whether a process is not ready, or does not see all of its edges."""
+        """Tells whether a process is not ready, or does not see all of its edges."""
         return process.life is not Life.PROBING or bool(process.unseen)
 
     def _probe(self, process: Supervised) -> None:

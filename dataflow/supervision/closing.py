@@ -50,7 +50,7 @@ class Closing:
 
     @property
     def over(self) -> bool:
-        """Whether nobody is left; one that does not even die of a SIGKILL is not waited for."""
+        """Tells whether nobody is left; one that does not even die of a SIGKILL is not waited for."""
         left = [p for p in self.run.processes.values() if p.reachable]
         return all(p.life is Life.KILLED and self.run.steady - p.since > LEAVE_TIMEOUT for p in left)
 

@@ -1,4 +1,4 @@
-"""What watches over which kind of run: here alone live runs and others part."""
+"""Composes the parts that watch over a run: here alone live runs and others part."""
 
 from __future__ import annotations
 

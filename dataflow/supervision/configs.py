@@ -1,4 +1,4 @@
-"""What each process of a run is told to be: its kind and its configuration, as plain values."""
+"""Configurations of the processes of a run, as plain values."""
 
 from __future__ import annotations
 

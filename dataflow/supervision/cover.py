@@ -62,7 +62,7 @@ class LosslessCover(Cover):
 
 
 class LiveCover(Cover):
-    """How far those are behind for whom sources wait (the window), and how far anybody is (the backlog).
+    """Says how far those are behind for whom sources wait (the window), and how far anybody is (the backlog).
 
     An operator does not count while its process is away or gives no sign of life. A new process owes nothing of what
     was given before it. One that is heard again begins its backlog anew, too, where its queue bounds what it has to

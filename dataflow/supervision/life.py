@@ -36,7 +36,7 @@ class Life(Enum):
 
 
 class Step(Enum):
-    """What changes a state. The process takes the first ones, the supervisor the others."""
+    """Steps that change a state. The process takes the first ones, the supervisor the others."""
 
     JOIN = "join"
     GET_READY = "get ready"

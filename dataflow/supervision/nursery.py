@@ -83,7 +83,7 @@ class Child:
 
     @property
     def dead(self) -> bool:
-        """Whether it has ended, for when nobody is left to tell."""
+        """Tells whether it has ended, for when nobody is left to tell."""
         return self._pidfd is not None and bool(select.select([self._pidfd], [], [], 0)[0])
 
     def close(self) -> list[str]:

@@ -1,4 +1,4 @@
-"""What is to be run, and where: the pure part of the supervisor."""
+"""Plans what is to be run, and where: the pure part of the supervisor."""
 
 from __future__ import annotations
 

@@ -39,7 +39,7 @@ class OperatorCounts:
 
 @dataclass(slots=True)
 class Status:
-    """What a progress display needs; updated in place while the graph runs."""
+    """Holds what a progress display needs; updated in place while the graph runs."""
 
     phase: str = "starting"
     waiting: tuple[str, ...] = ()
@@ -108,5 +108,5 @@ class RunFailed(RuntimeError):
 
     @property
     def internal(self) -> bool:
-        """Whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
+        """Tells whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
         return self.operator is None and self.details.startswith("Traceback")

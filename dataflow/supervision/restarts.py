@@ -27,7 +27,7 @@ class RestartPolicy(Part):
     """No process is started again: the first death ends the run."""
 
     def may_restart(self, process: Supervised) -> bool:
-        """Whether the policy of a process allows any restart at all."""
+        """Tells whether the policy of a process allows any restart at all."""
         return False
 
     def grant(self, process: Supervised) -> bool:

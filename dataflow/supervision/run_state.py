@@ -1,4 +1,5 @@
-"""What all parts of the supervisor's core share: the processes, the status, the time, and the commands to be given."""
+"""State that all parts of the supervisor's core share: the processes, the status, the time, and the commands to be
+given."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ from dataflow.supervision.supervised import Supervised
 
 
 class Phase(Enum):
-    """How far a run is; it only goes forward."""
+    """Phases of a run, which only goes forward."""
 
     STARTING = "starting"
     RUNNING = "running"
@@ -28,7 +29,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """When sources were released, and the stamp that then was now (None: unknown)."""
+    """Release of the sources: its moment, and the stamp that then was now (None: unknown)."""
 
     first: int | None
     at: Moment
@@ -68,7 +69,7 @@ class RunState:
 
     @property
     def under_way(self) -> bool:
-        """Whether sources are released and nothing is being closed yet."""
+        """Tells whether sources are released and nothing is being closed yet."""
         return self._phase in (Phase.RUNNING, Phase.STOPPING)
 
     @property

@@ -1,4 +1,5 @@
-"""When operators fire: stamps, frontiers and the aligner. Pure: no clock, no thread, no I/O."""
+"""Event time: stamps, frontiers, and the aligner that decides when operators fire. Pure: no clock, no thread, no
+I/O."""
 
 from dataflow.sync.aligner import Aligner, StreamEnd
 from dataflow.sync.demand import Cycle, Edge, stuck_cycle

@@ -44,7 +44,7 @@ _NO_NAMES: frozenset[str] = frozenset()
 
 
 class StreamEnd(NamedTuple):
-    """How a stream ended: its final stamp (None if it carried and promised nothing) and why."""
+    """End of a stream: its final stamp (None if it carried and promised nothing) and why."""
 
     final_stamp: int | None
     reason: str
@@ -317,21 +317,21 @@ class Aligner:
         return self._undecided()
 
     def ended(self) -> bool:
-        """Whether `poll` has returned the `finish` firing, and will return no other."""
+        """Tells whether `poll` has returned the `finish` firing, and will return no other."""
         return self._finished
 
     def final_stamp(self) -> int | None:
-        """What the operator's own streams end with, unless they emitted later: known once `ended`."""
+        """Returns what the operator's own streams end with, unless they emitted later: known once `ended`."""
         return self._finish_stamp() - 1 if self._finished else None
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
-        """How many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
+        """Tells how many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
         return self._drop_log.counts
 
     @property
     def late(self) -> Mapping[str, int]:
-        """How many messages came after what needed them was decided, by input. Triggers among them are dropped as
+        """Tells how many messages came after what needed them was decided, by input. Triggers among them are dropped as
         `late`; Sampled and Batch messages still serve the firings to come."""
         return self._drop_log.late
 
@@ -344,7 +344,7 @@ class Aligner:
         return self._drop_log.take()
 
     def take_unlisted(self) -> Mapping[tuple[str, str], int]:
-        """How many drops were too many to be kept since this was last asked, by (input, reason)."""
+        """Tells how many drops were too many to be kept since this was last asked, by (input, reason)."""
         return self._drop_log.take_unlisted()
 
     def buffered(self) -> dict[str, int]:
@@ -429,7 +429,7 @@ class Aligner:
             self._drop_log.tick(stamp, reason, because)
 
     def _exhausted(self) -> bool:
-        """Whether nothing is left but the finish."""
+        """Tells whether nothing is left but the finish."""
         over = self._stamp is None and self._triggers.bound == FOREVER
         return over and (self._ticks is None or self._ticks.stamp == FOREVER)
 

@@ -1,4 +1,4 @@
-"""What the aligner dropped: counted, and the last ones one by one."""
+"""Messages that the aligner dropped: counted, and the last ones one by one."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class DropLog:
         return events
 
     def take_unlisted(self) -> dict[tuple[str, str], int]:
-        """How many drops since this was last asked were too many to be kept, by (input, reason)."""
+        """Tells how many drops since this was last asked were too many to be kept, by (input, reason)."""
         unlisted = dict(self._unlisted)
         self._unlisted.clear()
         return unlisted

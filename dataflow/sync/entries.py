@@ -1,4 +1,4 @@
-"""What goes into an aligner and what comes out: entries, firings and drops.
+"""Inputs and outputs of an aligner: entries, firings and drops.
 
 Nobody changes them. Those that are made for every message are not frozen all the same: it would make them cost three
 times as much.

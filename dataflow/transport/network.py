@@ -1,4 +1,5 @@
-"""Where a bus listens and connects, and how that becomes a Zenoh configuration. This machine only unless told so."""
+"""Addresses on which a bus listens and connects, and the Zenoh configuration made of them. This machine only unless
+told so."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ class NetworkError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class NetworkConfig:
-    """How one process takes part in the network.
+    """Configuration of one process's part in the network.
 
     `listen` and `connect` are Zenoh endpoints such as `"unixsock-stream//run/user/1000/a"` or `"tcp/127.0.0.1:7447"`.
     Peers that are not up yet are tried again in the background until the bus is closed. An endpoint beyond this machine

@@ -86,7 +86,7 @@ def open_memory(pid: int, descriptor: int, name: str) -> mmap.mmap:
 
 
 class Board:
-    """What one subscription has released. Written here only, read by the publisher."""
+    """Holds what one subscription has released. Written here only, read by the publisher."""
 
     def __init__(self) -> None:
         """Makes the memory; raises `SharedMemoryError`."""
@@ -149,7 +149,7 @@ class PoolReader:
 
 
 def is_reference(payload: bytes) -> bool:
-    """Whether the payload is an envelope that stands for one in shared memory."""
+    """Tells whether the payload is an envelope that stands for one in shared memory."""
     return len(payload) >= PRELUDE.size and payload[:4] == MAGIC and payload[5] == Kind.REFERENCE
 
 

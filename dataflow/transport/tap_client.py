@@ -45,7 +45,7 @@ class TapMessage:
 
 @dataclass(slots=True)
 class _Origin:
-    """What a tap knows of one process: its counts as received, as taken, and as acknowledged."""
+    """State of one process, as a tap knows it: its counts as received, as taken, and as acknowledged."""
 
     epoch: int = 0
     received: tuple[int, int] = (0, 0)
@@ -193,7 +193,7 @@ class TapClient:
             self._arrived.notify()
 
     def _fits(self, origin: _Origin, messages: int, nbytes: int) -> bool:
-        """Whether a process keeps to the window: a single message may exceed it in bytes."""
+        """Tells whether a process keeps to the window: a single message may exceed it in bytes."""
         if messages - origin.acked[0] > self.window.messages:
             return False
         return nbytes - origin.acked[1] <= self.window.bytes or messages - origin.acked[0] == 1

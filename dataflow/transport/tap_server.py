@@ -49,7 +49,7 @@ class _Copy:
 
 @dataclass(slots=True)
 class _Tap:
-    """What a process knows of one tap. Counts are cumulative."""
+    """State of one tap, as a process knows it. Counts are cumulative."""
 
     id: str
     expressions: tuple[zenoh.KeyExpr, ...]

@@ -26,7 +26,7 @@ ACKNOWLEDGEMENT: Final = struct.Struct("<IQQ")  # epoch, messages, bytes
 
 @dataclass(frozen=True, slots=True)
 class TapWindow:
-    """How much may be under way from one process to a tap, unacknowledged. It bounds the tap's memory."""
+    """Says how much may be under way from one process to a tap, unacknowledged. It bounds the tap's memory."""
 
     messages: int = 64
     bytes: int = 16 << 20

@@ -301,7 +301,7 @@ def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Ite
 
 
 def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | None:
-    """What an operator made here, where that is not what was recorded."""
+    """Returns what an operator made here, where that is not what was recorded."""
     first = verification.first
     if first is None or report.verdict(verification) == "within tolerance":
         return None
@@ -314,7 +314,7 @@ def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | No
 
 
 def _led_astray(operator: str, unexpected: Collection[str], producers: Mapping[str, frozenset[str]]) -> bool:
-    """Whether an operator depends on an unexpected one that does not in turn depend on it."""
+    """Tells whether an operator depends on an unexpected one that does not in turn depend on it."""
     return any(
         other != operator and operator not in _upstream(other, producers)
         for other in _upstream(operator, producers) & set(unexpected)

@@ -33,7 +33,7 @@ from dataflow.verification.stored import StoredStream
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What is to be verified, and what the recording says of it: all that was read before any worker starts."""
+    """Holds what is to be verified, and what the recording says of it: all that was read before any worker starts."""
 
     path: Path
     graph: Graph
@@ -146,7 +146,7 @@ def _prepare(
 
 
 def _accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -> bool:
-    """Whether the records of a node can be held against its streams.
+    """Tells whether the records of a node can be held against its streams.
 
     Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
     jumped: its records count one incarnation, its messages several.

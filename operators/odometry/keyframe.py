@@ -37,7 +37,7 @@ class Keyframe:
 
 
 def view_distance(T_a: Matrix, T_b: Matrix, depth: float) -> float:
-    """How differently two cameras see a scene at a depth: baseline / depth + angle between them, radians."""
+    """Tells how differently two cameras see a scene at a depth: baseline / depth + angle between them, radians."""
     T = invert(T_a) @ T_b
     cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
     return float(np.linalg.norm(T[:3, 3]) / depth + np.arccos(cosine))

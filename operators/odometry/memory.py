@@ -1,4 +1,4 @@
-"""What an odometry remembers, as plain values that an operator's snapshot may hold."""
+"""Memory of an odometry, as plain values that an operator's snapshot may hold."""
 
 from __future__ import annotations
 

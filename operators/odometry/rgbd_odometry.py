@@ -34,7 +34,7 @@ TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
 
 
 class Status(StrEnum):
-    """What a frame's pose rests on."""
+    """Holds what a frame's pose rests on."""
 
     STARTED = "started"  # the first frame: its pose is the identity
     TRACKED = "tracked"  # features, refined by depth where there is any
@@ -146,7 +146,7 @@ class _Fit:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What an odometry remembers between frames."""
+    """Holds what an odometry remembers between frames."""
 
     motion: Motion | None
     covariance: Matrix
@@ -363,7 +363,7 @@ class RgbdOdometry:
         return float(1.0 / np.median(known)) if known.size else 2.0
 
     def _plausible(self, stamp: int, T_world_camera: Matrix, T_predicted: Matrix) -> bool:
-        """Whether the camera can have come that far since it was last measured."""
+        """Tells whether the camera can have come that far since it was last measured."""
         assert self._motion is not None
         reach = 0.3 + TOP_SPEED * (self._motion.blind_s + (stamp - self._motion.stamp) * 1e-9)
         return bool(np.linalg.norm(T_world_camera[:3, 3] - T_predicted[:3, 3]) < reach)

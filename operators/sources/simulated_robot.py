@@ -219,7 +219,7 @@ class SimulatedRobot(Source):
         return sum(1 for _ in merged(self._schedule()))
 
     def _measures(self) -> dict[str, tuple[str, Callable[..., Messages]]]:
-        """What measures, and the parameter that has its settings."""
+        """Returns what measures, and the parameter that has its settings."""
         rig = self._rig
         return {
             "color": ("color_camera", rig.color),
@@ -257,7 +257,7 @@ class SimulatedRobot(Source):
         return streams
 
     def _measured(self, parameter: str, measure: Callable[..., Messages], tick: Tick) -> Messages:
-        """What a sensor emits at a tick; truth about an image comes also where the image is missing."""
+        """Returns what a sensor emits at a tick; truth about an image comes also where the image is missing."""
         rng = generator(self.seed, tick.sensor, tick.index)
         elapsed = (tick.stamp - self.first_stamp) * 1e-9
         given: Sensor = getattr(self, parameter)

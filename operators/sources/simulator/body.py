@@ -23,7 +23,7 @@ _SHOULDER, _HIP = 0.118, 0.055  # half widths
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """Where the body is: pelvis (3,) and heading, lean forward (rad), soles (2, 3), hands (2, 3); left first."""
+    """Posture of a body: pelvis (3,) and heading, lean forward (rad), soles (2, 3), hands (2, 3); left first."""
 
     pelvis: Array
     yaw: float
@@ -57,7 +57,7 @@ class Body:
         return np.asarray(posture.pelvis + self.height * (_TORSO + _NECK) * spine + 0.05 * up + 0.13 * forward)
 
     def grip(self, posture: Posture, side: int) -> Array:
-        """Where the hand really is: its target, or as near to it as the arm reaches."""
+        """Tells where the hand really is: its target, or as near to it as the arm reaches."""
         _, _, end = self._arm(posture, side)
         return end
 

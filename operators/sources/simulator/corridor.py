@@ -117,7 +117,7 @@ def _doors(
 
 
 def _between(spans: list[tuple[float, float]], half: float) -> list[tuple[float, float]]:
-    """What is left of (-half, half) without the spans, which rise."""
+    """Returns what is left of (-half, half) without the spans, which rise."""
     edges = [-half, *(edge for span in spans for edge in span), half]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 0.5]
 

@@ -58,7 +58,7 @@ class Timeline:
 
 @dataclass(frozen=True, eq=False)
 class Seat:
-    """Where a person sits: the place (3,) of the pelvis."""
+    """Seat of a person: the place (3,) of the pelvis."""
 
     pelvis: Array
 
@@ -95,16 +95,16 @@ class Person:
         return self._parts[1]
 
     def held(self, t: float) -> bool:
-        """Whether the hand has the object."""
+        """Tells whether the hand has the object."""
         return self.timeline.at(t)[0].activity == "drinking"
 
     def seated(self, t: float) -> bool:
-        """Whether the seat carries the person."""
+        """Tells whether the seat carries the person."""
         act, _, _ = self.timeline.at(t)
         return act.sit == (1.0, 1.0)
 
     def grip(self, t: float) -> Array:
-        """Where the reaching hand is."""
+        """Tells where the reaching hand is."""
         return self.body.grip(self.posture(t), self._hand)
 
     def posture(self, t: float) -> Posture:
@@ -172,7 +172,7 @@ class Person:
     def _hands(
         self, pelvis: Array, forward: Array, left: Array, sit: float, swing: Array, yaw: float, lean: float
     ) -> Array:
-        """Where hands are when they do nothing: hanging, or on the thighs."""
+        """Tells where hands are when they do nothing: hanging, or on the thighs."""
         hands = np.zeros((2, 3))
         bare = Posture(pelvis, yaw, lean, np.zeros((2, 3)), np.zeros((2, 3)))
         for side in (0, 1):
@@ -278,7 +278,7 @@ def pacing(path: Array, *, walk: float = 0.7, wait: float = 2.5, phase: float = 
 
 
 def person_doing(thing: int, person: Person, t: float) -> Doing:
-    """What a person's script says."""
+    """Returns what a person's script says."""
     act, _, began = person.timeline.at(t)
     return Doing(thing, act.activity, began, act.goal, act.object)
 

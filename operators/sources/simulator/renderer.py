@@ -35,7 +35,7 @@ _SHRINK = np.array([0.5**k for k in range(LEVELS)], np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays (N) end: `distance` in units of the rays' directions (infinite for none), `things` index or -1."""
+    """Ends of rays (N): `distance` in units of the rays' directions (infinite for none), `things` index or -1."""
 
     distance: F32
     normals: F32
@@ -127,7 +127,7 @@ class Renderer:
         self._set_light(self._floor.triangles, self._mesh.triangles[self._floor.triangles], shaded)
 
     def view(self, T_world_camera: Array, optics: Optics, *, color: bool = True) -> View:
-        """What a camera at `T_world_camera` (optical frame) sees now."""
+        """Returns what a camera at `T_world_camera` (optical frame) sees now."""
         rays = camera_rays(T_world_camera, optics)
         depth, triangle, weights, normals = self._first_hit(self._scene, rays)
         for rows, columns in self._rectangles(T_world_camera, optics):
@@ -160,7 +160,7 @@ class Renderer:
         return Hits(distance, normals, things.astype(np.int32), tint.mean(axis=1).astype(np.float32) / 255)
 
     def blocked(self, rays: F32) -> NDArray[np.bool_]:
-        """Whether something lies on each ray (N, 6) before its direction's full length."""
+        """Tells whether something lies on each ray (N, 6) before its direction's full length."""
         return np.asarray(self.cast(rays).distance < 1.0)
 
     def silhouette(self, things: list[int], T_world_camera: Array, optics: Optics) -> Array:

@@ -1,4 +1,4 @@
-"""What a world is made of: things with shape and pose, lights, landmarks, the robot's path, and who rests on what."""
+"""Parts of a world: things with shape and pose, lights, landmarks, the robot's path, and who rests on what."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from operators.sources.simulator.trajectory import Trajectory
 
 
 class Mover(Protocol):
-    """How a thing moves; times in seconds since the start."""
+    """Motion of a thing; times in seconds since the start."""
 
     def frame(self, t: float) -> Array:
         """`T_world_thing` (4, 4): upright, on what the thing stands on."""
@@ -101,7 +101,7 @@ class Relation:
 
 @dataclass(frozen=True)
 class Doing:
-    """What a mover does: an activity, on which object (-1 for none), since when (s), and the goal it was given."""
+    """Occupation of a mover: an activity, on which object (-1 for none), since when (s), and the goal it was given."""
 
     thing: int
     activity: str
@@ -165,7 +165,7 @@ class World:
         return [p.relation for p in self.placements if p.holds is None or p.holds(t)]
 
     def doings(self, t: float) -> list[Doing]:
-        """What every mover does at a time."""
+        """Returns what every mover does at a time."""
         return [script(t) for script in self.scripts]
 
     def thing(self, id: int) -> Thing:

@@ -1,4 +1,5 @@
-"""When sensors measure: each on its own grid of whole nanoseconds, merged into one sequence of stamps."""
+"""Schedule of the sensors' measurements: each on its own grid of whole nanoseconds, merged into one sequence of
+stamps."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ Mount = tuple[float, float, float, float, float, float]
 
 
 class Sensor(BaseModel):
-    """What all sensors have. A sensor with rate 0 is off and costs nothing."""
+    """Settings that all sensors have. A sensor with rate 0 is off and costs nothing."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -272,7 +272,7 @@ class Motion(BaseModel):
 
 
 class Truth(BaseModel):
-    """What is known about the world itself. A rate of 0 switches a stream off."""
+    """Settings of the world itself. A rate of 0 switches a stream off."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

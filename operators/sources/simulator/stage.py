@@ -48,7 +48,7 @@ class Stage:
         return self.renderer
 
     def view(self, t: float, T_base_camera: Array, optics: Optics, *, color: bool) -> View:
-        """What a camera on the robot sees at a time."""
+        """Returns what a camera on the robot sees at a time."""
         key = (t, T_base_camera.tobytes(), optics)
         if self._last is not None and self._last[0] == key and (self._last[1].color is not None or not color):
             return self._last[1]

@@ -1,4 +1,4 @@
-"""What is true of the world, as messages: boxes in the image and in space, masks, poses, activities and relations."""
+"""Ground truth of the world, as messages: boxes in the image and in space, masks, poses, activities and relations."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def base_state(drive: Drive, t: float, stamp: int, world_frame: str, base_frame:
 
 
 def activities(world: World, t: float, first_stamp: int, stamp: int) -> Activity:
-    """What every mover does, on what, since when, and the goal it was given."""
+    """Returns what every mover does, on what, since when, and the goal it was given."""
     doings = world.doings(t)
     return Activity(
         stamp=stamp,

@@ -87,7 +87,8 @@ class WheelModel:
 
 
 def _rolled(path: Trajectory, track: float, start: float, end: float) -> Array:
-    """What the left and the right wheel roll between two times, metres: Gauss-Legendre quadrature of their speeds."""
+    """Returns what the left and the right wheel roll between two times, metres: Gauss-Legendre quadrature of their
+    speeds."""
     if end <= start:
         return np.zeros(2)
     speeds = _rim_speeds(path, track, start + (end - start) * (_NODES + 1) / 2)
