@@ -64,7 +64,9 @@ def _facts(stream: RecordedStream) -> tuple[str, str, str]:
 
 
 def graph_html(graph: Graph) -> str:
-    """A graph: a row for each operator, with what it takes and gives."""
+    """A graph: a drawing, and a row for each operator with what it takes and gives."""
+    from dataflow.api.svg import graph_svg
+
     rows = []
     for node in graph.nodes.values():
         taken = [
@@ -76,7 +78,7 @@ def graph_html(graph: Graph) -> str:
         rows.append((node.name, node.use, "\n".join(taken), "\n".join(made)))
     title = f"<b>{escape(graph.name)}</b>, namespace {escape(graph.namespace)}"
     shown = table(("operator", "class", "inputs", "outputs"), rows).replace("\n", "<br/>")
-    return f"<div>{title}{shown}</div>"
+    return f"<div>{title}<div>{graph_svg(graph)}</div>{shown}</div>"
 
 
 def run_html(report: RunReport) -> str:

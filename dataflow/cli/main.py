@@ -110,6 +110,8 @@ parameters = typer.Typer(no_args_is_help=True, help="Read and change the paramet
 _add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
 _add(param.get, None, to=parameters)
 _add(param.list_, None, "list", parameters)
+_add(param.dump, None, to=parameters)
+_add(param.load, None, to=parameters)
 app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 

@@ -222,6 +222,9 @@ class Recording:
         """Closes the file. Idempotent."""
         self._file.close()
 
+    def __repr__(self) -> str:
+        return f"<recording {self.path}: {len(self.streams)} streams>"
+
     def __enter__(self) -> Self:
         return self
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from watched import Broken, Camera, Judge, Photometer
+from watched import Broken, Camera, Counting, Interrupting, Judge, Photometer
 
 import dataflow
 from dataflow.graph import GraphError, load_graph
@@ -146,6 +147,31 @@ def test_a_failing_operator_is_named_and_the_recording_keeps_what_came_before(tm
     with dataflow.open(path) as recording:
         assert len(recording["image"]) == 3
         assert recording.metadata["dataflow:outcome"]["outcome"].startswith("failed: operator 'broken'")
+
+
+def test_ctrl_c_ends_a_run_in_order_and_its_recording_verifies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "run.mcap"
+    before = signal.getsignal(signal.SIGINT)
+    graph = dataflow.Graph("stopped", namespace="shop").add("camera", Camera).add("counter", Interrupting)
+    run = graph.connect("counter", image="camera/image").run(record=path)
+
+    assert run.report.interrupted
+    assert signal.getsignal(signal.SIGINT) is before
+    with dataflow.open(path) as recording:
+        assert recording["count"]["value"].tolist() == [1.0, 2.0, 3.0]
+        assert recording.metadata["dataflow:outcome"]["outcome"] == "interrupted"
+    monkeypatch.setattr(Interrupting, "process", Counting.process)
+    assert dataflow.replay(path).report.streams["shop/counter/count"][0] == 3
+
+
+def test_a_replay_from_the_middle_goes_on_with_the_state_of_then(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    graph = dataflow.Graph("count", namespace="shop").add("camera", Camera).add("counter", Counting)
+    graph.connect("counter", image="camera/image").run(record=path)
+
+    dataflow.replay(path, start=0.3, record=tmp_path / "rest.mcap")
+    with dataflow.open(tmp_path / "rest.mcap") as recording:
+        assert recording["count"]["value"].tolist() == [4.0, 5.0, 6.0]
 
 
 def test_progress_is_told_while_it_runs(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -101,6 +101,23 @@ def test_a_file_that_is_none_is_named(tmp_path: Path) -> None:
         dataflow.open(tmp_path / "text.mcap")
 
 
+def test_a_recording_whose_writer_was_killed_opens_up_to_its_last_chunk(path: Path) -> None:
+    whole = path.read_bytes()
+    path.write_bytes(whole[: whole.rindex(b"\x89MCAP0\r\n") - 200])
+
+    with dataflow.open(path) as recording:
+        assert len(recording["imu"]) == 11
+        assert recording["imu"][10] == imu(10)
+
+
+def test_a_closed_recording_says_so(path: Path) -> None:
+    with dataflow.open(path) as recording:
+        stream = recording["imu"]
+        assert stream[0] == imu(0)
+    with pytest.raises(RecordingError, match="closed"):
+        stream[1]
+
+
 def test_streams_of_unknown_types_are_listed_and_say_why_they_cannot_be_read(tmp_path: Path) -> None:
     file = tmp_path / "foreign.mcap"
     with file.open("wb") as out:

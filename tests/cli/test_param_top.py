@@ -129,6 +129,42 @@ def test_a_parameter_that_there_is_not_is_answered_with_the_nearest(dataflow) ->
     assert "did you mean 'factor'?" in dataflow("param", "get", "tuned.factr", code=2).stderr
 
 
+@pytest.mark.usefixtures("running")
+def test_values_are_dumped_as_yaml_and_loaded_again_as_far_as_they_differ(dataflow, tmp_path: Path) -> None:
+    file = tmp_path / "tuned.yaml"
+    before = dataflow("param", "get", "tuned.factor").stdout.strip()
+    assert dataflow("param", "dump").stdout == f'"tuned":\n  factor: {before}\n'
+    dataflow("param", "dump", file)
+    assert "exists; name another file" in dataflow("param", "dump", file, code=2).stderr
+    dataflow("param", "set", "tuned.factor", "4.5")
+
+    assert dataflow("param", "load", file).stdout == f"tuned.factor = {before}\n"
+    assert "already" in dataflow("param", "load", file).stderr
+    assert dataflow("param", "dump", file, "--all", "--overwrite").stdout == ""
+    assert "  period: 10000000\n" in file.read_text()
+    assert "already" in dataflow("param", "load", file).stderr
+
+
+@pytest.mark.usefixtures("running")
+@pytest.mark.parametrize(
+    ("text", "code", "told"),
+    [
+        ("tuned: {factr: 1}", 2, "'tuned' has no parameter 'factr': did you mean 'factor'?"),
+        ("tund: {factor: 1}", 2, "no operator 'tund' runs: did you mean 'tuned'?"),
+        ("tuned: 3", 2, "expected a mapping from operators to their parameters"),
+        ("tuned: {factor: 11}", 1, "less than or equal to 10"),
+        ("tuned: [", 2, "is no YAML value"),
+    ],
+)
+def test_a_file_with_a_fault_is_refused(dataflow, tmp_path: Path, text: str, code: int, told: str) -> None:
+    (tmp_path / "tuned.yaml").write_text(text)
+    before = dataflow("param", "get", "tuned.factor").stdout
+
+    assert told in " ".join(dataflow("param", "load", tmp_path / "tuned.yaml", code=code).stderr.split())
+
+    assert dataflow("param", "get", "tuned.factor").stdout == before
+
+
 def rows_of(outcome: Any) -> dict[str, dict[str, Any]]:
     return {row["operator"]: row for row in json.loads(outcome.stdout)["operators"]}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator, Mapping
 
 import numpy as np
@@ -60,6 +61,29 @@ class Judge(Operator):
 
     def summary(self) -> dict[str, float]:
         return {"alarms": self.given}
+
+
+class Counting(Operator):
+    """Counts images."""
+
+    image: In[Image] = In(doc="taken")
+    count: Out[Number] = Out(doc="images so far")
+
+    def setup(self) -> None:
+        self.taken = 0
+
+    def process(self, image: Image) -> Number:
+        self.taken += 1
+        return Number(stamp=image.stamp, value=float(self.taken))
+
+
+class Interrupting(Counting):
+    """Presses Ctrl-C at the third image."""
+
+    def process(self, image: Image) -> Number:
+        if self.taken == 2:
+            signal.raise_signal(signal.SIGINT)
+        return super().process(image)
 
 
 class Broken(Operator):
