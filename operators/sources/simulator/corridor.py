@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from operators.sources.simulator import furniture
+from operators.sources.simulator.choosers import add_chooser
 from operators.sources.simulator.furnishing import (
     Style,
     Wall,
@@ -34,15 +35,21 @@ def corridor(seed: int, order: Order) -> World:
     lay_floor(builder, (-x, -y), (x, y), height, style)
     outer = _ring(x, y, height, inside=True)
     inner = _ring(block_x, block_y, height, inside=False)
-    roles = [str(role) for role in rng.permutation(["walker", "walker", "ball", "rover"])] if order.movers else [""] * 4
-    for wall, role in zip(outer, roles, strict=True):
-        if role:
-            _inhabit(builder, rng, wall, role, wall.length / 2 - 1.9)
-    for wall in outer:
+    cast = order.cast(["walker", "walker", "ball", "rover"])
+    roles = [str(role) for role in rng.permutation(cast)] if order.movers else [""] * 4
+    kept = [
+        _inhabit(builder, rng, wall, role, wall.length / 2 - 1.9) if role else None
+        for wall, role in zip(outer, roles, strict=True)
+    ]
+    for wall, own in zip(outer, kept, strict=True):
         half = wall.length / 2 - 0.6
         raise_wall(builder, wall, style)
-        spans = _doors(builder, rng, wall, half, int(rng.integers(1, 3)))
-        line_wall(builder, rng, wall, _between(spans, half - width + 0.6), depth=0.5)
+        if own is None:
+            spans = _doors(builder, rng, wall, half, int(rng.integers(1, 3)))
+            line_wall(builder, rng, wall, _between(spans, half - width + 0.6), depth=0.5)
+        else:
+            spans = []
+            line_wall(builder, rng, wall, _between([own], half - width + 0.6), depth=0.5)
         decorate(builder, rng, wall, windows=rng.uniform() < 0.5, taken=spans)
     for wall in inner:
         half = wall.length / 2 - 0.2
@@ -122,12 +129,20 @@ def _between(spans: list[tuple[float, float]], half: float) -> list[tuple[float,
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 0.5]
 
 
-def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, reach: float) -> None:
+def _inhabit(
+    builder: Builder, rng: np.random.Generator, wall: Wall, role: str, reach: float
+) -> tuple[float, float] | None:
+    """Someone or something that moves along an outer wall, `reach` metres to both sides of its middle.
+
+    Returns the span of the wall that is kept free for its own furniture, if any.
+    """
     out = 0.85
 
     def places(*points: tuple[float, float]) -> Array:
         return np.array([wall.place(d, s)[:2, 3] for d, s in points])
 
+    if role == "chooser":
+        return add_chooser(builder, rng, wall, -reach, reach)
     if role == "walker":
         add_walker(builder, rng, places((out, -reach), (out, -0.3 * reach), (out + 0.04, 0.4 * reach), (out, reach)))
     elif role == "ball":
@@ -136,6 +151,7 @@ def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, 
     else:
         angle = np.linspace(0, 2 * math.pi, 10, endpoint=False)
         add_rover(builder, rng, places(*((out + 0.14 * math.sin(a), 0.7 * reach * math.cos(a)) for a in angle)))
+    return None
 
 
 def _lamp_places(x: float, y: float) -> list[tuple[float, float]]:

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from operators.sources.simulator import corridor, office, table_top
 from operators.sources.simulator.drive import Drive
 from operators.sources.simulator.inertial import true_reading
-from operators.sources.simulator.movers import STANDING, Driving, Person
+from operators.sources.simulator.movers import STANDING, Driving
 from operators.sources.simulator.native import open3d
+from operators.sources.simulator.persons import Person
 from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.settings import Inertial
 from operators.sources.simulator.trajectory import Trajectory
