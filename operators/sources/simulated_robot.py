@@ -113,6 +113,9 @@ class SimulatedRobot(Source):
     duration: Duration = Param("30s", doc="length; stamps lie before first_stamp + duration")
     first_stamp: int = Param(0, ge=0, doc="stamp of the start", unit="ns")
     speed: float = Param(0.5, gt=0.02, le=0.8, doc="of the robot on straights; it slows down in curves", unit="m/s")
+    route: Literal["round", "tour"] = Param(
+        "round", doc="of the robot: a round, or a tour that crosses itself and, but at the table, leads back too"
+    )
     hold: float = Param(0.0, ge=0, doc="time that the robot stands still at first", unit="s")
     movers: bool = Param(True, doc="people, balls and robots move; otherwise there are none")
     people: int = Param(2, ge=2, le=4, doc="persons among the movers; beyond two, they choose among drinks and seats")
@@ -157,6 +160,7 @@ class SimulatedRobot(Source):
             hold=self.hold,
             movers=self.movers,
             people=self.people,
+            tour=self.route == "tour",
             jumps=tuple((kidnap.at, kidnap.ahead) for kidnap in self.kidnaps),
         )
         shaken = self.motion

@@ -74,7 +74,7 @@ def corridor(seed: int, order: Order) -> World:
         tuple(builder.things),
         lights,
         0.5,
-        order.drive(_lane(block_x, block_y)),
+        order.drive(_tour(block_x, block_y, width) if order.tour else _lane(block_x, block_y)),
         landmarks,
         (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0),
         tuple(builder.placements),
@@ -107,6 +107,17 @@ def _lane(x: float, y: float) -> Array:
             for j in range(1, count)
         ]
     return np.array(points)
+
+
+def _tour(x: float, y: float, width: float) -> Array:
+    """Waypoints around the block counter-clockwise and back clockwise, with a turn in one corner after each round."""
+    lap = [(float(px), float(py)) for px, py in _lane(x, y)[5:]]  # without the corner in which it turns
+    c = width - 0.84  # of the turn's middle, from the block's corner
+    turn = [(0.3, 1.0), (c - 1.0, 1.12), (c - 0.5, c - 0.36), (c - 0.23, c + 0.2), (c + 0.1, c + 0.31),
+            (c + 0.31, c + 0.1), (c + 0.18, c - 0.23), (c - 0.4, c - 0.55), (c - 1.0, 1.0), (0.2, 0.98)]  # fmt: skip
+    there = [(x + u, -y - v) for u, v in turn]
+    back = [(x + v, -y - u) for u, v in turn]
+    return np.array([*lap, *there, *lap[::-1], *back])
 
 
 def _doors(

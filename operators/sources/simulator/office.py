@@ -66,8 +66,12 @@ def office(seed: int, order: Order) -> World:
         decorate(builder, rng, wall, windows=k in (0, 2), taken=taken)
 
     a, b = half_x - REACH, half_y - REACH
-    path = order.drive(_loop(rng, a, b))
-    _island(builder, rng, min(a, b) - 0.42)
+    path = order.drive(_tour(a, b) if order.tour else _loop(rng, a, b))
+    if order.tour:
+        for side in (-1, 1):
+            _island(builder, rng, 0.42, x=side * 0.55 * a)
+    else:
+        _island(builder, rng, min(a, b) - 0.42)
     lights = tuple(
         Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(1.7, 2.2))
         for sx in (-1, 1)
@@ -94,6 +98,18 @@ def _loop(rng: np.random.Generator, a: float, b: float) -> Array:
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False) + rng.uniform(0, 2 * math.pi)
     wobble = 1 - 0.06 * (1 + np.sin(3 * angle + rng.uniform(0, 6)))
     return np.stack([a * wobble * np.cos(angle), b * wobble * np.sin(angle)], axis=1)
+
+
+def _tour(a: float, b: float) -> Array:
+    """Waypoints once around counter-clockwise, then as an eight: the way crosses itself in the middle of the room.
+
+    The left half is driven in both directions.
+    """
+    around = [-55, -20, 20, 55, 90, 125, 160, 200, 235, 270, 305, 340, 380, 415]
+    back = [235, 200, 160, 125]
+    rim = [(0.95 * a * math.cos(math.radians(t)), 0.95 * b * math.sin(math.radians(t))) for t in (*around, *back)]
+    middle = (0.0, 0.0)
+    return np.array([middle, *rim[: len(around)], middle, *rim[len(around) :]])
 
 
 def _inhabit(
@@ -130,11 +146,11 @@ def _inhabit(
     return None
 
 
-def _island(builder: Builder, rng: np.random.Generator, radius: float) -> None:
-    """A small table in the middle of the room, within a circle, and what lies on it."""
+def _island(builder: Builder, rng: np.random.Generator, radius: float, *, x: float = 0.0) -> None:
+    """A small table in the middle of the room or `x` metres beside it, within a circle, and what lies on it."""
     length, depth = radius * rng.uniform(1.25, 1.4), radius * rng.uniform(0.8, 1.0)
     shape, surface = furniture.table(rng, length, depth, rng.uniform(0.45, 0.75))
-    T = pose(0, 0, 0, rng.uniform(-math.pi, math.pi))
+    T = pose(x, 0, 0, rng.uniform(-math.pi, math.pi))
     id = builder.put("table", shape, T, on=FLOOR)
     scatter(builder, rng, id, T, surface, small_items(rng, 6))
 

@@ -123,13 +123,15 @@ class Order:
     """What is asked of a world.
 
     `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, how many `people` are
-    among them, and `jumps`: times (s) and shares of the round by which the robot is carried ahead.
+    among them, whether the robot makes a `tour` that crosses itself and sees places from several sides instead of a
+    round, and `jumps`: times (s) and shares of the round by which it is carried ahead.
     """
 
     speed: float
     hold: float
     movers: bool
     people: int = 2
+    tour: bool = False
     jumps: tuple[tuple[float, float], ...] = ()
 
     def cast(self, roles: Sequence[str]) -> list[str]:

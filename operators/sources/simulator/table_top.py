@@ -72,7 +72,7 @@ def table_top(seed: int, order: Order) -> World:
         tuple(builder.things),
         lights,
         0.62,
-        order.drive(_circle(rng), at_most=0.6),
+        order.drive(_rosette() if order.tour else _circle(rng), at_most=0.6),
         landmarks,
         (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2),
         tuple(builder.placements),
@@ -85,6 +85,13 @@ def _circle(rng: np.random.Generator) -> Array:
     """Waypoints counter-clockwise around the table: what the robot's left camera sees is the table."""
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False) + rng.uniform(0, 6)
     radius = 1.86 + 0.07 * np.sin(2 * angle + rng.uniform(0, 6))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def _rosette() -> Array:
+    """Waypoints of two rounds, now nearer and now farther, that cross each other three times."""
+    angle = np.linspace(0, 4 * math.pi, 28, endpoint=False)
+    radius = 1.78 + 0.13 * np.sin(1.5 * angle)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 
