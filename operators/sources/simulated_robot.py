@@ -113,8 +113,12 @@ class SimulatedRobot(Source):
     duration: Duration = Param("30s", doc="length; stamps lie before first_stamp + duration")
     first_stamp: int = Param(0, ge=0, doc="stamp of the start", unit="ns")
     speed: float = Param(0.5, gt=0.02, le=0.8, doc="of the robot on straights; it slows down in curves", unit="m/s")
+    route: Literal["round", "tour"] = Param(
+        "round", doc="of the robot: a round, or a tour that crosses itself and, but at the table, leads back too"
+    )
     hold: float = Param(0.0, ge=0, doc="time that the robot stands still at first", unit="s")
     movers: bool = Param(True, doc="people, balls and robots move; otherwise there are none")
+    people: int = Param(2, ge=2, le=4, doc="persons among the movers; beyond two, they choose among drinks and seats")
     threads: int = Param(1, ge=1, le=64, doc="threads that cast rays; results do not depend on it")
     color_camera: ColorCamera = Param(ColorCamera(), doc="the colour camera")
     depth_camera: DepthCamera = Param(DepthCamera(), doc="the depth camera")
@@ -155,6 +159,8 @@ class SimulatedRobot(Source):
             speed=self.speed,
             hold=self.hold,
             movers=self.movers,
+            people=self.people,
+            tour=self.route == "tour",
             jumps=tuple((kidnap.at, kidnap.ahead) for kidnap in self.kidnaps),
         )
         shaken = self.motion

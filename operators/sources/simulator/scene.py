@@ -122,14 +122,22 @@ class Placement:
 class Order:
     """What is asked of a world.
 
-    `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, and `jumps`: times (s)
-    and shares of the round by which the robot is carried ahead.
+    `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, how many `people` are
+    among them, whether the robot makes a `tour` that crosses itself and sees places from several sides instead of a
+    round, and `jumps`: times (s) and shares of the round by which it is carried ahead.
     """
 
     speed: float
     hold: float
     movers: bool
+    people: int = 2
+    tour: bool = False
     jumps: tuple[tuple[float, float], ...] = ()
+
+    def cast(self, roles: Sequence[str]) -> list[str]:
+        """Roles of movers: after the first two, as many give way to those who choose as there are more people."""
+        more = self.people - 2
+        return [*roles[:2], *["chooser"] * more, *roles[2 + more :]]
 
     def drive(self, waypoints: Array, *, at_most: float = 1.0) -> Trajectory:
         """The robot's path through waypoints (N, 2), nowhere faster than `at_most` (m/s)."""

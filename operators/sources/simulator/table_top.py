@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from operators.sources.simulator import furniture, objects
+from operators.sources.simulator.choosers import add_chooser
 from operators.sources.simulator.furnishing import (
     FLOOR,
     Style,
@@ -36,6 +37,12 @@ def table_top(seed: int, order: Order) -> World:
     if order.movers:
         ways = [walls[walked].place(0.88, s * (walls[walked].length / 2 - 1.3)) for s in (-1.0, -0.3, 0.4, 1.0)]
         add_walker(builder, rng, np.array([T[:2, 3] for T in ways]))
+    kept: dict[int, tuple[float, float]] = {}
+    if order.movers:
+        others = [k for k in range(4) if k not in (walked, door_wall)]
+        for k in others[: order.people - 2]:
+            half = walls[k].length / 2 - 1.5
+            kept[k] = add_chooser(builder, rng, walls[k], -half, half)
     for k, wall in enumerate(walls):
         raise_wall(builder, wall, style, accent=k == 0)
         half = wall.length / 2 - 0.6
@@ -44,6 +51,8 @@ def table_top(seed: int, order: Order) -> World:
         if k == door_wall:
             put_on_floor(builder, "door", furniture.door(rng, 0.9, 2.05, rng.uniform(0, 0.4)), wall.place(0.0, 0.0))
             taken, free = [(-0.6, 0.6)], [(-half, -0.65), (0.65, half)]
+        if k in kept:
+            free = [(-half, kept[k][0]), (kept[k][1], half)]
         line_wall(builder, rng, wall, free, depth=0.55)
         decorate(builder, rng, wall, windows=k % 2 == 0, taken=taken)
     _lay_table(builder, rng, order.movers)
@@ -63,7 +72,7 @@ def table_top(seed: int, order: Order) -> World:
         tuple(builder.things),
         lights,
         0.62,
-        order.drive(_circle(rng), at_most=0.6),
+        order.drive(_rosette() if order.tour else _circle(rng), at_most=0.6),
         landmarks,
         (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2),
         tuple(builder.placements),
@@ -76,6 +85,13 @@ def _circle(rng: np.random.Generator) -> Array:
     """Waypoints counter-clockwise around the table: what the robot's left camera sees is the table."""
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False) + rng.uniform(0, 6)
     radius = 1.86 + 0.07 * np.sin(2 * angle + rng.uniform(0, 6))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def _rosette() -> Array:
+    """Waypoints of two rounds, now nearer and now farther, that cross each other three times."""
+    angle = np.linspace(0, 4 * math.pi, 28, endpoint=False)
+    radius = 1.78 + 0.13 * np.sin(1.5 * angle)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 

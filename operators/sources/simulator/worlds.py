@@ -14,10 +14,18 @@ NAMES = tuple(_MAKERS)
 
 
 def make_world(
-    name: str, seed: int, *, speed: float, hold: float, movers: bool, jumps: tuple[tuple[float, float], ...] = ()
+    name: str,
+    seed: int,
+    *,
+    speed: float,
+    hold: float,
+    movers: bool,
+    people: int = 2,
+    tour: bool = False,
+    jumps: tuple[tuple[float, float], ...] = (),
 ) -> World:
     """A world drawn from the seed. Raises ValueError for an unknown name."""
     maker = _MAKERS.get(name)
     if maker is None:
         raise ValueError(f"no world {name!r}; there are {', '.join(NAMES)}")
-    return maker(seed, Order(speed, hold, movers, jumps))
+    return maker(seed, Order(speed, hold, movers, people, tour, jumps))

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
 from operators.sources.simulator import corridor, office, table_top
 from operators.sources.simulator.drive import Drive
 from operators.sources.simulator.inertial import true_reading
-from operators.sources.simulator.movers import STANDING, Driving, Person
+from operators.sources.simulator.movers import STANDING, Driving
 from operators.sources.simulator.native import open3d
+from operators.sources.simulator.persons import Person
 from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.settings import Inertial
 from operators.sources.simulator.trajectory import Trajectory
@@ -131,6 +133,38 @@ def test_lanes_lie_apart_and_off_the_path_of_the_robot(name: str, seeds: int) ->
         for k, lane in enumerate(here.lanes):
             assert lane.gap(here.path.outline()) > ROBOT_RADIUS, (seed, lane.mover)
             assert all(lane.apart(other) > 0 for other in here.lanes[k + 1 :]), (seed, lane.mover)
+
+
+@pytest.mark.usefixtures("unfurnished")
+@pytest.mark.parametrize(("name", "seeds"), [("office", 12), ("corridor", 4), ("table_top", 4)])
+def test_a_tour_keeps_off_all_lanes_and_crosses_itself(name: str, seeds: int) -> None:
+    for seed in range(seeds):
+        here = make_world(name, seed, speed=0.5, hold=0.0, movers=True, people=2 + seed % 3, tour=True)
+        outline = here.path.outline(2000)
+        assert all(lane.gap(outline) > ROBOT_RADIUS for lane in here.lanes), seed
+        motion = here.path.at(np.linspace(0, here.path.period, 1500, endpoint=False))
+        apart = np.linalg.norm(motion.position[:, None] - motion.position[None], axis=2)
+        turned = np.abs((motion.yaw[:, None] - motion.yaw[None] + math.pi) % (2 * math.pi) - math.pi)
+        k = np.arange(1500)
+        later = np.abs((k[:, None] - k[None] + 750) % 1500 - 750) > 60
+        same = (apart < 0.05) & later
+        assert same.any()
+        assert turned[same].max() > {"office": 3.0, "corridor": 3.0, "table_top": 0.1}[name]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_tour_touches_nothing_and_stays_within_limits(name: str) -> None:
+    here = make_world(name, 1, speed=0.5, hold=0.0, movers=True, people=4, tour=True)
+    track = cKDTree(here.path.outline(2000))
+    for thing in here.things:
+        if thing.still and thing.label not in ("floor", "ceiling"):
+            v = thing.vertices(0.0)
+            v = v[(v[:, 2] > 0.02) & (v[:, 2] < ROBOT_HEIGHT), :2]
+            gap = track.query(v)[0].min(initial=9)
+            assert gap > ROBOT_RADIUS, f"{thing.label} {thing.id} stands {gap:.2f} m from the path"
+    motion = here.path.at(np.linspace(0, here.path.period, 2000))
+    assert motion.speed().max() < 0.55
+    assert np.abs(motion.yaw_rate).max() < math.radians(45)
 
 
 @pytest.mark.usefixtures("unfurnished")

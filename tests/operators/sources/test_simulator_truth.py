@@ -17,8 +17,9 @@ from operators.sources import SimulatedRobot
 from operators.sources.simulator.classes import ACTIVITIES, THINGS
 from operators.sources.simulator.furnishing import FLOOR
 from operators.sources.simulator.furniture import rover
-from operators.sources.simulator.movers import Carried, Person
+from operators.sources.simulator.movers import Carried
 from operators.sources.simulator.optics import Optics
+from operators.sources.simulator.persons import Person
 from operators.sources.simulator.relations import PLACEMENT, SPATIAL
 from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Builder, Light, Still, World
@@ -116,7 +117,7 @@ def test_depth_is_where_the_triangles_are(robot: SimulatedRobot) -> None:
     """A second implementation (Möller and Trumbore, 1997) on all triangles, for a few pixels."""
     world, t = robot._stage.world, 3.0
     optics = Optics(40, 30, 34, 34, 19.5, 14.5)
-    T = robot._stage.T_world_base(t) @ robot._T_base_depth
+    T = robot._stage.T_world_base(t) @ robot._rig.T_base_depth
     view = robot._stage.at(t).view(T, optics, color=False)
     corners, ids = [], []
     for thing in world.things:
@@ -326,9 +327,14 @@ def _surface_heights(vertices: np.ndarray, thing: Any, x: float, y: float) -> np
     return np.concatenate(heights)
 
 
+def grasp_of(person: Person) -> Any:
+    """A place that the person grips, if there is one."""
+    return next((act.grasp for act in person.timeline.acts if act.grasp is not None), None)
+
+
 def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
     world = robot._stage.world
-    drinkers = [t for t in world.objects() if isinstance(t.mover, Person) and t.mover._grasp is not None]
+    drinkers = [t for t in world.objects() if isinstance(t.mover, Person) and grasp_of(t.mover) is not None]
     assert drinkers
     for person in drinkers:
         mover = person.mover
@@ -363,13 +369,13 @@ def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
 def test_a_hand_reaches_its_mug(robot: SimulatedRobot) -> None:
     for thing in robot._stage.world.objects():
         mover = thing.mover
-        if isinstance(mover, Person) and mover._grasp is not None:
+        if isinstance(mover, Person) and grasp_of(mover) is not None:
             before = 0.0
             for act in mover.timeline.acts:
                 if act.activity == "drinking" and act.lift == (0.0, 1.0):
                     t = before - mover.timeline.phase + mover.timeline.period + 1e-3
-                    assert mover.held(t)
-                    assert np.linalg.norm(mover.grip(t) - mover._grasp) < 0.05
+                    assert mover.held(t) == act.object
+                    assert np.linalg.norm(mover.grip(t) - act.grasp) < 0.05
                 before += act.seconds
 
 
