@@ -1,4 +1,4 @@
-"""Sparse features: spread corners, their Lucas-Kanade tracks, and ORB matches where tracking cannot reach."""
+"""Sparse features: spread corners and their Lucas-Kanade tracks."""
 
 import cv2
 import numpy as np
@@ -13,10 +13,21 @@ LK_LEVELS = 3
 LK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
 
 
-def detect_corners(gray: Gray, count: int) -> Pixels:
-    """At most count corners (N, 2), spread over the image. Shi and Tomasi, "Good features to track", 1994."""
+def detect_corners(gray: Gray, count: int, taken: Pixels | None = None) -> Pixels:
+    """Finds corners (N, 2), spread over the image and apart from those taken, at most count with them.
+
+    Shi and Tomasi, "Good features to track", 1994.
+    """
     spacing = max(3.0, 0.6 * float(np.sqrt(gray.size / count)))
-    corners = cv2.goodFeaturesToTrack(gray, count, qualityLevel=0.005, minDistance=spacing, blockSize=5)
+    mask = None
+    if taken is not None and len(taken):
+        count -= len(taken)
+        if count <= 0:
+            return np.zeros((0, 2))
+        mask = np.full(gray.shape, 255, np.uint8)
+        for x, y in np.rint(taken).astype(int).tolist():
+            cv2.circle(mask, (x, y), int(spacing), 0, -1)
+    corners = cv2.goodFeaturesToTrack(gray, count, 0.005, spacing, mask=mask, blockSize=5)
     return np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
@@ -45,25 +56,3 @@ def with_exposure_of(reference: Gray, gray: Gray) -> Gray:
         return gray
     table = np.clip(np.rint((np.arange(256) - mean) * gain + mean_wanted), 0, 255).astype(np.uint8)
     return np.asarray(cv2.LUT(gray, table), np.uint8)
-
-
-class OrbMatcher:
-    """Descriptors and mutual nearest matches. Rublee et al., "ORB", 2011."""
-
-    def __init__(self, count: int = 1000) -> None:
-        self._orb = cv2.ORB.create(count, scaleFactor=1.2, nlevels=8, edgeThreshold=15, patchSize=31, fastThreshold=7)
-        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
-
-    def describe(self, gray: Gray) -> tuple[Pixels, NDArray[np.uint8]]:
-        """Pixels (N, 2) and their descriptors (N, 32)."""
-        points, descriptors = self._orb.detectAndCompute(gray, None)
-        if descriptors is None:
-            return np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
-        return np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.uint8)
-
-    def match(self, descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Pairs of indices (M, 2) that are each other's nearest and near."""
-        if len(descriptors_a) == 0 or len(descriptors_b) == 0:
-            return np.zeros((0, 2), np.int64)
-        matches = self._matcher.match(descriptors_a, descriptors_b)
-        return np.array([(m.queryIdx, m.trainIdx) for m in matches if m.distance < 64], np.int64).reshape(-1, 2)
