@@ -196,7 +196,7 @@ def test_a_lidar_that_was_covered_is_found_again_near_by() -> None:
 def test_another_place_is_not_taken_for_the_mapped_one_and_a_new_map_begins() -> None:
     elsewhere = [(axis, 3 * place, *spans) if axis == 2 else (axis, place, *spans) for axis, place, *spans in CORRIDOR]
     clouds = [scan(ROOM, circling, k) for k in range(6)] + [scan(elsewhere, along, k) for k in range(6, 18)]
-    played = play(LidarOdometry(patience=0.3, give_up=0.4), {"cloud": clouds})
+    played = play(LidarOdometry(patience=0.35, give_up=0.4), {"cloud": clouds})
     states = [text.split(":")[0] for text in texts(played)]
     assert states[6:10] == ["predicted"] * 3 + ["lost"]
     assert "relocalised" not in states
