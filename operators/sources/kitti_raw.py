@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, Image, Message, PointCloud, Transforms
+from dataflow.messages.geometry import invert
 from dataflow.operator import Out, Param, Source
 from operators.geometry.se3 import orthonormalised
 
@@ -47,7 +48,7 @@ class KittiRaw(Source):
     points: Out[PointCloud] = Out(doc="one turn of the Velodyne, with intensities 0 to 1")
     image: Out[Image] = Out(doc="left colour camera, rectified")
     image_info: Out[CameraInfo] = Out(static=True, doc="calibration of the rectified camera")
-    extrinsics: Out[Transforms] = Out(static=True, doc="the Velodyne in the camera's frame")
+    extrinsics: Out[Transforms] = Out(static=True, doc="the camera in the Velodyne's frame")
 
     path: str = Param(doc="the folder")
     rate: float = Param(10.0, gt=0, doc="frames a second where the folder has no timestamps", unit="Hz")
@@ -89,7 +90,10 @@ class KittiRaw(Source):
                 fx=K[0, 0], fy=K[1, 1], cx=K[0, 2], cy=K[1, 2],
             ),
             "extrinsics": Transforms.from_matrix(
-                self._calibration.T_camera_velodyne, stamp=stamp, frame=self.image_frame, child_frame=self.lidar_frame
+                invert(self._calibration.T_camera_velodyne),
+                stamp=stamp,
+                frame=self.lidar_frame,
+                child_frame=self.image_frame,
             ),
         }  # fmt: skip
 
