@@ -106,8 +106,11 @@ def compile_class(
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in arrays)})",
     ]
     exec(compile("\n".join(text), f"<message {schema!r}>", "exec"), names)
-    made = (names[n] for n in ("_construct", "_adopt", "_digest", "_header", "_arrays"))
-    return Compiled(*made, tuple({d.str: np.dtype(d.str) for d in f.dtypes} for f in arrays))
+    construct, adopt, digest, header, held = (
+        names[f"_{n}"] for n in ("construct", "adopt", "digest", "header", "arrays")
+    )
+    dtypes = tuple({d.str: np.dtype(d.str) for d in f.dtypes} for f in arrays)
+    return Compiled(construct, adopt, digest, header, held, dtypes)
 
 
 def _construct(
