@@ -182,6 +182,11 @@ class Message(_Declared):
         self.validate()
 
     @classmethod
+    def compiled(cls) -> Compiled:
+        """Returns the functions that are made for the class."""
+        return cls._made or cls._compile()
+
+    @classmethod
     def _compile(cls) -> Compiled:
         """Makes the functions of the class; its constructor too, unless somebody has written one."""
         validates = cls.validate is not Message.validate

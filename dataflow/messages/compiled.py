@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import keyword
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -50,6 +50,8 @@ class Compiled(NamedTuple):
     digest: Callable[[Any], bytes]
     header: Callable[[Any], tuple[Any, ...]]
     arrays: Callable[[Any], tuple[Any, ...]]
+    dtypes: tuple[Mapping[str, np.dtype[Any]], ...]
+    """Of each array field the dtypes by their numpy names, such as `<f4`."""
 
 
 def compile_class(
@@ -104,7 +106,11 @@ def compile_class(
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in arrays)})",
     ]
     exec(compile("\n".join(text), f"<message {schema!r}>", "exec"), names)
-    return Compiled(*(names[n] for n in ("_construct", "_adopt", "_digest", "_header", "_arrays")))
+    construct, adopt, digest, header, held = (
+        names[f"_{n}"] for n in ("construct", "adopt", "digest", "header", "arrays")
+    )
+    dtypes = tuple({d.str: np.dtype(d.str) for d in f.dtypes} for f in arrays)
+    return Compiled(construct, adopt, digest, header, held, dtypes)
 
 
 def _construct(

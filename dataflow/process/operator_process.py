@@ -7,6 +7,7 @@ when there is nothing to do.
 
 from __future__ import annotations
 
+import gc
 import queue
 import sys
 import time
@@ -154,6 +155,7 @@ class OperatorProcess:
         limit_threads(self.graph.threads)
         for maker in self.runners.all:
             maker.setup()
+        gc.freeze()  # modules and operators live as long as the process: collections need not look at them
 
     def _receiver(self, stream: str) -> Callable[[Any], None]:
         put = self.inbox.put

@@ -207,6 +207,9 @@ class SinkProcess:
         fresh = [r for r, place in zip(batch.records, places, strict=True) if place >= following or place in lacking]
         lacking.difference_update(places)
         self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
+        if len(fresh) == len(batch.records):
+            self.sink.firings(batch.operator, last.stamp, batch.data)
+            return batch.last
         for part in consecutive(fresh):
             self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last and part[-1] is last))
         return batch.last
