@@ -1,8 +1,8 @@
 """The simulated network: a link from each process to each that takes from it.
 
 A link keeps its order; links know nothing of each other. A process that is frozen takes nothing: its links fill, and
-whoever writes to one that is full waits for so long and no longer; then the link is broken, and what was on it is lost,
-and of what is sent until it stands again all but the newest of each stream, and but for frontiers and ends. A partition
+whoever writes to one that is full waits for so long and no longer; then the link is broken, and what is on it and what
+is sent until it stands again is lost, but for the newest of each stream, its frontiers and its end. A partition
 breaks links, too. Only live runs outlive that.
 """
 
@@ -57,8 +57,12 @@ class Link:
 
     def cut(self, span: float) -> None:
         """Breaks the link for so many seconds."""
-        for key in {key for key, _, _ in self._on_its_way}:
-            self._drop(key)
+        newest = {each[0]: each for each in self._on_its_way}
+        self._on_its_way, before = deque(), self._on_its_way
+        for each in before:
+            if each[2] or each is newest[each[0]]:
+                self._on_its_way.append(each)
+        self.lost += len(before) - len(self._on_its_way)
         self._broken_until = max(self._broken_until, self._world.now + span)
         self._due = max(self._due, self._broken_until)
         self._world.at(self._due, self._deliver)
