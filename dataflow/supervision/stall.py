@@ -78,6 +78,9 @@ class LiveStallWatch(StallWatch):
     def __init__(self, run: RunState, quiescence: Quiescence) -> None:
         super().__init__(run, quiescence)
         self._signs: dict[str, float] = {}
+        graph = run.graph
+        self._flowing = {s for node in graph.sources() for s in node.outputs.values() if not graph.streams[s].static}
+        """The streams of sources that have not ended."""
 
     def released(self) -> None:
         super().released()
@@ -90,6 +93,8 @@ class LiveStallWatch(StallWatch):
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         super().said(process, kind, fields)
         self._signs[process.label] = self.run.steady
+        if kind == "stream_ended":
+            self._flowing.discard(fields["stream"])
 
     def _stuck(self) -> list[Supervised]:
         """Returns those who are at a call for as long as nothing has happened."""
@@ -98,6 +103,9 @@ class LiveStallWatch(StallWatch):
 
     def tick(self) -> None:
         super().tick()
+        if not self._flowing and (stuck := self._stuck()):  # however busy a timer is
+            names = "; ".join(p.at_work() for p in stuck)
+            raise RunFailed(f"all sources have ended, and a call does not: {names}", self.run.last_words())
         now, timeout = self.run.steady, self.run.plan.stall_timeout
         for process in list(self.run.working()):
             silence = now - self._signs.get(process.label, now)

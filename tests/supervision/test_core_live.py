@@ -248,6 +248,22 @@ def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
     assert play.failure() == "no progress for 20 s; still busy: process 'smooth', smooth at stamp 5 for 20 s"
 
 
+def test_a_call_that_does_not_end_is_named_when_the_sources_have_ended_though_a_timer_goes_on() -> None:
+    play = robot(stall_timeout=20.0).starts()
+    play.beating = False
+    for k in range(60):
+        play.tell(play.beat("left"), play.beat("after", ("after", 5, 0.5 * k)), play.beat("smooth"))
+        play.tell(play.progress("smooth", {"smooth": k}))
+        play.wait(0.5)
+    assert play.over is None  # sources may go on without it
+
+    streams = play.plan.graph.nodes["left"].outputs.values()
+    play.tell(*(Said("left", "stream_ended", {"stream": s, "reason": "end of source"}) for s in streams))
+    play.wait(20.0)
+
+    assert play.failure().startswith("all sources have ended, and a call does not: process 'after', after at stamp 5")
+
+
 def test_after_a_restart_a_stuck_graph_is_proven_again() -> None:
     play = robot().starts()
     play.dies("smooth", -9)

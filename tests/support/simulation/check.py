@@ -102,9 +102,9 @@ def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
     if outcome.failure is None:
         if report.identical:
             return "identical"
-        if not report.culprits and all(report.verdict(v) in ("identical", "unverifiable") for v in report.operators):
-            if _missed_by_recorder(outcome.report):
-                return "unverifiable"
+        unchanged = all(report.verdict(v) in ("identical", "unverifiable") for v in report.operators)
+        if unchanged and not report.changed and _missed_by_recorder(outcome.report):
+            return "unverifiable"
         raise Violation(f"verified as different:\n{_explained(report)}")
     if any(v.first is not None for v in report.operators) or report.changed:
         raise Violation(f"of a failed run, verified as different:\n{_explained(report)}")
@@ -218,7 +218,7 @@ def _made(graph: Graph, log: FiringLog, stream: str, report: RunReport) -> set[P
 
 
 def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunReport) -> None:
-    """Sources were never further ahead of the operators than their window, and it grew only where the graph needs it."""
+    """Sources were never further ahead of the operators than their window; it grew only where the graph needs it."""
     grown = any("further ahead than the window" in note for note in report.notes)
     if grown:
         if graph.name in NO_LOOK_AHEAD:
@@ -243,7 +243,7 @@ def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunRepor
             undone = min((s for s, when in worked if when > now and s < stamp), default=stamp)
             ahead = sum(messages for when, s, messages in given if when < now and undone <= s < stamp)
             if ahead >= scenario.window + MOST_OF_A_STEP:
-                raise Violation(f"{label}: {ahead} messages ahead of stamp {undone}, with a window of {scenario.window}")
+                raise Violation(f"{label}: {ahead} messages ahead of {undone}, with a window of {scenario.window}")
 
 
 NO_LOOK_AHEAD = ("chain", "diamond")

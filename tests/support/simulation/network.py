@@ -1,9 +1,9 @@
 """The simulated network: a link from each process to each that takes from it.
 
 A link keeps its order; links know nothing of each other. A process that is frozen takes nothing: its links fill, and
-whoever writes to one that is full waits for so long and no longer; then the link is broken, and what was on it, and
-what is sent until it stands again, is lost, but for ends and frontiers of streams. A partition breaks links, too. Only live runs
-outlive that.
+whoever writes to one that is full waits for so long and no longer; then the link is broken, and what is on it and what
+is sent until it stands again is lost, but for the newest of each stream, its frontiers and its end. A partition
+breaks links, too. Only live runs outlive that.
 """
 
 from __future__ import annotations
@@ -46,22 +46,33 @@ class Link:
                 self.cut(STANDS_AGAIN)
                 break
             self._room.wait(until - world.now)
-        broken = world.now < self._broken_until
-        if self._taker.process.dead or (broken and not kept):
+        if self._taker.process.dead:
             self.lost += 1
             return
+        if world.now < self._broken_until:
+            self._drop(key)
         self._on_its_way.append((key, payload, kept))
         self._due = max(self._due, self._broken_until, world.now + world.latency())
         world.at(self._due, self._deliver)
 
     def cut(self, span: float) -> None:
         """Breaks the link for so many seconds."""
-        before, self._on_its_way = self._on_its_way, deque(each for each in self._on_its_way if each[2])
+        newest = {each[0]: each for each in self._on_its_way}
+        self._on_its_way, before = deque(), self._on_its_way
+        for each in before:
+            if each[2] or each is newest[each[0]]:
+                self._on_its_way.append(each)
         self.lost += len(before) - len(self._on_its_way)
         self._broken_until = max(self._broken_until, self._world.now + span)
         self._due = max(self._due, self._broken_until)
         self._world.at(self._due, self._deliver)
         self._room.notify()
+
+    def _drop(self, key: str) -> None:
+        """Drops what waits on one key."""
+        left = deque(each for each in self._on_its_way if each[0] != key or each[2])
+        self.lost += len(self._on_its_way) - len(left)
+        self._on_its_way = left
 
     def _deliver(self) -> None:
         """Hands over what has arrived; each message has its own moment, but the frozen take all at once."""

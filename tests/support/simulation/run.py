@@ -20,7 +20,7 @@ from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
 from simulation.world import Process, Violation, World
 
-LIMIT = 600.0
+LIMIT = 200.0
 """Simulated seconds after which a run hangs: far above the sum of all timeouts."""
 MEGABYTES = 50_000_000
 
@@ -92,7 +92,6 @@ class Simulation:
         self._plan, self._happenings, self._mode = plan, happenings, mode
         self._supervisor: Supervisor | None = None
         self._lives: dict[str, int] = {}
-        self._boxes: list[int] = []
 
     def run(self) -> Outcome:
         interval = sys.getswitchinterval()
@@ -106,7 +105,8 @@ class Simulation:
             stack.callback(_restore_effort, *before)
             stack.callback(self.world.close)
             self._play()
-        self.outcome.seconds, self.outcome.turns, self.outcome.calls = self.world.now, self.world.turns, self.world.calls
+        world = self.world
+        self.outcome.seconds, self.outcome.turns, self.outcome.calls = world.now, world.turns, world.calls
         self.outcome.lost = sum(link.lost for link in self.network.links)
         self.outcome.disk_full = self.disk.full
         return self.outcome
@@ -166,7 +166,6 @@ class Simulation:
             (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
             (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
             (f"{supervision}.supervisor", "environment"): _nothing,
-            (f"{supervision}.supervisor", "make_black_box"): self._make_box,
             (f"{supervision}.nursery", "os"): system,
             (f"{supervision}.nursery", "select"): machine.Select(system),
             (f"{supervision}.nursery", "signal"): machine.Signals(system),
@@ -174,11 +173,6 @@ class Simulation:
             ("dataflow.recording.container", "os"): self.disk,
             ("dataflow.firing.source", "Tripwire"): _NoTripwire,
         }
-
-    def _make_box(self) -> int:
-        from dataflow.records.black_box import make_black_box
-
-        return make_black_box()
 
     # Processes
 

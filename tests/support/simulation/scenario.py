@@ -26,7 +26,10 @@ GRAPHS: Mapping[str, str] = {
   left: {{SOURCE}}
   right: {{SOURCE}}
   mount: {{{_USE}:Pose, inputs: {{x: left/slow}}LIVE}}
-  mix: {{{_USE}:Mix, inputs: {{a: left/fast, b: right/fast, constant: mount/mount, feedback: smooth/y, recent: right/fast}}, {_WORK}LIVE}}
+  mix:
+    {_USE}:Mix
+    inputs: {{a: left/fast, b: right/fast, constant: mount/mount, feedback: smooth/y, recent: right/fast}}
+    {_WORK}LINE
   smooth: {{{_USE}:Smooth, inputs: {{x: mix/y}}LIVE}}
 """,
     "diamond": f"""
@@ -116,6 +119,7 @@ def load(
     words = {
         "SOURCE": _DEVICE if live else _SOURCE,
         "LIVE": f", live: {{{policy}}}" if policy else "",
+        "LINE": f"\n    live: {{{policy}}}" if policy else "",
         "RESTARTED": f", live: {{{_RESTART}}}" if "restart" in policy else "",
         "COUNT": str(count),
         "PERIOD": str(period),
@@ -175,11 +179,12 @@ def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happenin
     kind, target = r.choice(kinds), r.choice(labels) if r.random() < 0.9 else "@recorder"
     match kind:
         case "freeze":
-            return Happening(at, kind, target, {"span": r.choice((round(0.3 * r.random(), 4), round(2 * r.random(), 4), 6.0, FOREVER))})
+            return Happening(at, kind, target, {"span": r.choice((0.05, 0.2, 1.0, 2.0, 6.0, FOREVER))})
         case "kill_at_call":
             return Happening(0.0, kind, target, {"call": r.randint(1, 1200), "life": r.choice((1, 1, 1, 2))})
         case "cut":
-            return Happening(at, kind, target, {"other": r.choice([*labels, "@recorder"]), "span": round(0.3 * r.random(), 4)})
+            fields = {"other": r.choice([*labels, "@recorder"]), "span": r.choice((0.01, 0.05, 0.3))}
+            return Happening(at, kind, target, fields)
         case "stop":
             return Happening(at, kind)
         case _:
