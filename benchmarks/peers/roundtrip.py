@@ -1,0 +1,135 @@
+"""Round trips between two processes, ours and the peers' in turns in one run: ratios with their spread.
+
+    python benchmarks/peers/roundtrip.py --peers VENV      # VENV holds dora-rs, dora-rs-cli, eclipse-zenoh, iceoryx2, lcm
+    python benchmarks/peers/roundtrip.py --peers VENV --rounds 9 --sizes 1008,921600,8294400 --only ours,dora
+
+One process sends an array that holds the time, another answers with its first eight bytes, 100 times a second; a round
+trip ends when the first process has the answer as a number. Every contestant's processes are started anew for each round
+and size, so one bad placement cannot decide. The figure of a round is its median; the table gives the median over rounds
+and, of the ratio to dora, the smallest and largest over rounds: on a noisy machine ratios of one round mean more than times
+of different ones.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+WARM_UP = 20
+
+
+class Failed(RuntimeError):
+    """A contestant that gave no result: says why."""
+
+
+def script(name: str, peers: Path | None) -> Callable[[int, int], list[float]]:
+    """A contestant that is one Python script: `name.py BYTES COUNT` prints a JSON list of microseconds."""
+
+    def run(size: int, count: int) -> list[float]:
+        python = sys.executable if peers is None else str(peers / "bin" / "python")
+        return parsed(finished([python, str(HERE / f"{name}.py"), str(size), str(count)]))
+
+    return run
+
+
+def dora(peers: Path) -> Callable[[int, int], list[float]]:
+    def run(size: int, count: int) -> list[float]:
+        path = f"{peers / 'bin'}{os.pathsep}{os.environ['PATH']}"
+        output = finished(
+            [str(peers / "bin" / "dora"), "run", str(HERE / "dora.yaml")], PATH=path, BYTES=str(size), COUNT=str(count)
+        )
+        return parsed(output.split("TOOK ", 1)[-1].splitlines()[0])
+
+    return run
+
+
+def ours(options: dict[str, object]) -> Callable[[int, int], list[float]]:
+    """A live run of `roundtrip.yaml`, in a Python of its own."""
+
+    def run(size: int, count: int) -> list[float]:
+        code = (
+            "import json, sys\n"
+            "from pathlib import Path\n"
+            f"sys.path.append({str(HERE)!r})\n"
+            "from dataflow.graph import load_graph\n"
+            "from dataflow.supervision.run import run\n"
+            f"graph = load_graph({str(HERE / 'roundtrip.yaml')!r}, settings=['nbytes={size}', 'count={count}'], live=True)\n"
+            f"options = json.loads({json.dumps(options)!r})\n"
+            "options = {k: Path(v) if k == 'record' else v for k, v in options.items()}\n"
+            "print(run(graph, live=True, **options).summaries['pong']['took'])\n"
+        )
+        return parsed(finished([sys.executable, "-c", code]))
+
+    return run
+
+
+def finished(command: list[str], **environment: str) -> str:
+    """The standard output of a command. Raises `Failed`."""
+    try:
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=120, check=False, env={**os.environ, **environment}
+        )
+    except (subprocess.TimeoutExpired, OSError) as error:
+        raise Failed(str(error)) from error
+    if done.returncode:
+        raise Failed((done.stderr.strip() or done.stdout.strip()).splitlines()[-1])
+    return done.stdout
+
+
+def parsed(text: str) -> list[float]:
+    try:
+        return [float(x) for x in json.loads(text)]
+    except ValueError as error:
+        raise Failed(f"no result in {text[-200:]!r}") from error
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "--peers", type=Path, help="virtual environment of the peers; without it ours and the floor only"
+    )
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--count", type=int, default=150)
+    parser.add_argument("--sizes", default="1008,921600,8294400")
+    parser.add_argument("--only", default="", help="names of contestants, separated by commas")
+    arguments = parser.parse_args()
+    contestants: dict[str, Callable[[int, int], list[float]]] = {"ours": ours({}), "floor": script("floor", None)}
+    if arguments.peers is not None:
+        contestants["dora"] = dora(arguments.peers)
+        for name in ("zenoh", "iceoryx", "lcm"):
+            contestants[name] = script(f"{name}_pair", arguments.peers)
+    if arguments.only:
+        contestants = {name: contestants[name] for name in arguments.only.split(",")}
+    sizes = [int(size) for size in arguments.sizes.split(",")]
+    medians: dict[tuple[str, int], dict[int, float]] = {}
+    for round_ in range(arguments.rounds):
+        for size in sizes:
+            for name, run in contestants.items():
+                try:
+                    took = run(size, arguments.count)[WARM_UP:]
+                    medians.setdefault((name, size), {})[round_] = statistics.median(took)
+                except Failed as failure:
+                    print(f"{name}, {size} bytes, round {round_}: {failure}", file=sys.stderr)
+    print(f"\nround trip, median of {arguments.rounds} rounds of {arguments.count - WARM_UP}, µs\n")
+    print("| bytes | contestant | µs | x dora (smallest - largest) |\n| --- | --- | --- | --- |")
+    for size in sizes:
+        reference = medians.get(("dora", size), {})
+        for name in contestants:
+            rounds = medians.get((name, size), {})
+            if not rounds:
+                print(f"| {size:,} | {name} | no result | |")
+                continue
+            ratios = [value / reference[k] for k, value in rounds.items() if k in reference]
+            text = f"{statistics.median(ratios):.2f} ({min(ratios):.2f} - {max(ratios):.2f})" if ratios else ""
+            print(f"| {size:,} | {name} | {statistics.median(rounds.values()):,.0f} | {text} |")
+
+
+if __name__ == "__main__":
+    main()
