@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -28,7 +28,9 @@ class ProcessConfig:
     whether a recorder takes the firing records. `live`: sources do not wait for the graph, and operators not for their
     inputs. `resume` is given to a process that takes the place of one that died: for each operator, where it had got
     to (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the
-    operators' states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
+    operators' states of that moment. `rings_out` and `rings_in`: for each link to and from another process the keys of
+    its channels; their descriptors were handed down in this order.
+    `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
     label: str
@@ -48,6 +50,8 @@ class ProcessConfig:
     resume: dict[str, Any] | None = None
     snapshots: int | None = None
     warm: dict[str, Any] | None = None
+    rings_out: Sequence[Sequence[str]] = ()
+    rings_in: Sequence[Sequence[str]] = ()
 
     def resumed(self, operator: str) -> Resumed:
         """Where an operator had got to in the process before this one."""

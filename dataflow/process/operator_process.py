@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dataflow.chaos.faults import OperatorFaults
@@ -22,10 +22,12 @@ from dataflow.graph.model import Graph, Node
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
+from dataflow.process.handed import BACKLOG
+from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet, fetch_statics
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.network import network_config
-from dataflow.process.outlet import Links, Outlet, incarnations_of
+from dataflow.process.outlet import Network, Outlet, incarnations_of
 from dataflow.process.pace import Pace
 from dataflow.process.planned_faults import do_fault
 from dataflow.process.progress import Progress
@@ -33,15 +35,13 @@ from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
-from dataflow.transport import Bus, Envelope, TapServer
+from dataflow.transport import Bus, Envelope, Outgoing, TapServer
 from dataflow.transport.publisher import BusError
 
 IDLE_WAIT = 0.1
 TAKE_WITHIN = 0.001
 """Seconds for what has arrived, before what is decided is run; live runs take all, to know the newest."""
 PROBE_EVERY = 0.01
-BACKLOG = (16, 8)
-"""How many windows of messages and of bytes may wait for operators that no source waits for."""
 
 
 class OperatorProcess:
@@ -51,7 +51,8 @@ class OperatorProcess:
         self,
         config: ProcessConfig,
         channel: Channel,
-        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        inbox: Inbox,
+        outgoing: Sequence[tuple[Sequence[str], Outgoing]] = (),
         box: int | None = None,
     ) -> None:
         """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
@@ -74,6 +75,7 @@ class OperatorProcess:
         self.outlet = Outlet(
             channel,
             self.runners.taking,
+            outgoing=outgoing,
             namespace=self.graph.namespace,
             static=self.static,
             live=config.live,
@@ -101,10 +103,8 @@ class OperatorProcess:
         settings = network_config(graph.network, config.secret, config.listen, config.connect, live=config.live)
         self.bus = Bus(settings)
         self.taps = TapServer(self.bus, graph.namespace)
-        publishers = {s: self.bus.publisher(s, consumers=consumers) for s, consumers in config.publish.items()}
-        self.outlet.open(Links(self.bus, self.taps, publishers, config.publish))
-        for stream in config.subscribe:
-            self.bus.subscribe(stream, self._receiver(stream))
+        made = {*config.publish, *(s for name in config.nodes for s in graph.nodes[name].outputs.values())}
+        self.outlet.open(Network(self.bus, self.taps, {stream: self.bus.publisher(stream) for stream in sorted(made)}))
         self.channel.send("joined")
         for stream in config.subscribe:
             graph.message_types(stream)  # its messages may be of a type that no operator here names
@@ -154,14 +154,6 @@ class OperatorProcess:
         for maker in self.runners.all:
             maker.setup()
 
-    def _receiver(self, stream: str) -> Callable[[Any], None]:
-        put = self.inbox.put
-
-        def receive(payload: Any) -> None:
-            put(("envelope", stream, payload))
-
-        return receive
-
     def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
         self.channel.send(
             "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
@@ -172,6 +164,7 @@ class OperatorProcess:
         while True:
             if self._probing:
                 self.outlet.probe()
+            self.outlet.push()
             self._take(self._wait_time())
             if self._left:
                 break
@@ -186,6 +179,7 @@ class OperatorProcess:
         """Sends the firing records that were not sent yet: after a failure here, the failed one among them."""
         if self._released:
             self.outlet.flush_all()
+            self.outlet.push_all()
 
     def close(self) -> None:
         """Closes every operator and the network; the first error is raised when all are closed."""
@@ -355,6 +349,8 @@ class OperatorProcess:
                 self._stopping = True
                 self.feeding.finish("interrupted")
                 self.live.finish("interrupted")
+            case "gone":
+                self.outlet.consumer_gone(fields["ring"])
             case "lacks":
                 self.outlet.send_again(fields["operator"])
             case "leave":

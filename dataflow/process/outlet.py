@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -13,10 +13,14 @@ from dataflow.process.channel import Channel
 from dataflow.records.black_box import BlackBox
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.sync import NEVER, Entry
-from dataflow.transport import Bus, Envelope, Kind, StreamPublisher, TapServer, encode
+from dataflow.transport import Bus, Envelope, Kind, Outgoing, StreamPublisher, TapServer, encode, encode_parts
+from dataflow.transport.codec import parts_size
+from dataflow.transport.envelope import Buffer
+from dataflow.transport.shared import THRESHOLD
 
 BATCH_RECORDS = 64
 BATCH_SECONDS = 0.25
+PUSH_WITHIN = 2.0
 
 
 class Consumer(Protocol):
@@ -33,14 +37,12 @@ class Consumer(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Links:
-    """What an outlet publishes through: the bus, its taps, a publisher for each stream that other processes take, and
-    how many of them do."""
+class Network:
+    """What an outlet publishes through besides its links: the bus, its taps, and a publisher for each stream."""
 
     bus: Bus
     taps: TapServer
     publishers: Mapping[str, StreamPublisher]
-    takers: Mapping[str, int]
 
 
 class Outlet:
@@ -57,6 +59,7 @@ class Outlet:
         channel: Channel,
         consumers: Callable[[str], Iterable[Consumer]],
         *,
+        outgoing: Sequence[tuple[Sequence[str], Outgoing]],
         namespace: str,
         static: frozenset[str],
         live: bool,
@@ -67,15 +70,20 @@ class Outlet:
         self.sent = 0
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
         self._live, self._box, self._firings = live, box, firings
-        self._links: Links | None = None
+        self._network: Network | None = None
+        self._links = [link for _, link in outgoing]
+        self._takers: dict[str, list[tuple[Outgoing, int]]] = {}
+        for keys, link in outgoing:
+            for number, key in enumerate(keys):
+                self._takers.setdefault(key, []).append((link, number))
         self._held: list[tuple[str, Envelope | bytes]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
         self._logs: dict[str, list[FiringRecord]] = {}
         self._flushed = time.monotonic()
 
-    def open(self, links: Links) -> None:
+    def open(self, network: Network) -> None:
         """Begins to publish static streams to late joiners, and copies to taps; the rest waits for `release`."""
-        self._links = links
+        self._network = network
 
     def release(self) -> None:
         """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
@@ -85,26 +93,60 @@ class Outlet:
 
     def probe(self) -> None:
         """Sends a probe on every key that another process takes."""
-        for publisher in self._publishers.values():
-            publisher.probe()
+        for stream, takers in self._takers.items():
+            parts = encode_parts(Envelope(Kind.PROBE, stream, 0, 0, 0))
+            for link, channel in takers:
+                if not link.waiting:
+                    link.send(channel, parts, parts_size(parts), droppable=True, block=None)
 
-    @property
-    def _publishers(self) -> Mapping[str, StreamPublisher]:
-        return {} if self._links is None else self._links.publishers
+    def push(self) -> None:
+        """Sends what has waited for room, as far as there is some."""
+        for link in self._links:
+            if link.waiting:
+                link.flush()
+
+    def push_all(self) -> None:
+        """Waits (bounded) until everything has room: before this process leaves."""
+        deadline = time.monotonic() + PUSH_WITHIN
+        while sum(not link.flush() for link in self._links) and time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    def consumer_gone(self, number: int) -> None:
+        """The process at the other end of a link has died."""
+        self._links[number].take_leave()
+
+    def _listened(self, stream: str) -> StreamPublisher | None:
+        """Returns the publisher of a stream to which somebody outside the run subscribes."""
+        publisher = None if self._network is None else self._network.publishers.get(stream)
+        return publisher if publisher is not None and publisher.matched else None
 
     def _send(self, stream: str, envelope: Envelope | bytes) -> None:
-        publisher = self._publishers.get(stream)
-        if publisher is None:
-            return
+        """Sends to every process that takes a stream, and over the network if anybody there subscribes to it."""
+        takers, listened = self._takers.get(stream, ()), self._listened(stream)
         if self._held is not None:
             self._held.append((stream, envelope))
             return
-        assert self._links is not None
-        self.sent += self._links.takers[stream]
-        if isinstance(envelope, bytes):
-            publisher.put_bytes(envelope)
-        else:
-            publisher.put(envelope)
+        if not takers and listened is None:
+            return
+        parts: list[Buffer] = [envelope] if isinstance(envelope, bytes) else encode_parts(envelope)
+        size = parts_size(parts)
+        if listened is not None:
+            listened.put_bytes(b"".join(parts))
+        if not takers:
+            return
+        self.sent += len(takers)
+        block = None
+        if size >= THRESHOLD and isinstance(envelope, Envelope) and self._network is not None:
+            claims = tuple(link.claim for link, _ in takers if link.present())
+            shared = self._network.bus.share(envelope, parts, size, claims) if claims else None
+            if shared is not None:
+                reference, block = shared
+                parts, size = [reference], len(reference)
+        droppable = not (isinstance(envelope, Envelope) and envelope.kind is Kind.END)
+        for link, channel in takers:
+            link.send(channel, parts, size, droppable=droppable, block=block)
+        if self._network is not None:
+            self._network.bus.counted.moved("sent", size)
 
     def message(self, stream: str, entry: Entry) -> None:
         for consumer in self._consumers(stream):
@@ -113,22 +155,21 @@ class Outlet:
         envelope = Envelope(
             Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
         )
-        links = self._links
-        if links is not None and stream in self._static:
-            links.bus.declare_static(stream, encode(envelope))
+        network = self._network
+        if network is not None and stream in self._static:
+            network.bus.declare_static(stream, encode(envelope))
         begun = entry.incarnation != self._next.get(stream, (0, 0))[0]
         self._next[stream] = entry.incarnation, entry.seq + 1
         self._send(stream, envelope)
-        if begun and stream in self._publishers:  # by this a taker knows that the new incarnation is the stream's own
+        if begun:  # by this a taker knows that the new incarnation is the stream's own
             self._send(stream, self._envelope(Kind.FRONTIER, stream, entry.stamp))
-        if links is not None and links.taps.active:
-            links.taps.offer(stream, envelope)
+        if network is not None and network.taps.active:
+            network.taps.offer(stream, envelope)
 
     def frontier(self, stream: str, frontier: int) -> None:
         for consumer in self._consumers(stream):
             consumer.advance(stream, frontier)
-        if stream in self._publishers:
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
+        self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         for consumer in self._consumers(stream):
@@ -183,8 +224,8 @@ class Outlet:
 
     def put_raw(self, stream: str, payload: bytes) -> None:
         """Publishes bytes that are no envelope: a planned fault."""
-        if self._links is not None:
-            self._links.bus.session.put(stream, payload)
+        if self._network is not None:
+            self._network.bus.session.put(stream, payload)
 
 
 def incarnations_of(resumed: Mapping[str, Any], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
 from dataflow.process.network import network_config
 from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
@@ -29,13 +30,13 @@ from dataflow.transport.envelope import MAGIC
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01
 FLUSH_EVERY = 1.0
-DRAIN_QUIET = 0.2
 DRAIN_WITHIN = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class SinkConfig:
-    """What the supervisor tells a sink process to be: `kind` is "record" or "view", `options` belong to the kind."""
+    """What the supervisor tells a sink process to be: `kind` is "record" or "view", `options` belong to the kind,
+    `rings_in` are the keys of each link from another process."""
 
     label: str
     kind: str
@@ -45,6 +46,7 @@ class SinkConfig:
     connect: list[str]
     secret: str
     options: dict[str, Any]
+    rings_in: Sequence[Sequence[str]] = ()
     live: bool = False
 
 
@@ -80,7 +82,7 @@ class SinkProcess:
         self,
         config: SinkConfig,
         channel: Channel,
-        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        inbox: Inbox,
         make_sink: Callable[[SinkConfig, Graph], StreamSink],
     ) -> None:
         self.config, self.channel, self.inbox = config, channel, inbox
@@ -112,19 +114,9 @@ class SinkProcess:
     def open(self) -> None:
         config = self.config
         self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
-        for key in (*self.frontiers, *self._operator_of):
-            self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
         self.channel.send("ready", first=None, steps=None)
-
-    def _receiver(self, key: str) -> Callable[[Any], None]:
-        put = self.inbox.put
-
-        def receive(payload: Any) -> None:
-            put(("envelope", key, payload))
-
-        return receive
 
     def run(self) -> None:
         assert self.sink is not None
@@ -255,20 +247,16 @@ class SinkProcess:
             case "leave":
                 self._outcome = fields["outcome"]
                 self._left = True
-                if self._outcome != "complete" or any(self._lacking.values()):
-                    self._drain()
+                self._drain()
             case "lost":
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")
 
     def _drain(self) -> None:
-        """Takes what is still on its way after the run has ended early."""
+        """Takes what has arrived: all others have left, or nobody can say whether they have."""
         deadline = time.monotonic() + DRAIN_WITHIN
-        while time.monotonic() < deadline:
-            try:
-                item = self.inbox.get(timeout=DRAIN_QUIET)
-            except queue.Empty:
-                return
+        while not self.inbox.empty() and time.monotonic() < deadline:
+            item = self.inbox.get_nowait()
             if item[0] == "envelope":
                 self._handle(item)
 

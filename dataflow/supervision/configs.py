@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.supervision.plan import HostPlan, RunPlan
+from dataflow.supervision.rings import pairs_of
 
 Config = tuple[str, dict[str, Any]]
 """Kind of process ("host" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
@@ -21,17 +22,29 @@ def configurations(
     first = next(iter(hosts))
     configs: dict[str, Config] = {}
     for label, host in hosts.items():
-        common = _common(plan, host, endpoints) | {"secret": secret}
+        common = _common(plan, host, hosts, endpoints) | {"secret": secret}
         if host.sink is None:
             configs[label] = _host(plan, host, common, endpoints, label == first)
+            pairs = pairs_of(plan.graph, hosts)
+            configs[label][1]["rings_out"] = [list(keys) for (maker, _), keys in pairs.items() if maker == label]
         else:
             configs[label] = _sink(plan, host, common)
     return configs
 
 
-def _common(plan: RunPlan, host: HostPlan, endpoints: Mapping[str, str]) -> dict[str, Any]:
+def _common(
+    plan: RunPlan, host: HostPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str]
+) -> dict[str, Any]:
     connect = [endpoints[up] for up in host.upstream]
-    return {"label": host.label, "graph": plan.graph.to_json(), "connect": connect, "live": plan.live}
+    pairs = pairs_of(plan.graph, hosts)
+    rings_in = [list(keys) for (_, consumer), keys in pairs.items() if consumer == host.label]
+    common = {
+        "label": host.label,
+        "graph": plan.graph.to_json(),
+        "connect": connect,
+        "live": plan.live,
+    }
+    return common | {"rings_in": rings_in}
 
 
 def _sink(plan: RunPlan, host: HostPlan, common: Mapping[str, Any]) -> Config:

@@ -3,10 +3,13 @@
 from dataflow.transport.bus import Bus, Token
 from dataflow.transport.codec import decode, decode_head, encode, encode_parts
 from dataflow.transport.envelope import DecodeError, Envelope, Head, Kind, Limits
+from dataflow.transport.links import Incoming, Outgoing, make_board
 from dataflow.transport.network import NetworkConfig, NetworkError
 from dataflow.transport.publisher import BusError, StreamPublisher
 from dataflow.transport.registry import RegistryError, RunningGraph, register, running
+from dataflow.transport.ring import make_ring
 from dataflow.transport.seal import new_secret
+from dataflow.transport.shared import PoolReader
 from dataflow.transport.sockets import Reservation, reserve_endpoints
 from dataflow.transport.tap_client import TapClient, TapMessage
 from dataflow.transport.tap_server import TapServer
@@ -18,10 +21,13 @@ __all__ = [
     "DecodeError",
     "Envelope",
     "Head",
+    "Incoming",
     "Kind",
     "Limits",
     "NetworkConfig",
     "NetworkError",
+    "Outgoing",
+    "PoolReader",
     "RegistryError",
     "Reservation",
     "RunningGraph",
@@ -35,6 +41,8 @@ __all__ = [
     "decode_head",
     "encode",
     "encode_parts",
+    "make_board",
+    "make_ring",
     "new_secret",
     "register",
     "reserve_endpoints",

@@ -23,7 +23,7 @@ from dataflow.transport.counters import Counters
 from dataflow.transport.envelope import Buffer, DecodeError, Envelope
 from dataflow.transport.keys import RUNTIME, shared_key, static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
-from dataflow.transport.pool import BoardReader, SharedPool
+from dataflow.transport.pool import Block, BoardReader, Claim, SharedPool
 from dataflow.transport.publisher import BusError, Sharing, StreamPublisher, undeclare
 from dataflow.transport.seal import Seal
 from dataflow.transport.shared import SUPPORTED, Board, PoolReader, SharedMemoryError, is_reference, machine
@@ -173,10 +173,12 @@ class Bus:
             self.counted.add("unresolved")
             return payload
 
-    def _share(
-        self, envelope: Envelope, parts: list[Buffer], size: int, claims: tuple[BoardReader, ...]
-    ) -> bytes | None:
-        """Puts an envelope into the pool for `claims`; returns its reference, or None without room (counted)."""
+    def share(
+        self, envelope: Envelope, parts: list[Buffer], size: int, claims: tuple[Claim, ...]
+    ) -> tuple[bytes, Block] | None:
+        """Puts an envelope into shared memory for `claims`; returns its reference and its block, or None (counted)."""
+        if not self._shares:
+            return None
         with self._lock:
             if self._pool is None:
                 self._pool = SharedPool(self.config.pool_bytes)
@@ -185,7 +187,14 @@ class Bus:
                 self.counted.add("shared_full")
                 return None
             self.counted.moved("shared", size)
-            return self._pool.reference(encode_head(envelope), block, size)
+            return self._pool.reference(encode_head(envelope), block, size), block
+
+    def _share(
+        self, envelope: Envelope, parts: list[Buffer], size: int, claims: tuple[BoardReader, ...]
+    ) -> bytes | None:
+        """Puts an envelope into the pool for `claims`; returns its reference, or None without room (counted)."""
+        shared = self.share(envelope, parts, size, claims)
+        return None if shared is None else shared[0]
 
     def _keep(self, token: Token) -> Token:
         """A declaration lasts until it is closed, also when the caller does not keep its token."""

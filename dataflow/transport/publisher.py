@@ -54,6 +54,13 @@ class StreamPublisher:
         self._sharing = sharing
         self._blocked = blocked
         self._probes = 0
+        self.matched = False
+        """Whether anybody subscribes to the key."""
+        self._matching = publisher.declare_matching_listener(zenoh.handlers.Callback(self._on_matching, indirect=False))
+        self.matched = bool(publisher.matching_status.matching)
+
+    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
+        self.matched = bool(status.matching)
 
     def put(self, envelope: Envelope) -> int:
         """Publishes an envelope, through shared memory where all consumers can take it from there; returns its bytes.

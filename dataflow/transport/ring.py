@@ -1,9 +1,10 @@
 """A ring in shared memory from one process to another, with an eventfd that wakes the reader.
 
 One writer, one reader, each on one thread. Whoever starts both makes the memory (a memfd) and hands it down, so nothing
-else on the machine can write to it: what comes out of a ring comes from the process at its other end. Four words are
+else on the machine can write to it: what comes out of a ring comes from the process at its other end. Five words are
 shared, each with one writer: `head` and `tail` count the bytes ever written and read, `asleep` is set by a reader that
-is about to wait, `blocked` by a writer that found no room. A frame counts once `head` includes it, which is written
+is about to wait, `blocked` by a writer that found no room,
+`readers` counts the readers that there were. A frame counts once `head` includes it, which is written
 last; so a writer that is killed leaves whole frames, and its successor goes on with the same ring. A reader that takes
 the place of another skips what was meant for that one.
 
@@ -20,7 +21,7 @@ from collections.abc import Sequence
 
 CAPACITY = 1 << 20
 _HEADER = 4096
-_HEAD, _TAIL, _ASLEEP, _BLOCKED = (64 * k // 8 for k in range(4))  # a cache line each
+_HEAD, _TAIL, _ASLEEP, _BLOCKED, _READERS = (64 * k // 8 for k in range(5))  # a cache line each
 _FRAME = struct.Struct("<II")
 _SKIP = 0xFFFFFFFF
 
@@ -72,6 +73,10 @@ class RingWriter(_End):
         """Whether a frame of `size` bytes can pass at all, once there is room: it may take a quarter of the ring."""
         return _room(size) <= self.capacity // 4
 
+    def reader(self) -> int:
+        """Returns which reader is at the other end, by number; 0: there was none yet."""
+        return int(self._words[_READERS])
+
     def put(self, channel: int, parts: Sequence[Bytes]) -> bool:
         """Writes one frame, on a numbered channel of this ring; False, and nothing, when there is no room for it now.
 
@@ -118,6 +123,8 @@ class RingReader(_End):
         self._wake = wake
         self._tail = self._words[_HEAD]
         self._words[_TAIL] = self._tail
+        self._words[_READERS] += 1
+        self._words[_BLOCKED] = 0
 
     def take(self, limit: int) -> list[tuple[int, bytes]]:
         """Up to `limit` frames that are there, in order: (channel, content). Raises `RingError` for a broken ring."""

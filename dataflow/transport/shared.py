@@ -88,11 +88,13 @@ def open_memory(pid: int, descriptor: int, name: str) -> mmap.mmap:
 class Board:
     """What one subscription has released. Written here only, read by the publisher."""
 
-    def __init__(self) -> None:
-        """Makes the memory; raises `SharedMemoryError`."""
-        self.descriptor = make_memory(BOARD_NAME + secrets.token_hex(4), BOARD_BYTES)
+    def __init__(self, descriptor: int | None = None) -> None:
+        """Maps the memory that was handed down, or makes its own; raises `SharedMemoryError`."""
+        own = descriptor is None
+        self.descriptor = descriptor or make_memory(BOARD_NAME + secrets.token_hex(4), BOARD_BYTES)
         self._cells = memoryview(mmap.mmap(self.descriptor, BOARD_BYTES)).cast("Q")
-        protect(self.descriptor)
+        if own:
+            protect(self.descriptor)
         self._base = 0
         self._pool: mmap.mmap | None = None
 

@@ -1,0 +1,43 @@
+"""What a process inherits from the supervisor, by the order of the descriptors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dataflow.transport import Incoming, Outgoing, PoolReader
+
+BACKLOG = (16, 8)
+"""How many windows of messages and of bytes may wait for operators that no source waits for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Handed:
+    """The eventfd that wakes this process, its links to and from others, and the memory for its firing records."""
+
+    wake: int
+    outgoing: Sequence[tuple[Sequence[str], Outgoing]]
+    incoming: Sequence[Incoming]
+    box: int | None
+
+
+def take_handed(descriptors: Sequence[int], config: Mapping[str, Any]) -> Handed:
+    """Opens what was handed down.
+
+    The order: this process's eventfd; ring, eventfd of the other process and board of each link of the configuration's
+    `rings_out`, then of its `rings_in`; last, for an operator process of a live run, the memory for its firing records.
+    """
+    rest = iter(descriptors)
+    wake = next(rest)
+    most = None
+    if config["live"]:
+        most = tuple(size * times for size, times in zip(config.get("window", (256, 64 << 20)), BACKLOG, strict=True))
+    outgoing = [(keys, Outgoing(*_three(rest), most)) for keys in config.get("rings_out", ())]
+    pools = PoolReader()
+    incoming = [Incoming(*_three(rest), keys, pools) for keys in config["rings_in"]]
+    return Handed(wake, outgoing, incoming, next(rest, None))
+
+
+def _three(descriptors: Iterator[int]) -> tuple[int, int, int]:
+    return next(descriptors), next(descriptors), next(descriptors)

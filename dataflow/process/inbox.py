@@ -1,0 +1,76 @@
+"""The inbox of a process: what its threads put there, and what arrives through its rings.
+
+One thread takes, any may put. Whoever waits here waits for one eventfd: the writers of the rings, the readers of the
+rings that this process writes to (when they were full and have room again) and its own threads all wake it by that.
+"""
+
+from __future__ import annotations
+
+import os
+import queue
+import select
+import time
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+from dataflow.transport import Incoming
+
+Item = tuple[Any, ...]
+
+
+class Inbox:
+    """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own."""
+
+    def __init__(self, wake: int | None = None, incoming: Sequence[Incoming] = ()) -> None:
+        self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if wake is None else wake
+        self._incoming = tuple(incoming)
+        self._items: deque[Item] = deque()
+        self._asleep = False
+
+    def put(self, item: Item) -> None:
+        """Appends an item; on any thread."""
+        self._items.append(item)
+        if self._asleep:
+            os.eventfd_write(self.wake, 1)
+
+    def get(self, timeout: float) -> Item:
+        """Returns the next item, or raises `queue.Empty` when there is none in time, or something else woke it."""
+        if self.empty() and timeout > 0:
+            self._asleep = True
+            if not self._items and not sum(not ring.sleep() for ring in self._incoming):
+                select.select([self.wake], [], [], timeout)
+            self._asleep = False
+            self._forget_wakes()
+        return self.get_nowait()
+
+    def get_nowait(self) -> Item:
+        """Returns the next item; raises `queue.Empty` when there is none."""
+        if not self._items and self.empty():
+            raise queue.Empty
+        return self._items.popleft()
+
+    def get_until(self, deadline: float) -> Item:
+        """Returns the next item, or raises `queue.Empty` when there is none by `deadline` (s, monotonic)."""
+        while True:
+            try:
+                return self.get(max(0.0, deadline - time.monotonic()))
+            except queue.Empty:
+                if time.monotonic() >= deadline:
+                    raise
+
+    def empty(self) -> bool:
+        """Whether there is nothing, in the rings either."""
+        for ring in self._incoming:
+            for key, payload in ring.take():
+                self._items.append(("envelope", key, payload))
+        return not self._items
+
+    def qsize(self) -> int:
+        return len(self._items)
+
+    def _forget_wakes(self) -> None:
+        try:
+            os.eventfd_read(self.wake)
+        except BlockingIOError:
+            return
