@@ -1,9 +1,9 @@
 """The links between two processes of one machine: a ring for what is said, a board for what shared memory is used.
 
 A large message lies in the pool and passes as a reference; where the pool has no room, it passes whole: what does not
-fit a quarter of the ring in pieces, in its place in the order. What the ring has no room for waits here, in order. A run
-that loses nothing bounds that by its windows. In a live run it is bounded here: beyond `most`, the oldest messages are
-dropped, and the consumer sees a gap in their numbers; ends of streams are kept.
+fit a quarter of the ring in pieces, in its place in the order. What the ring has no room for waits here, in order.
+A run that loses nothing bounds that by its windows. In a live run it is bounded here: beyond `most`, the oldest
+messages are dropped, and the consumer sees a gap in their numbers; ends of streams are kept.
 """
 
 from __future__ import annotations

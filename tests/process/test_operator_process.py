@@ -46,7 +46,7 @@ class OneProcess:
         config = ProcessConfig(
             "last", graph.to_json(), ["last"], {}, [STREAM], [], [], "secret", live=live, firings=True
         )
-        self.process = OperatorProcess(config, self.channel, self.inbox, box)  # type: ignore[arg-type]
+        self.process = OperatorProcess(config, self.channel, self.inbox, box=box)  # type: ignore[arg-type]
         self.process.make()
         for runner in self.process.runners.all:
             runner.setup()
