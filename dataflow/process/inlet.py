@@ -91,14 +91,18 @@ class Inlet:
         return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder())
 
     def _take_static(self, stream: str, envelope: Envelope) -> None:
-        """The one message and the end of a static stream; both come again when its operator was restarted."""
+        """Takes the one message of a static stream, if it has one, and its end; both come again after a restart.
+
+        An end whose number is 0 says that there is no message.
+        """
         known = stream in self._seen
-        if envelope.kind is not Kind.MESSAGE and not (envelope.kind is Kind.END and known):
+        ends = envelope.kind is Kind.END and (known or not envelope.seq)
+        if envelope.kind is not Kind.MESSAGE and not ends:
             self.refuse(stream, _described(envelope))
             return
         self.received += 1
         self._seen.add(stream)
-        if envelope.kind is Kind.END or not known:
+        if ends or not known:
             self._deliver(stream, envelope)
 
     def _take_in_order(self, stream: str, envelope: Envelope) -> None:

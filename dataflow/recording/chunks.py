@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections import OrderedDict
@@ -17,6 +18,8 @@ from dataflow.recording.rawfile import RawFile
 CACHE_BYTES = 256 * 2**20
 MAX_RATIO = 300
 """Beyond what LZ4 can do and what zstd does on sensor data: only a file made to do harm expands so much for long."""
+LZ4_AT_ONCE = 2**26
+"""Bytes that are asked of the LZ4 library at once: it takes twice as many."""
 UNDOUBTED_BYTES = 2**31
 """Expanded bytes of a file whose ratio is not looked at."""
 
@@ -131,5 +134,19 @@ class Chunks:
                 with self._decompressor.stream_reader(packed, read_across_frames=True) as reader:
                     return reader.read(size + 1)
             case "lz4":
-                return bytes(lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)) if size else b""
+                return _unpack_lz4(packed, size + 1) if size else b""
         raise RecordingError(f"{self._file.path}: chunks are compressed with {compression!r}; known: zstd, lz4, none")
+
+
+def _unpack_lz4(packed: memoryview, most: int) -> bytes:
+    """The data of a frame, up to `most` bytes of it."""
+    decompressor = lz4.frame.LZ4FrameDecompressor()
+    unpacked = io.BytesIO()
+    rest: memoryview | bytes = packed
+    while not decompressor.eof and (left := most - unpacked.tell()):
+        part = decompressor.decompress(rest, max_length=min(left, LZ4_AT_ONCE))
+        if not part and decompressor.needs_input:
+            break
+        unpacked.write(part)
+        rest = b""
+    return unpacked.getvalue()

@@ -32,14 +32,16 @@ class DrainLimit(Part):
         reached = [run.status.operators[n].done for n, node in run.graph.nodes.items() if node.source]
         front = max((stamp for stamp in reached if stamp not in (NEVER, FOREVER)), default=None)
         upto = "" if front is None else f", sources had given up to {front}"
+        left = [process for process in run.working() if process.report is None]
+        silent = [f"{process.describe()} gives no sign of life" for process in left if process.silent]
         behind = [
             self._at(name)
-            for process in run.working()
-            if process.report is None
+            for process in left
+            if not process.silent
             for name in run.consumers(process)
             if process.done.get(name) != FOREVER
         ]
-        return ("; ".join(behind) or "; ".join(p.describe() for p in run.working() if p.report is None)) + upto
+        return ("; ".join(silent + behind) or "; ".join(process.describe() for process in left)) + upto
 
     def _at(self, name: str) -> str:
         counts = self.run.status.operators[name]

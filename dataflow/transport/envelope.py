@@ -27,9 +27,10 @@ class Kind(IntEnum):
     MESSAGE = 1
     """A message; `stamp` is the message's. It implies the frontier `stamp`."""
     FRONTIER = 2
-    """No later message has a stamp ≤ `stamp`. `incarnation` and `seq` mean nothing."""
+    """No later message has a stamp ≤ `stamp`. `incarnation` and `seq` are the next message's."""
     END = 3
-    """Nothing follows: `stamp` is the final one, `reason` says why. `incarnation` and `seq` mean nothing."""
+    """Nothing follows: `stamp` is the final one, `reason` says why. `incarnation` and `seq` are those that the next
+    message would have had."""
     PROBE = 5
     """Start barrier: carries no data. `seq` is the probe's number."""
     REFERENCE = 6

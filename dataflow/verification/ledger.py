@@ -27,7 +27,7 @@ class Account:
 
     `unaccounted` were stored, or taken by another operator, and no firing record made them; `not_stored` were made by a
     record and are not in a stream that was recorded. `lost` calls follow a gap in the records. `finished`: the last
-    record is that of `finish()`.
+    record is that of `finish()`, but for the `setup()` of a process that was restarted when the node had ended.
     """
 
     unaccounted: int
@@ -77,7 +77,7 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
                     made[stream].add((record.incarnation, emission.seq))
             if (record.incarnation, record.index) > last:
                 last = (record.incarnation, record.index)
-                finished[name] = record.kind == "finish"
+                finished[name] = record.kind == "finish" or (finished[name] and record.kind == "setup")
         if name in lost:
             lost[name] = whole(log.of(name))[1]
     accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}

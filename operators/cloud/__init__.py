@@ -1,5 +1,8 @@
 """Operators that make and change point clouds."""
 
 from operators.cloud.cloud_builder import CloudBuilder
+from operators.cloud.cloud_filter import CloudFilter
+from operators.cloud.clusterer import Clusterer
+from operators.cloud.plane_segmenter import PlaneSegmenter
 
-__all__ = ["CloudBuilder"]
+__all__ = ["CloudBuilder", "CloudFilter", "Clusterer", "PlaneSegmenter"]

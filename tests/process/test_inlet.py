@@ -107,10 +107,20 @@ def test_what_nobody_reads_is_counted_instead_of_waited_for() -> None:
     assert read == ["third (2 more like it before)"]
 
 
+def test_a_static_stream_without_a_message_ends() -> None:
+    """As that of a sensor which is off."""
+    inflow = Inflow(static=(STREAM,))
+
+    inflow.take(end(0, -1))
+
+    assert inflow.delivered == [(Kind.END, 0)]
+    assert not inflow.inlet.statics_missing([STREAM])
+
+
 def test_a_static_stream_is_taken_once_and_its_end_only_after_it() -> None:
     inflow = Inflow(static=(STREAM,))
 
-    inflow.take(end(0, 5), message(0), end(1, 1000), message(0, incarnation=1))
+    inflow.take(end(1, 5), message(0), end(1, 1000), message(0, incarnation=1))
 
     assert inflow.delivered == [(Kind.MESSAGE, 0), (Kind.END, 1)]
     assert (inflow.inlet.received, inflow.inlet.misplaced) == (3, 1)

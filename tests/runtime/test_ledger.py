@@ -12,11 +12,12 @@ from dataflow.graph import Graph, load_graph
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.layout import OUTCOME, RESERVED_METADATA
 from dataflow.records.comparison import Verification
-from dataflow.records.firing import FiringRecord, consecutive, encode_batch
-from dataflow.records.reading import recorded_firings
-from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.records.firing import FiringRecord, Kind, consecutive, encode_batch
+from dataflow.records.reading import FiringLog, recorded_firings
+from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.run import run
 from dataflow.verification.complete import complete
+from dataflow.verification.ledger import read_ledger
 from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 
@@ -188,13 +189,28 @@ def test_a_sink_is_compared_by_what_it_sums_up(recorded: Path) -> None:
     assert of(fed, "sum").verdict == "identical"  # given the recorded inputs
 
 
+@pytest.mark.parametrize(("more", "finished"), [(("setup",), True), (("setup", "fire"), False)])
+def test_a_process_that_was_restarted_after_its_operators_had_ended_owes_no_second_end(
+    recorded: Path, more: tuple[Kind, ...], finished: bool
+) -> None:
+    with Recording(recorded) as recording:
+        graph = recorded_graph(recording)
+        known = FiringLog.read(recording)
+        batches = {name: list(known.batches(name)) for name in known.operators}
+        again = [FiringRecord("sum", 1, index, kind, 10**10) for index, kind in enumerate(more)]
+        batches["sum"].append(encode_batch(again))
+        account = read_ledger(recording, graph, FiringLog(batches, "test"), ["sum"]).accounts["sum"]
+    assert account.finished is finished
+
+
 def breaking(folder: Path, use: str, how: str) -> Graph:
     """A live graph with an operator that fails once, `how`, and is started again."""
     file = folder / f"{use.rpartition(':')[2]}.yaml"
     file.write_text(
         "graph: errors\nnamespace: test\noperators:\n"
         "  left: {use: runtime_operators:Counter, params: {count: 40, period: 2000000}}\n"
-        f"  broken: {{use: {use}, params: {{how: {how}}}, inputs: {{x: left/fast}}, live: {{restart: {{max: 3}}}}}}\n"
+        f"  broken: {{use: {use}, params: {{how: {how}}}, inputs: {{x: left/fast}}, "
+        "live: {queue: block, restart: {max: 3}}}\n"
     )
     return load_graph(file, live=True)
 

@@ -298,6 +298,18 @@ def test_ctrl_c_while_a_process_is_away_ends_the_run() -> None:
     assert play.failure() == "interrupted while host 'smooth' was to be started again"
 
 
+def test_what_did_not_drain_because_a_process_is_silent_is_laid_to_that() -> None:
+    play = Play(LEFT, SUM, live=True).starts()
+    play.tell(play.progress("sum", {"sum": 9}))
+    play.wait(1.0)
+    play.deaf.add("left")
+    play.wait(5.0)
+    play.stops()
+    play.wait(80.0)
+
+    assert "not everything was drained within 60 s: host 'left' gives no sign of life; sum was at" in play.failure()
+
+
 def test_records_of_a_failed_run_reach_the_recorder_when_the_others_have_left() -> None:
     play = robot(record="run.mcap").starts()
     play.keeps(record("after", 0, 5))

@@ -9,6 +9,7 @@ import pytest
 from transport_envelopes import carrying
 
 from dataflow.client import attach
+from dataflow.graph import load_text
 from dataflow.messages import DepthImage
 from dataflow.transport import Bus, RunningGraph, TapServer, encode
 
@@ -21,7 +22,8 @@ def test_a_tap_begins_with_the_statics_that_exist_and_waits_for_no_process_that_
     """The time allowed is longer than the test's: a wait for something that never comes would not end."""
     monkeypatch.setattr(attach, "CONNECT_WITHIN", 1000.0)
     host = open_bus(listen=(endpoint,))
-    found = RunningGraph("robot", "robot1", 1, 0.0, (endpoint,), 0.0, {})
+    graph = load_text("graph: robot\noperators: {camera: {use: operators.sources:SyntheticRgbd}}")
+    found = RunningGraph("robot", "robot1", 1, 0.0, (endpoint,), 0.0, graph.to_json())
     with TapServer(host, "robot1"):
         with attach.tap(found, ["**"]) as client:
             assert client.take(0.0) is None

@@ -1,0 +1,185 @@
+"""Clouds made smaller and cleaner, with normals."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Diagnostics, PointCloud
+from dataflow.messages.diagnostics import Level
+from dataflow.operator import In, Operator, Out, Param
+from operators.cloud.filtering import Voxels, finite, in_box, in_range, radius_inliers, statistical_inliers
+from operators.cloud.normals import FEWEST, estimate_normals
+
+Corner = tuple[float, float, float]
+
+
+class CloudFilter(Operator):
+    """Keeps the points of a range and a box, thins them by a voxel grid, removes outliers and estimates normals.
+
+    The steps run in that order, each unless its parameter switches it off. A voxel's point is the mean of its points,
+    as are its colour, intensity and time; laser rings have no mean and are left out. Normals face the origin of the
+    cloud's frame, where the sensor is. Points with NaN or infinite coordinates are dropped and counted.
+
+    Methods: outliers by Rusu et al., "Towards 3D point cloud based object maps", 2008; normals by Hoppe et al.,
+    "Surface reconstruction from unorganized points", 1992.
+    """
+
+    cloud: In[PointCloud] = In(doc="points in the frame of their sensor")
+    filtered: Out[PointCloud] = Out(doc="what is kept")
+    status: Out[Diagnostics] = Out(doc="points given, dropped by every step, and kept; a warning where none is left")
+
+    min_range: float = Param(0.0, ge=0, doc="nearest distance from the origin that is kept", unit="m")
+    max_range: float = Param(100.0, gt=0, doc="farthest distance from the origin that is kept", unit="m")
+    lower: Corner | None = Param(None, doc="smallest x, y, z of the box that is kept; no box if none", unit="m")
+    upper: Corner | None = Param(None, doc="largest x, y, z of the box that is kept; no box if none", unit="m")
+    voxel: float = Param(0.0, ge=0, live=True, doc="side of the voxels; 0 keeps all points", unit="m")
+    outlier_neighbours: int = Param(
+        0, ge=0, le=200, live=True, doc="neighbours whose mean distance tells a statistical outlier; 0 removes none"
+    )
+    outlier_ratio: float = Param(
+        2.0, gt=0, live=True, doc="standard deviations by which that distance may exceed the cloud's mean"
+    )
+    radius: float = Param(0.0, ge=0, live=True, doc="radius in which a point needs others; 0 removes none", unit="m")
+    radius_neighbours: int = Param(3, ge=1, live=True, doc="how many others it needs there")
+    normal_neighbours: int = Param(0, ge=0, le=200, doc="points that a normal is estimated from; 0 for none")
+    normal_radius: float = Param(0.3, gt=0, live=True, doc="they lie within this radius", unit="m")
+
+    def setup(self) -> None:
+        """Raises ValueError for a range or box that can hold no point, and for too few neighbours of a normal."""
+        if self.min_range >= self.max_range:
+            raise ValueError(f"min_range {self.min_range} m must be below max_range {self.max_range} m")
+        if (self.lower is None) != (self.upper is None):
+            raise ValueError("a box needs both lower and upper")
+        if self.lower is not None and self.upper is not None and not np.less(self.lower, self.upper).all():
+            raise ValueError(f"the box from {self.lower} to {self.upper} holds no point: lower must be below upper")
+        if 0 < self.normal_neighbours < FEWEST:
+            raise ValueError(
+                f"normal_neighbours is {self.normal_neighbours}: a normal needs {FEWEST} points, 0 is none"
+            )
+        self._dropped: Counter[str] = Counter()
+        self._given = self._kept = self._clouds = self._empty = 0
+
+    def process(self, cloud: PointCloud) -> dict[str, Any]:
+        dropped: dict[str, int] = {}
+        kept = cloud
+        if not (usable := finite(kept.points)).all():
+            kept = _select(kept, usable)
+        dropped["not finite"] = cloud.count - kept.count
+        for step, chosen in (("range", self._in_range), ("box", self._in_box)):
+            before = kept.count
+            kept = _select(kept, chosen(kept.points))
+            dropped[step] = before - kept.count
+        merged = kept.count
+        if self.voxel and kept.count:
+            kept = _thinned(kept, self.voxel)
+        dropped["voxel"] = merged - kept.count
+        for step, chosen in (("statistical outlier", self._statistical), ("radius outlier", self._radius)):
+            before = kept.count
+            kept = _select(kept, chosen(kept.points))
+            dropped[step] = before - kept.count
+        if self.normal_neighbours:
+            normals = estimate_normals(
+                kept.points.astype(np.float64),
+                neighbours=self.normal_neighbours,
+                radius=self.normal_radius,
+                viewpoint=np.zeros(3),
+            )
+            kept = kept.replace(normals=normals.astype(np.float32))
+        self._count(cloud.count, dropped, kept.count)
+        return {"filtered": kept, "status": _status(cloud, dropped, kept.count)}
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "dropped": dict(self._dropped),
+            "counts": [self._given, self._kept, self._clouds, self._empty],
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._dropped = Counter(state["dropped"])
+        self._given, self._kept, self._clouds, self._empty = (int(n) for n in state["counts"])
+
+    def summary(self) -> Mapping[str, float | int]:
+        steps = {f"dropped, {step}": count for step, count in self._dropped.items()}
+        return {
+            "clouds": self._clouds,
+            "clouds left empty": self._empty,
+            "points": self._given,
+            "points kept": self._kept,
+        } | steps
+
+    def _in_range(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        return in_range(points, self.min_range, self.max_range)
+
+    def _in_box(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        if self.lower is None or self.upper is None:
+            return np.ones(len(points), np.bool_)
+        return in_box(points, np.array(self.lower), np.array(self.upper))
+
+    def _statistical(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        if not self.outlier_neighbours:
+            return np.ones(len(points), np.bool_)
+        return statistical_inliers(points, self.outlier_neighbours, self.outlier_ratio)
+
+    def _radius(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+        if not self.radius:
+            return np.ones(len(points), np.bool_)
+        return radius_inliers(points, self.radius, self.radius_neighbours)
+
+    def _count(self, given: int, dropped: Mapping[str, int], kept: int) -> None:
+        self._dropped.update(dropped)
+        self._given += given
+        self._kept += kept
+        self._clouds += 1
+        self._empty += kept == 0
+
+
+def _select(cloud: PointCloud, chosen: NDArray[np.bool_]) -> PointCloud:
+    """Returns the chosen points with all that is known of them."""
+    if chosen.all():
+        return cloud
+    fields = ("colors", "intensities", "rings", "time_offsets", "normals")
+    known = {name: getattr(cloud, name) for name in fields}
+    return cloud.replace(
+        points=cloud.points[chosen],
+        **{name: values[chosen] for name, values in known.items() if values is not None},
+    )
+
+
+def _thinned(cloud: PointCloud, size: float) -> PointCloud:
+    """Returns one point per voxel: the mean of what is in it."""
+    voxels = Voxels.by_size(cloud.points, size)
+    colors = None if cloud.colors is None else np.rint(voxels.means(cloud.colors)).astype(np.uint8)
+    intensities = None if cloud.intensities is None else voxels.means(cloud.intensities).astype(np.float32)
+    times = None if cloud.time_offsets is None else voxels.means(cloud.time_offsets).astype(np.float32)
+    return PointCloud(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        points=voxels.means(cloud.points).astype(np.float32),
+        colors=colors,
+        intensities=intensities,
+        time_offsets=times,
+    )
+
+
+def _status(cloud: PointCloud, dropped: Mapping[str, int], kept: int) -> Diagnostics:
+    if not cloud.count:
+        text = "the cloud is empty"
+    elif not kept:
+        text = f"none of {cloud.count} points is left; most went by: {max(dropped, key=lambda step: dropped[step])}"
+    else:
+        text = f"{kept} of {cloud.count} points kept"
+    pairs = {"points": cloud.count} | {f"dropped, {step}": n for step, n in dropped.items()} | {"kept": kept}
+    return Diagnostics(
+        stamp=cloud.stamp,
+        names=("cloud_filter",),
+        messages=(text,),
+        levels=np.array([Level.OK if kept else Level.WARN], np.uint8),
+        keys=tuple(pairs),
+        values=tuple(str(n) for n in pairs.values()),
+        owners=np.zeros(len(pairs), np.int32),
+    )

@@ -1,0 +1,167 @@
+"""The things in a cloud: clusters with boxes and shapes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import (
+    Boxes3D,
+    Clusters,
+    Diagnostics,
+    FeatureVector,
+    Odometry,
+    PointCloud,
+    Pose,
+    Transforms,
+)
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.clustering import Shape, dbscan, kept, shape_of
+from operators.cloud.filtering import Voxels, finite
+from operators.cloud.gravity import gravity, unit
+
+FEATURES = "cluster shape: volume (m³), linearity, planarity, sphericity"
+"""The model's name on the port `features`."""
+
+
+class Clusterer(Operator):
+    """Divides a cloud into clusters of points that are near each other, and describes each: DBSCAN on its voxels.
+
+    Meant for what a `PlaneSegmenter` leaves. Boxes stand upright on gravity, which comes from `pose` as there. With
+    `core_points` 1 the clustering is Euclidean. Equal input gives clusters in the same order; their numbers are no
+    identity over time.
+
+    Method: Ester et al., "A density-based algorithm for discovering clusters", 1996; shapes from eigenvalues as in West
+    et al., "Context-driven automated target detection in 3D data", 2004.
+    """
+
+    cloud: In[PointCloud] = In(doc="points in the frame of their sensor")
+    pose: Sampled[Pose | Odometry] = Sampled(required=False, doc="the sensor or its robot in a frame whose z is up")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
+    )
+    clusters: Out[Clusters] = Out(doc="the cluster of every point of the cloud, with centroids and bounds")
+    boxes: Out[Boxes3D] = Out(doc="an upright box around each cluster, in the same order, with its number of points")
+    features: Out[FeatureVector] = Out(
+        doc="volume of the convex hull in m³, linearity, planarity and sphericity of each cluster, in the same order"
+    )
+    status: Out[Diagnostics] = Out(doc="clusters, points in them, and points in none; a warning for an empty cloud")
+
+    up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
+    voxel: float = Param(0.02, gt=0.001, doc="side of the voxels that are clustered", unit="m")
+    reach: float = Param(0.12, gt=0, live=True, doc="points so near are neighbours", unit="m")
+    core_points: int = Param(5, ge=1, live=True, doc="points within reach that make a core point, its own included")
+    min_points: int = Param(30, ge=1, live=True, doc="fewest points of a cluster")
+    max_points: int = Param(1_000_000, ge=1, live=True, doc="most points of a cluster")
+
+    def setup(self) -> None:
+        """Raises ValueError for an up of length 0."""
+        self._up = unit(self.up)
+        self._counts: Counter[str] = Counter()
+
+    def process(
+        self, cloud: PointCloud, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
+    ) -> dict[str, Any]:
+        """Raises ValueError where no transform relates the cloud's frame to that of the pose."""
+        up, _ = gravity(cloud, pose, extrinsics, self._up)
+        usable = np.flatnonzero(finite(cloud.points))
+        points = cloud.points[usable].astype(np.float64)
+        labels = np.full(cloud.count, -1, np.int32)
+        labels[usable] = self._labels(cloud.points[usable])
+        own = labels[usable]
+        shapes = [shape_of(points[own == k], up) for k in range(int(labels.max(initial=-1)) + 1)]
+        sizes = np.bincount(labels[labels >= 0], minlength=len(shapes)).astype(np.int64)
+        counts = {
+            "points": cloud.count,
+            "not finite": cloud.count - len(usable),
+            "clusters": len(shapes),
+            "points in clusters": int(sizes.sum()),
+            "points in none": len(usable) - int(sizes.sum()),
+        }
+        self._counts.update(counts | {"clouds": 1, "clouds without clusters": not shapes})
+        return {
+            "clusters": _clusters(cloud, labels, shapes),
+            "boxes": _boxes(cloud, sizes, shapes),
+            "features": _features(cloud, shapes),
+            "status": _status(cloud.stamp, counts),
+        }
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return dict(self._counts)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._counts = Counter({key: int(count) for key, count in state.items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return dict(self._counts)
+
+    def _labels(self, points: NDArray[np.float32]) -> NDArray[np.int32]:
+        """Returns the cluster (N,) of each point, -1 for none."""
+        if not len(points):
+            return np.zeros(0, np.int32)
+        voxels = Voxels.by_size(points, self.voxel)
+        of_voxel = dbscan(voxels.means(points), self.reach, self.core_points, voxels.counts)
+        labels = of_voxel[voxels.of]
+        sizes = np.bincount(labels[labels >= 0], minlength=int(labels.max(initial=-1)) + 1).astype(np.int64)
+        return kept(labels, sizes, self.min_points, self.max_points)
+
+
+def _clusters(cloud: PointCloud, labels: NDArray[np.int32], shapes: list[Shape]) -> Clusters:
+    return Clusters(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        labels=labels,
+        centroids=_rows([s.centroid for s in shapes], 3),
+        lower=_rows([s.lower for s in shapes], 3),
+        upper=_rows([s.upper for s in shapes], 3),
+    )
+
+
+def _boxes(cloud: PointCloud, sizes: NDArray[np.int64], shapes: list[Shape]) -> Boxes3D:
+    return Boxes3D(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        class_names=("cluster",),
+        centers=_rows([s.T[:3, 3] for s in shapes], 3),
+        sizes=_rows([s.size for s in shapes], 3),
+        orientations=matrix_to_quaternion(np.array([s.T for s in shapes]).reshape(-1, 4, 4)),
+        scores=np.ones(len(shapes), np.float32),
+        class_ids=np.zeros(len(shapes), np.int32),
+        point_counts=sizes,
+    )
+
+
+def _features(cloud: PointCloud, shapes: list[Shape]) -> FeatureVector:
+    return FeatureVector(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        model=FEATURES,
+        vectors=_rows([[s.volume, s.linearity, s.planarity, s.sphericity] for s in shapes], 4).astype(np.float32),
+        ids=np.arange(len(shapes), dtype=np.int64),
+    )
+
+
+def _rows(rows: list[Any], width: int) -> NDArray[np.float64]:
+    return np.array(rows, np.float64).reshape(-1, width)
+
+
+def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
+    usable = counts["points"] - counts["not finite"]
+    text = f"{counts['clusters']} clusters of {counts['points in clusters']} points; {counts['points in none']} in none"
+    if not usable:
+        text = "the cloud has no finite point" if counts["points"] else "the cloud is empty"
+    return Diagnostics(
+        stamp=stamp,
+        names=("clusterer",),
+        messages=(text,),
+        levels=np.array([Level.OK if usable else Level.WARN], np.uint8),
+        keys=tuple(counts),
+        values=tuple(str(n) for n in counts.values()),
+        owners=np.zeros(len(counts), np.int32),
+    )

@@ -1,0 +1,128 @@
+"""Clusters of points, their boxes and their shapes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+
+def dbscan(points: Array, reach: float, core: int, weights: NDArray[np.intp]) -> Labels:
+    """Returns the cluster (N,) of each point, -1 for noise. Clusters are numbered by their first point.
+
+    A point with a weight of at least `core` within `reach`, its own included, is a core point; core points within reach
+    of each other share a cluster, and others join that of their nearest core point within reach. With `core` 1 this is
+    Euclidean clustering. Ester et al., "A density-based algorithm for discovering clusters", 1996; ties by distance,
+    so the result does not depend on the order of the points.
+    """
+    count = len(points)
+    labels = np.full(count, -1, np.int32)
+    if not count:
+        return labels
+    tree = cKDTree(points)
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    mass = weights + np.bincount(pairs[:, 0], weights[pairs[:, 1]], count)
+    mass = mass + np.bincount(pairs[:, 1], weights[pairs[:, 0]], count)
+    is_core = mass >= core
+    cores = np.flatnonzero(is_core)
+    if not len(cores):
+        return labels
+    linked = pairs[is_core[pairs].all(axis=1)]
+    graph = coo_matrix((np.ones(len(linked), np.int8), (linked[:, 0], linked[:, 1])), (count, count))
+    _, part = connected_components(graph, directed=False)
+    labels[cores] = part[cores]
+    border = np.flatnonzero(~is_core)
+    if len(border):
+        distance, nearest = cKDTree(points[cores]).query(points[border], distance_upper_bound=reach)
+        near = np.isfinite(distance)
+        labels[border[near]] = part[cores[nearest[near]]]
+    return _numbered(labels)
+
+
+def kept(labels: Labels, sizes: NDArray[np.int64], fewest: int, most: int) -> Labels:
+    """Returns the labels without the clusters whose size (C,) is outside [fewest, most], numbered anew."""
+    fits = np.append((sizes >= fewest) & (sizes <= most), False)
+    return _numbered(np.where(fits[labels], labels, -1).astype(np.int32))
+
+
+def _numbered(labels: Labels) -> Labels:
+    """Returns the labels as 0, 1, ... in the order of their first points."""
+    names, first = np.unique(labels, return_index=True)
+    order = [name for _, name in sorted(zip(first.tolist(), names.tolist(), strict=True)) if name >= 0]
+    table = np.full(int(labels.max(initial=-1)) + 2, -1, np.int32)
+    for number, name in enumerate(order):
+        table[name] = number
+    return table[labels]
+
+
+@dataclass(frozen=True, eq=False)
+class Shape:
+    """What is known of one cluster. `T` (4, 4) maps its box's axes, z along up, to the cloud's frame; `size` (3,)."""
+
+    centroid: Array
+    lower: Array
+    upper: Array
+    T: Array
+    size: Array
+    volume: float
+    linearity: float
+    planarity: float
+    sphericity: float
+
+
+def shape_of(points: Array, up: Array) -> Shape:
+    """Returns the shape of a cluster (N, 3), N ≥ 1.
+
+    The box is the one of least area around the points as seen from above, from the lowest to the highest; the volume is
+    that of the convex hull, 0 where the points are flat. Linearity, planarity and sphericity are (a - b) / a, (b - c) /
+    a and c / a for the eigenvalues a ≥ b ≥ c of the covariance, and add up to 1: West et al., "Context-driven automated
+    target detection in 3D data", 2004. A single point has none of them: all are 0.
+    """
+    centroid = points.mean(axis=0)
+    offset = points - centroid
+    smallest, middle, largest = (max(float(v), 0.0) for v in np.linalg.eigvalsh(offset.T @ offset / len(points)))
+    scale = largest if largest > 1e-12 else np.inf
+    T, size = _standing_box(points, up)
+    return Shape(
+        centroid=centroid,
+        lower=points.min(axis=0),
+        upper=points.max(axis=0),
+        T=T,
+        size=size,
+        volume=_volume(points),
+        linearity=(largest - middle) / scale,
+        planarity=(middle - smallest) / scale,
+        sphericity=smallest / scale,
+    )
+
+
+def _standing_box(points: Array, up: Array) -> tuple[Array, Array]:
+    helper = np.eye(3)[int(np.argmin(np.abs(up)))]
+    x = np.cross(helper, up)
+    x /= np.linalg.norm(x)
+    level = np.stack([x, np.cross(up, x)])
+    origin = points[0]
+    flat = ((points - origin) @ level.T).astype(np.float32)
+    (u, v), (width, depth), angle = cv2.minAreaRect(flat)
+    heights = (points - origin) @ up
+    c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    T = np.eye(4)
+    T[:3, :3] = np.stack([*(np.array([[c, s], [-s, c]]) @ level), up], axis=1)
+    T[:3, 3] = origin + np.array([u, v]) @ level + (heights.min() + heights.max()) / 2 * up
+    return T, np.array([width, depth, heights.max() - heights.min()])
+
+
+def _volume(points: Array) -> float:
+    """Returns the volume of the convex hull, m³; 0 where the points lie in a plane."""
+    try:
+        return float(ConvexHull(points - points[0]).volume) if len(points) > 3 else 0.0
+    except QhullError:
+        return 0.0

@@ -1,0 +1,38 @@
+"""Which way is up for a cloud, and how high its sensor is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Odometry, PointCloud, Pose, Transforms
+from operators.geometry.extrinsics import transform_between
+
+Array = NDArray[np.float64]
+
+
+def unit(up: tuple[float, float, float]) -> Array:
+    """Returns a direction of length 1. Raises ValueError where it has none."""
+    length = float(np.linalg.norm(up))
+    if not length > 1e-6 or not math.isfinite(length):
+        raise ValueError(f"up {up} is no direction")
+    return np.array(up) / length
+
+
+def gravity(
+    cloud: PointCloud, pose: Pose | Odometry | None, extrinsics: Transforms | None, fallback: Array
+) -> tuple[Array, float]:
+    """Returns up (3,) in the cloud's frame and the height of that frame's origin in the pose's frame, whose z is up.
+
+    Without a pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the extrinsics
+    relate to it; ValueError says where they do not.
+    """
+    if pose is None:
+        return fallback, 0.0
+    posed = pose.child_frame or cloud.frame
+    if posed != cloud.frame and extrinsics is None:
+        raise ValueError(f"the pose is that of {posed!r}, the cloud in {cloud.frame!r}, and there are no extrinsics")
+    T = pose.matrix() @ transform_between(extrinsics, cloud.frame, posed)
+    return np.asarray(T[2, :3]), float(T[2, 3])

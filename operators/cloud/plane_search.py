@@ -1,0 +1,226 @@
+"""Planes along and across gravity in a cloud, by random sampling that knows which way is up.
+
+The up direction leaves one number open for a level plane and two for an upright one, so a sample is one point or two:
+few trials find every plane, and the noise of normals only decides who may vote. Fischler and Bolles, "Random sample
+consensus", 1981; voting by normals as in Schnabel, Wahl and Klein, "Efficient RANSAC", 2007.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from operators.cloud.filtering import Voxels
+from operators.cloud.normals import estimate_normals
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+Mask = NDArray[np.bool_]
+Kind = Literal["level", "upright"]
+
+_ELECTORATE = 2000  # so many points are enough to tell the best of the samples; all fit the plane afterwards
+
+
+@dataclass(frozen=True)
+class Search:
+    """How planes are looked for. Lengths in metres, angles in radians."""
+
+    voxel: float
+    """Side of the voxels whose means stand for the cloud."""
+    distance: float
+    """A point this near to a plane is on it..."""
+    growth: float
+    """...plus this times its squared distance from the sensor: the noise of a depth camera. 1/m."""
+    normal_angle: float
+    """Who votes for a plane has a normal within this of the plane's."""
+    tilt: float
+    """A plane leans by no more than this from level or upright."""
+    gap: float
+    """Parts of a level plane farther apart than this are planes of their own."""
+    min_area: float
+    """Smallest area that makes a plane, m²."""
+    trials: int
+    """Random samples per plane."""
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane n·p + d = 0 with the voxels on it; `normal` (3,) faces the sensor."""
+
+    kind: Kind
+    normal: Array
+    d: float
+    members: Indices
+    area: float
+
+    def distances(self, points: Array) -> Array:
+        """Returns signed distances (N,), above 0 on the sensor's side."""
+        return np.asarray(points @ self.normal + self.d)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """The cloud as voxels: `points` (V, 3) and `normals` (V, 3) with the sensor at the origin, `tolerance` (V,)."""
+
+    points: Array
+    normals: Array
+    tolerance: Array
+    up: Array
+    of: Indices
+
+    @classmethod
+    def of_cloud(cls, cloud: NDArray[np.float32], up: Array, search: Search) -> Scene:
+        """`cloud` (N, 3) is finite, `up` (3,) a unit vector; `of` (N,) tells the voxel of each point."""
+        voxels = Voxels.by_size(cloud, search.voxel)
+        points = voxels.means(cloud)
+        normals = estimate_normals(points, neighbours=24, radius=6 * search.voxel, viewpoint=np.zeros(3))
+        return cls(points, normals, tolerances(points, search), up, voxels.of)
+
+
+def tolerances(points: Array, search: Search) -> Array:
+    """Returns how far (N,) from a plane a point of that plane may lie."""
+    return np.asarray(search.distance + search.growth * np.einsum("ij,ij->i", points, points))
+
+
+def find_planes(scene: Scene, search: Search, rng: np.random.Generator) -> list[Plane]:
+    """Returns level planes, then upright ones, in the order in which they were found; a voxel is on one at most."""
+    lean = np.abs(scene.normals @ scene.up)
+    sine, cosine = math.sin(search.normal_angle), math.cos(search.normal_angle)
+    free = np.ones(len(scene.points), np.bool_)
+    planes: list[Plane] = []
+    for kind, voters in (("level", lean >= cosine), ("upright", lean <= sine)):
+        planes += _planes_of_kind(scene, search, kind, voters, free, rng)  # type: ignore[arg-type]
+    return planes
+
+
+def _planes_of_kind(
+    scene: Scene, search: Search, kind: Kind, voters: Mask, free: Mask, rng: np.random.Generator
+) -> list[Plane]:
+    """Takes planes, best first, until none is large enough; takes their voxels from `free`."""
+    planes: list[Plane] = []
+    may_vote = voters.copy()
+    fewest = max(8, math.ceil(search.min_area / (4 * search.voxel**2)))
+    while True:
+        index = np.flatnonzero(may_vote & free)
+        if len(index) < fewest:
+            return planes
+        normal, d = _best_sample(scene, search, kind, index, rng)
+        normal, d, on = _refined(scene, search, kind, index, normal, d)
+        if len(on) < fewest:
+            return planes
+        parts = _parts(scene.points[on], search.gap if kind == "level" else 3 * search.gap)
+        may_vote[on] = False
+        for part in range(parts.max() + 1):
+            members = on[parts == part]
+            area = covered_area(scene.points[members], normal, 2 * search.voxel)
+            if area < search.min_area:
+                continue
+            own_normal, own_d = _fitted(scene, kind, members, normal, d, search.tilt)
+            members = _absorbed(scene, free, members, own_normal, own_d, 2 * search.voxel)
+            free[members] = False
+            planes.append(Plane(kind, *_facing(own_normal, own_d), members, area))
+
+
+def _best_sample(
+    scene: Scene, search: Search, kind: Kind, index: Indices, rng: np.random.Generator
+) -> tuple[Array, float]:
+    """Returns the sampled plane with the most votes."""
+    index = index[:: 1 + len(index) // _ELECTORATE]
+    points, tolerance, normals = scene.points[index], scene.tolerance[index], scene.normals[index]
+    if kind == "level":
+        picked = rng.integers(0, len(index), search.trials)
+        candidates = np.repeat(scene.up[None], search.trials, axis=0)
+    else:
+        pairs = rng.integers(0, len(index), (search.trials, 2))
+        along = points[pairs[:, 1]] - points[pairs[:, 0]]
+        candidates = np.cross(along, scene.up)
+        length = np.linalg.norm(candidates, axis=1)
+        usable = length > 4 * search.voxel
+        candidates = candidates[usable] / length[usable, None]
+        picked = pairs[usable, 0]
+        if not len(picked):
+            picked, candidates = np.zeros(1, np.intp), _level_part(normals[:1], scene.up)
+    offsets = np.einsum("ij,ij->i", points[picked], candidates)
+    near = np.abs(candidates @ points.T - offsets[:, None]) <= tolerance
+    near &= np.abs(candidates @ normals.T) >= math.cos(search.normal_angle)
+    best = int(near.sum(axis=1).argmax())
+    return candidates[best], -float(offsets[best])
+
+
+def _refined(
+    scene: Scene, search: Search, kind: Kind, index: Indices, normal: Array, d: float
+) -> tuple[Array, float, Indices]:
+    """Fits the plane to its voters and asks again who they are, a few times."""
+    on = index
+    for _ in range(4):
+        near = np.abs(scene.points[index] @ normal + d) <= scene.tolerance[index]
+        near &= np.abs(scene.normals[index] @ normal) >= math.cos(search.normal_angle)
+        on = index[near]
+        if len(on) < 3:
+            break
+        normal, d = _fitted(scene, kind, on, normal, d, search.tilt)
+    return normal, d, on
+
+
+def _fitted(scene: Scene, kind: Kind, members: Indices, normal: Array, d: float, tilt: float) -> tuple[Array, float]:
+    """Returns the plane of least squares through the members, weighted by their noise; the old one if it leans."""
+    weights = scene.tolerance[members] ** -2
+    weights = weights / weights.sum()
+    middle = weights @ scene.points[members]
+    offset = scene.points[members] - middle
+    _, axes = np.linalg.eigh((offset * weights[:, None]).T @ offset)
+    fitted = axes[:, 0] * (1.0 if axes[:, 0] @ normal >= 0 else -1.0)
+    lean = abs(float(fitted @ scene.up))
+    leans = lean < math.cos(tilt) if kind == "level" else lean > math.sin(tilt)
+    if leans or fitted @ normal < math.cos(2 * tilt):
+        return normal, -float(middle @ normal)
+    return fitted, -float(middle @ fitted)
+
+
+def _parts(points: Array, gap: float) -> NDArray[np.int32]:
+    """Returns the number of the connected part of each point; points nearer than `gap` are connected."""
+    pairs = cKDTree(points).query_pairs(gap / 2, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(points), len(points)))
+    return np.asarray(connected_components(graph, directed=False)[1])
+
+
+def _absorbed(scene: Scene, free: Mask, members: Indices, normal: Array, d: float, reach: float) -> Indices:
+    """Returns the members and the free voxels beside them that are as near to the plane, whatever their normal."""
+    others = free.copy()
+    others[members] = False
+    close = np.flatnonzero(others & (np.abs(scene.points @ normal + d) <= 1.5 * scene.tolerance))
+    if not len(close):
+        return members
+    distance, _ = cKDTree(scene.points[members]).query(scene.points[close], distance_upper_bound=reach)
+    return np.sort(np.concatenate([members, close[np.isfinite(distance)]]))
+
+
+def covered_area(points: Array, normal: Array, cell: float) -> float:
+    """Returns the area of the cells of a square grid in the plane that hold points, m²."""
+    flat = np.floor(points @ in_plane(normal).T / cell).astype(np.int64)
+    return len(np.unique(flat, axis=0)) * cell * cell
+
+
+def in_plane(normal: Array) -> Array:
+    """Returns two unit vectors (2, 3) that span the plane."""
+    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
+    x = np.cross(helper, normal)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(normal, x)])
+
+
+def _level_part(normals: Array, up: Array) -> Array:
+    flat = normals - (normals @ up)[:, None] * up
+    return np.asarray(flat / np.linalg.norm(flat, axis=1, keepdims=True))
+
+
+def _facing(normal: Array, d: float) -> tuple[Array, float]:
+    """Returns the plane with its normal towards the origin, where the sensor is."""
+    return (normal, d) if d >= 0 else (-normal, -d)

@@ -1,0 +1,213 @@
+"""The surfaces of a room in a cloud: floor, walls, table tops."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Boxes3D, Diagnostics, Odometry, Planes, PointCloud, Pose, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.filtering import finite
+from operators.cloud.gravity import gravity, unit
+from operators.cloud.plane_search import Plane, Scene, Search, find_planes, tolerances
+from operators.cloud.surfaces import SURFACES, Rules, Surface, recognised
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int32]
+
+_THICKNESS = 0.02  # metres, of a surface's box
+
+
+class PlaneSegmenter(Operator):
+    """Finds level and upright planes in a cloud and says which are floor, wall, table top or ceiling.
+
+    The cloud is in its sensor's frame. Up comes from `pose`, whose own frame has z up, else from the parameter `up`.
+    The floor is the lowest level plane with next to nothing below it; its height is remembered, so that tables are
+    told where no floor is seen. Without a floor so far, level planes are `other`. A wall is wide and high, and nothing
+    that stands is seen behind it. Upright planes need not be vertical beyond `tilt`; slopes are not looked for.
+
+    Method: RANSAC (Fischler and Bolles, 1981) along and across gravity, votes by normals as in Schnabel, Wahl and
+    Klein, "Efficient RANSAC for point-cloud shape detection", 2007, least squares over the voters.
+    """
+
+    cloud: In[PointCloud] = In(doc="points in the frame of their sensor, which is the origin")
+    pose: Sampled[Pose | Odometry] = Sampled(required=False, doc="the sensor or its robot in a frame whose z is up")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
+    )
+    planes: Out[Planes] = Out(doc="every plane with the rectangle seen of it, and the plane of every point")
+    surfaces: Out[Boxes3D] = Out(doc="the same planes in the same order as flat boxes with a class")
+    rest: Out[PointCloud] = Out(doc="the points on no floor, wall, table top or ceiling")
+    status: Out[Diagnostics] = Out(doc="how many of each were found; a warning where the cloud is too small for any")
+
+    up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
+    voxel: float = Param(0.05, gt=0.005, doc="side of the voxels that planes are looked for in", unit="m")
+    distance: float = Param(0.02, gt=0, doc="a point this near to a plane is on it", unit="m")
+    growth: float = Param(0.003, ge=0, doc="and this times its squared distance from the sensor: its noise", unit="1/m")
+    normal_angle: float = Param(0.6, gt=0, lt=1.5, doc="a point that votes has a normal within this", unit="rad")
+    tilt: float = Param(0.1, gt=0, lt=0.5, doc="a plane leans by no more than this", unit="rad")
+    gap: float = Param(0.3, gt=0, doc="level planes so far apart are two", unit="m")
+    min_area: float = Param(0.25, gt=0, doc="smallest area of a plane", unit="m²")
+    trials: int = Param(200, ge=10, le=5000, doc="random samples per plane")
+    min_table: float = Param(0.4, gt=0, doc="lowest top of a table above the floor", unit="m")
+    max_table: float = Param(1.1, gt=0, doc="highest top of a table above the floor", unit="m")
+    table_side: float = Param(0.4, gt=0, doc="shortest side that is seen of a table", unit="m")
+    wall_side: float = Param(0.6, gt=0, doc="shortest width that is seen of a wall", unit="m")
+    wall_area: float = Param(0.5, gt=0, doc="smallest area that is seen of a wall", unit="m²")
+    wall_top: float = Param(1.2, gt=0, doc="a wall is seen up to this height above the floor at least", unit="m")
+    floor_memory: float = Param(0.1, gt=0, doc="the floor is within this of where it was", unit="m")
+
+    def setup(self) -> None:
+        """Raises ValueError for an up of length 0 and for table heights the wrong way round."""
+        self._up = unit(self.up)
+        if self.min_table >= self.max_table:
+            raise ValueError(f"min_table {self.min_table} m must be below max_table {self.max_table} m")
+        self._search = Search(
+            voxel=self.voxel,
+            distance=self.distance,
+            growth=self.growth,
+            normal_angle=self.normal_angle,
+            tilt=self.tilt,
+            gap=self.gap,
+            min_area=self.min_area,
+            trials=self.trials,
+        )
+        self._rules = Rules(
+            table_heights=(self.min_table, self.max_table),
+            table_side=self.table_side,
+            wall_side=self.wall_side,
+            wall_area=self.wall_area,
+            wall_top=self.wall_top,
+            floor_memory=self.floor_memory,
+        )
+        self._floor: float | None = None
+        self._counts: Counter[str] = Counter()
+
+    def process(
+        self, cloud: PointCloud, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
+    ) -> dict[str, Any]:
+        """Raises ValueError where no transform relates the cloud's frame to that of the pose."""
+        up, height = gravity(cloud, pose, extrinsics, self._up)
+        usable = np.flatnonzero(finite(cloud.points))
+        points = cloud.points[usable]
+        surfaces: list[Surface] = []
+        labels = np.full(cloud.count, -1, np.int32)
+        if len(points):
+            scene = Scene.of_cloud(points, up, self._search)
+            planes = find_planes(scene, self._search, self.rng)
+            known = None if self._floor is None else self._floor - height
+            surfaces, floor = recognised(scene, planes, self._rules, known, 2 * self.voxel)
+            self._floor = None if floor is None else floor + height
+            labels[usable] = self._labels(points, scene, [surface.plane for surface in surfaces])
+        named = np.array([surface.name != "other" for surface in surfaces] + [False])
+        found = Counter(surface.name for surface in surfaces)
+        self._counts.update({name: found[name] for name in SURFACES} | {"clouds": 1, "clouds without": not surfaces})
+        boxes = _boxes(cloud, surfaces, labels)
+        return {
+            "planes": _planes(cloud, surfaces, labels),
+            "surfaces": boxes,
+            "rest": _without(cloud, named[labels]),
+            "status": _status(cloud, found, self._floor is not None),
+        }
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: the floor is looked for again."""
+        self._floor = None
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {"floor": self._floor, "counts": dict(self._counts)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._floor = None if state["floor"] is None else float(state["floor"])
+        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return dict(self._counts)
+
+    def _labels(self, points: NDArray[np.float32], scene: Scene, planes: list[Plane]) -> Labels:
+        """Returns the plane (N,) of every point: that of its voxel, or -1 where the point itself lies off it."""
+        of_voxel = np.full(len(scene.points), -1, np.int32)
+        for k, plane in enumerate(planes):
+            of_voxel[plane.members] = k
+        labels = of_voxel[scene.of]
+        exact = points.astype(np.float64)
+        tolerance = 1.5 * tolerances(exact, self._search)
+        for k, plane in enumerate(planes):
+            off = (labels == k) & (np.abs(plane.distances(exact)) > tolerance)
+            labels[off] = -1
+        return labels
+
+
+def _planes(cloud: PointCloud, surfaces: list[Surface], labels: Labels) -> Planes:
+    return Planes(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        coefficients=_rows([[*s.plane.normal, s.plane.d] for s in surfaces], 4),
+        centers=_rows([s.seen.T[:3, 3] for s in surfaces], 3),
+        orientations=_orientations(surfaces),
+        extents=_rows([s.seen.size for s in surfaces], 2),
+        inlier_counts=_members(surfaces, labels),
+        labels=labels,
+    )
+
+
+def _boxes(cloud: PointCloud, surfaces: list[Surface], labels: Labels) -> Boxes3D:
+    return Boxes3D(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        class_names=SURFACES,
+        centers=_rows([s.seen.T[:3, 3] for s in surfaces], 3),
+        sizes=_rows([[*s.seen.size, _THICKNESS] for s in surfaces], 3),
+        orientations=_orientations(surfaces),
+        scores=np.ones(len(surfaces), np.float32),
+        class_ids=np.array([SURFACES.index(s.name) for s in surfaces], np.int32),
+        point_counts=_members(surfaces, labels),
+    )
+
+
+def _rows(rows: list[Any], width: int) -> Array:
+    return np.array(rows, np.float64).reshape(-1, width)
+
+
+def _orientations(surfaces: list[Surface]) -> Array:
+    return matrix_to_quaternion(np.array([s.seen.T for s in surfaces]).reshape(-1, 4, 4))
+
+
+def _members(surfaces: list[Surface], labels: Labels) -> NDArray[np.int64]:
+    return np.bincount(labels[labels >= 0], minlength=len(surfaces)).astype(np.int64)
+
+
+def _without(cloud: PointCloud, taken: NDArray[np.bool_]) -> PointCloud:
+    """Returns the finite points that are on no surface, with their colours and normals."""
+    kept = finite(cloud.points) & ~taken
+    return PointCloud(
+        stamp=cloud.stamp,
+        frame=cloud.frame,
+        points=cloud.points[kept],
+        colors=None if cloud.colors is None else cloud.colors[kept],
+        intensities=None if cloud.intensities is None else cloud.intensities[kept],
+        normals=None if cloud.normals is None else cloud.normals[kept],
+    )
+
+
+def _status(cloud: PointCloud, found: Mapping[str, int], floor_known: bool) -> Diagnostics:
+    text = ", ".join(f"{found[name]} {name}" for name in SURFACES if found[name]) or "no plane in the cloud"
+    if not floor_known:
+        text += "; no floor so far, so level planes have no class"
+    keys = ("points", *SURFACES)
+    values = (str(cloud.count), *(str(found[name]) for name in SURFACES))
+    return Diagnostics(
+        stamp=cloud.stamp,
+        names=("plane_segmenter",),
+        messages=(text,),
+        levels=np.array([Level.OK if found and floor_known else Level.WARN], np.uint8),
+        keys=keys,
+        values=values,
+        owners=np.zeros(len(keys), np.int32),
+    )

@@ -1,0 +1,170 @@
+"""PlaneSegmenter on rooms whose surfaces are known."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dataflow.messages import Boxes3D, Diagnostics, Planes, PointCloud, Pose
+from dataflow.messages.geometry import invert, transform_points
+from dataflow.testing import play
+from operators.cloud import PlaneSegmenter
+
+HEIGHT = 1.2
+"""Of the sensor above the floor, metres."""
+
+
+def patch(
+    corner: Any, along: Any, up: Any, density: float, rng: np.random.Generator, noise: float = 0.004
+) -> np.ndarray:
+    """Points on a rectangle, so many on a square metre, with noise across it."""
+    a, b = np.array(along, float), np.array(up, float)
+    count = int(density * np.linalg.norm(a) * np.linalg.norm(b))
+    s, t = rng.uniform(0, 1, (2, count, 1))
+    normal = np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+    return np.array(corner) + s * a + t * b + rng.normal(0, noise, (count, 1)) * normal
+
+
+def room(*, floor: bool = True, table: bool = True, cupboard: bool = False, seed: int = 0) -> dict[str, np.ndarray]:
+    """Surfaces in the world: floor at 0, walls at x = 3 and y = 2, a table top at 0.75."""
+    rng = np.random.default_rng(seed)
+    parts = {
+        "wall x": patch((3, -2, 0), (0, 4, 0), (0, 0, 2.4), 700, rng),
+        "wall y": patch((0, 2, 0), (3, 0, 0), (0, 0, 2.4), 700, rng),
+        "ball": rng.normal((1.8, -0.8, 0.9), 0.04, (120, 3)),
+    }
+    if floor:
+        parts["floor"] = patch((0, -2, 0), (3, 0, 0), (0, 4, 0), 700, rng)
+    if table:
+        parts["table"] = patch((1.2, -1.2, 0.75), (1.2, 0, 0), (0, 0.8, 0), 1500, rng)
+    if cupboard:
+        parts["cupboard"] = patch((2.4, -0.4, 0), (0, 1.0, 0), (0, 0, 1.4), 1500, rng)
+    return parts
+
+
+def cloud(parts: dict[str, np.ndarray], T_world_sensor: np.ndarray, stamp: int = 1) -> PointCloud:
+    points = transform_points(invert(T_world_sensor), np.concatenate(list(parts.values())))
+    return PointCloud(stamp=stamp, frame="camera", points=points.astype(np.float32))
+
+
+def optical(pitch: float = 0.3, yaw: float = 0.2) -> np.ndarray:
+    """The pose of a camera that looks ahead and down by `pitch`."""
+    cy, sy, cp, sp = np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch)
+    forward = np.array([cy * cp, sy * cp, -sp])
+    right = np.array([sy, -cy, 0])
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    T[2, 3] = HEIGHT
+    return T
+
+
+def pose(T: np.ndarray, stamp: int = 1) -> Pose:
+    return Pose.from_matrix(T, stamp=stamp, frame="world", child_frame="camera")
+
+
+def segmented(given: PointCloud, T: np.ndarray | None = None, **params: Any) -> tuple[Planes, Boxes3D, PointCloud]:
+    streams: dict[str, Any] = {"cloud": [given]} | ({} if T is None else {"pose": [pose(T)]})
+    played = play(PlaneSegmenter(**params), streams)
+    (planes,), (surfaces,), (rest,) = played["planes"], played["surfaces"], played["rest"]
+    assert isinstance(planes, Planes)
+    assert isinstance(surfaces, Boxes3D)
+    assert isinstance(rest, PointCloud)
+    return planes, surfaces, rest
+
+
+def test_floor_walls_and_table_are_found_with_their_planes_and_points() -> None:
+    T, parts = optical(), room()
+    planes, surfaces, rest = segmented(cloud(parts, T), T)
+    assert sorted(surfaces.labels()) == ["floor", "table", "wall", "wall"]
+    expected = {
+        "floor": [([0, 0, 1], 0.0)],
+        "table": [([0, 0, 1], -0.75)],
+        "wall": [([-1, 0, 0], 3.0), ([0, -1, 0], 2.0)],
+    }
+    for k, name in enumerate(surfaces.labels()):
+        normal = T[:3, :3] @ planes.coefficients[k, :3]
+        d = planes.coefficients[k, 3] - normal @ T[:3, 3]
+        off = min(np.abs(normal - n).max() + abs(d - e) for n, e in expected[name])
+        assert off < 0.02, name
+    of = np.repeat(np.arange(len(parts)), [len(p) for p in parts.values()])
+    for name in ("floor", "table"):
+        found = planes.labels == surfaces.labels().index(name)
+        true = of == list(parts).index(name)
+        assert (found & true).sum() / (found | true).sum() > 0.93
+    assert planes.inlier_counts.tolist() == np.bincount(planes.labels[planes.labels >= 0]).tolist()
+    assert 110 <= rest.count <= 200  # the ball, and little else
+
+
+def test_the_rectangle_of_a_table_is_what_is_seen_of_it() -> None:
+    T = optical()
+    _, surfaces, _ = segmented(cloud(room(), T), T)
+    k = surfaces.labels().index("table")
+    assert sorted(surfaces.sizes[k, :2]) == pytest.approx([0.8, 1.2], abs=0.06)
+    center = transform_points(T, surfaces.centers[k][None])[0]
+    np.testing.assert_allclose(center, [1.8, -0.8, 0.75], atol=0.03)
+
+
+def test_without_a_pose_the_parameter_says_which_way_is_up() -> None:
+    T = optical()
+    given = cloud(room(), T)
+    _, surfaces, _ = segmented(given, up=tuple(T[2, :3]))
+    assert sorted(surfaces.labels()) == ["floor", "table", "wall", "wall"]
+
+
+def test_an_upright_plane_with_a_wall_behind_it_is_no_wall_and_stays_in_the_rest() -> None:
+    T, parts = optical(), room(table=False, cupboard=True)
+    planes, surfaces, rest = segmented(cloud(parts, T), T)
+    assert sorted(surfaces.labels()) == ["floor", "other", "wall", "wall"]
+    assert planes.inlier_counts[surfaces.labels().index("other")] > 0.9 * len(parts["cupboard"])
+    assert rest.count > len(parts["cupboard"])
+
+
+def test_the_floor_is_remembered_where_only_a_table_is_seen() -> None:
+    T = optical()
+    clouds = [cloud(room(), T, 1), cloud(room(floor=False), T, 2)]
+    played = play(PlaneSegmenter(), {"cloud": clouds, "pose": [pose(T, 1), pose(T, 2)]})
+    _, second = played["surfaces"]
+    assert isinstance(second, Boxes3D)
+    assert sorted(second.labels()) == ["table", "wall", "wall"]
+
+
+@pytest.mark.parametrize(
+    "points", [np.zeros((0, 3)), np.full((50, 3), np.nan), np.random.default_rng(0).uniform(0, 1, (4, 3))]
+)
+def test_a_cloud_too_small_for_planes_is_a_warning(points: np.ndarray) -> None:
+    given = PointCloud(stamp=1, frame="camera", points=points.astype(np.float32))
+    played = play(PlaneSegmenter(), {"cloud": [given]})
+    (status,), (planes,), (rest,) = played["status"], played["planes"], played["rest"]
+    assert isinstance(status, Diagnostics)
+    assert isinstance(planes, Planes)
+    assert isinstance(rest, PointCloud)
+    assert status.levels.tolist() == [1]
+    assert "no plane in the cloud" in status.messages[0]
+    assert planes.count == 0
+    assert rest.count == np.isfinite(points).all(axis=1).sum()
+
+
+def test_a_pose_of_another_frame_without_extrinsics_is_named() -> None:
+    operator = PlaneSegmenter()
+    operator.setup()
+    T = optical()
+    stranger = Pose.from_matrix(T, stamp=1, frame="world", child_frame="base")
+    with pytest.raises(ValueError, match="the pose is that of 'base', the cloud in 'camera'"):
+        operator.process(cloud(room(), T), stranger)
+    with pytest.raises(ValueError, match="is no direction"):
+        PlaneSegmenter(up=(0.0, 0.0, 0.0)).setup()
+
+
+def test_two_plays_are_equal_and_a_restored_operator_goes_on_alike() -> None:
+    T = optical()
+    streams: dict[str, Any] = {"cloud": [cloud(room(seed=k), T, k + 1) for k in range(2)], "pose": [pose(T)]}
+    first, again = PlaneSegmenter(), PlaneSegmenter()
+    assert play(first, streams).digests() == play(again, streams).digests()
+    restored = PlaneSegmenter()
+    restored.setup()
+    restored.restore(first.snapshot())
+    later = cloud(room(floor=False), T, 3)
+    one, other = (operator.process(later, pose(T, 3))["surfaces"] for operator in (first, restored))
+    assert sorted(one.labels()) == sorted(other.labels()) == ["table", "wall", "wall"]
