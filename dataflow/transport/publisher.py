@@ -57,7 +57,8 @@ class StreamPublisher:
         self.matched = False
         """Whether anybody subscribes to the key."""
         self._matching = publisher.declare_matching_listener(zenoh.handlers.Callback(self._on_matching, indirect=False))
-        self.matched = bool(publisher.matching_status.matching)
+        status: Any = publisher.matching_status  # Zenoh's stubs call it a bool
+        self.matched = bool(status.matching)
 
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
         self.matched = bool(status.matching)

@@ -103,7 +103,8 @@ def test_a_block_is_free_when_its_consumer_dropped_released_or_died(pair: Pair) 
     pool = SharedPool(1 << 20)
     held = [pool.write([bytes(70_000)], 70_000, (pair.producer.claim,)) for _ in range(2)]
     assert not any(block.free() for block in held if block)
-    assert held[0] is not None and held[1] is not None
+    assert held[0] is not None
+    assert held[1] is not None
     pair.producer.claim.drop(held[0])
     assert [block.free() for block in held if block] == [True, False]
     pair.producer.take_leave()
