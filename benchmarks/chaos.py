@@ -53,8 +53,8 @@ def one(seed: int, placement: str, duration: str, folder: Path) -> tuple[bool, i
     timeouts = sum(n for found in report.waits.values() for _, what, n in found if what == "timeout")
     planned = sum(note.startswith("planned fault") for note in report.notes)
     restarts = sum(report.restarts.values())
-    busy = [c.busy_ns * 1e-9 for name, c in verified.work.items()]
-    slowest = max(busy) if other == "host_each" else sum(busy)
+    work = [c.cpu_ns * 1e-9 for name, c in verified.work.items()]
+    slowest = max(work) if other == "host_each" else sum(work)
     factor, limit = verified.span / verified.wall, verified.span / slowest
     verdict = "identical" if verified.identical else "DIFFERENT"
     print(

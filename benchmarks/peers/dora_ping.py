@@ -1,4 +1,7 @@
-"""A dora node: sends, waits for the answer, prints the round trips as JSON. BYTES and COUNT come from the environment."""
+"""A dora node: sends, waits for the answer, prints the round trips as JSON.
+
+BYTES and COUNT come from the environment.
+"""
 
 from __future__ import annotations
 

@@ -1,13 +1,15 @@
 """Round trips between two processes, ours and the peers' in turns in one run: ratios with their spread.
 
-    python benchmarks/peers/roundtrip.py --peers VENV      # VENV holds dora-rs, dora-rs-cli, eclipse-zenoh, iceoryx2, lcm
+    python benchmarks/peers/roundtrip.py --peers VENV
     python benchmarks/peers/roundtrip.py --peers VENV --rounds 9 --sizes 1008,921600,8294400 --only ours,dora
 
+VENV is a virtual environment with dora-rs, dora-rs-cli, eclipse-zenoh, iceoryx2, lcm, pyarrow and numpy.
+
 One process sends an array that holds the time, another answers with its first eight bytes, 100 times a second; a round
-trip ends when the first process has the answer as a number. Every contestant's processes are started anew for each round
-and size, so one bad placement cannot decide. The figure of a round is its median; the table gives the median over rounds
-and, of the ratio to dora, the smallest and largest over rounds: on a noisy machine ratios of one round mean more than times
-of different ones.
+trip ends when the first process has the answer as a number. Every contestant's processes are started anew for each
+round and size, so one bad placement cannot decide. The figure of a round is its median; the table gives the median over
+rounds and, of the ratio to dora, the smallest and largest over rounds: on a noisy machine ratios of one round mean more
+than times of different ones.
 """
 
 from __future__ import annotations
@@ -60,7 +62,8 @@ def ours(options: dict[str, object]) -> Callable[[int, int], list[float]]:
             f"sys.path.append({str(HERE)!r})\n"
             "from dataflow.graph import load_graph\n"
             "from dataflow.supervision.run import run\n"
-            f"graph = load_graph({str(HERE / 'roundtrip.yaml')!r}, settings=['nbytes={size}', 'count={count}'], live=True)\n"
+            f"settings = ['nbytes={size}', 'count={count}']\n"
+            f"graph = load_graph({str(HERE / 'roundtrip.yaml')!r}, settings=settings, live=True)\n"
             f"options = json.loads({json.dumps(options)!r})\n"
             "options = {k: Path(v) if k == 'record' else v for k, v in options.items()}\n"
             "print(run(graph, live=True, **options).summaries['pong']['took'])\n"
@@ -92,9 +95,7 @@ def parsed(text: str) -> list[float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "--peers", type=Path, help="virtual environment of the peers; without it ours and the floor only"
-    )
+    parser.add_argument("--peers", type=Path, help="the environment of the peers; else ours and the floor only")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=150)
     parser.add_argument("--sizes", default="1008,921600,8294400")

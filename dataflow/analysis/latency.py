@@ -1,10 +1,13 @@
 """Path latency: the time from a source's message to the end of the firing that it causes at a sink.
 
 Computed from firing records, so from any recording: every record holds when its call began and how long it took, and
-which messages it was given. A firing is caused by the messages of its triggers; that of an operator that fires on a
-timer by the messages of its batches, or, with none of those, by the ones that it sampled. Its *critical* cause is the
-one whose producer finished last. Walking back over critical causes splits a latency into the operators' own time and
-the time that messages waited in front of them (transport, queues, and other operators of the same process).
+which messages it was given. No operator is imported: what causes a firing follows from the records. An input whose
+messages always have the firing's own stamp (within the operator's tolerance), each one given once, *triggers* it; where
+an operator has no such input, its batches cause its firings, or, with none of those, what it samples. A sampled input
+that always brings a message of the firing's stamp counts as a trigger, rightly: the firing waits for it all the same.
+A firing's *critical* cause is the one whose producer finished last. Walking back over critical causes splits a latency
+into the operators' own time and the time that messages waited in front of them (transport, queues, and other operators
+of the same process).
 
 Clocks: wall time of one machine. Where a run spread over several, their offset is part of the result.
 """
@@ -13,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -54,6 +58,20 @@ class PathLatency:
     def costliest(self) -> str:
         return max(self.shares, key=lambda share: share.work + share.wait).operator
 
+    def as_json(self) -> dict[str, Any]:
+        return {
+            "source": self.source,
+            "sink": self.sink,
+            "count": self.count,
+            "p50_ms": self.p50 * 1e-6,
+            "p99_ms": self.p99 * 1e-6,
+            "max_ms": self.largest * 1e-6,
+            "costliest": self.costliest,
+            "shares": [
+                {"operator": s.operator, "work_ms": s.work * 1e-6, "wait_ms": s.wait * 1e-6} for s in self.shares
+            ],
+        }
+
 
 @dataclass(slots=True)
 class _Made:
@@ -75,7 +93,7 @@ class _Path:
 
 def recorded_latencies(recording: Recording, graph: Graph) -> list[PathLatency]:
     """The latencies of all paths of a recorded run, sources and sinks in graph order. Raises `RecordingError`."""
-    return latencies(graph, {name: _records(recording, name) for name in graph.nodes})
+    return latencies(graph, {name: list(_records(recording, name)) for name in graph.nodes})
 
 
 def _records(recording: Recording, operator: str) -> Iterator[FiringRecord]:
@@ -83,39 +101,78 @@ def _records(recording: Recording, operator: str) -> Iterator[FiringRecord]:
         yield from decode_batch(payload).records
 
 
-def latencies(graph: Graph, records: Mapping[str, Iterable[FiringRecord]]) -> list[PathLatency]:
+def batch_latencies(graph: Graph, batches: Iterable[bytes]) -> list[PathLatency]:
+    """The latencies of all paths, from batches of firing records. Raises `FiringRecordError`."""
+    records: dict[str, list[FiringRecord]] = {}
+    for batch in batches:
+        decoded = decode_batch(batch)
+        records.setdefault(decoded.operator, []).extend(decoded.records)
+    return latencies(graph, records)
+
+
+def latencies(graph: Graph, records: Mapping[str, Sequence[FiringRecord]]) -> list[PathLatency]:
     """The latencies of all paths, from the records of each operator in their order.
 
     A sink is an operator that causes no firing of another one.
     """
-    causes = {name: _causing_inputs(node) for name, node in graph.nodes.items()}
+    calls = {name: [r for r in records.get(name, ()) if _is_firing(r)] for name in graph.nodes}
+    stamps = _stamps(graph, calls)
+    causes = {name: _causing_inputs(node, calls[name], stamps) for name, node in graph.nodes.items()}
     made: dict[Place, _Made] = {}
     paths: dict[tuple[str, str], _Path] = {}
     consumed = {stream for name, inputs in causes.items() for i in inputs for stream in graph.nodes[name].inputs[i]}
     for name in _in_order(graph, causes):
         node = graph.nodes[name]
         sink = not node.source and not consumed & set(node.outputs.values())
-        for record in records.get(name, ()):
-            if record.kind not in ("fire", "tick") or record.outcome != "ok":
-                continue
+        for record in calls[name]:
             firing = _firing(node, record, causes[name], made)
             if firing is None:
                 continue
-            for stream, emission in zip(node.outputs.values(), record.outputs, strict=False):
-                if emission is not None and emission.seq != WITHHELD:
-                    made[stream, record.incarnation, emission.seq] = firing
+            made.update((place, firing) for place, _ in _emitted(node, record))
             if sink:
                 for source in firing.origin:
                     _enter(paths.setdefault((source, name), _Path()), firing, source)
     return [_summary(source, sink, path) for (source, sink), path in _sorted(graph, paths)]
 
 
-def _causing_inputs(node: Node) -> tuple[str, ...]:
-    ports = node.spec.inputs
-    for kind in ("in", "batch", "sampled"):
-        if names := tuple(name for name in node.inputs if ports[name].kind == kind):
-            return names
-    return ()
+def _is_firing(record: FiringRecord) -> bool:
+    return record.kind in ("fire", "tick") and record.outcome == "ok"
+
+
+def _emitted(node: Node, record: FiringRecord) -> Iterator[tuple[Place, int]]:
+    """The messages of a firing, each with its stamp."""
+    for stream, emission in zip(node.outputs.values(), record.outputs, strict=False):
+        if emission is not None and emission.seq != WITHHELD:
+            yield (stream, record.incarnation, emission.seq), emission.stamp
+
+
+def _stamps(graph: Graph, calls: Mapping[str, Sequence[FiringRecord]]) -> dict[Place, int]:
+    return {
+        place: stamp
+        for name, node in graph.nodes.items()
+        for record in calls[name]
+        for place, stamp in _emitted(node, record)
+    }
+
+
+def _causing_inputs(node: Node, calls: Sequence[FiringRecord], stamps: Mapping[Place, int]) -> tuple[str, ...]:
+    """The inputs whose messages cause the firings: triggers, else batches, else all."""
+    batches = {name for record in calls for name, ref in record.inputs.items() if isinstance(ref, tuple)}
+    single = [name for name in node.inputs if name not in batches]
+    triggers = tuple(name for name in single if _triggers(node, name, calls, stamps))
+    return triggers or tuple(name for name in node.inputs if name in batches) or tuple(single)
+
+
+def _triggers(node: Node, name: str, calls: Sequence[FiringRecord], stamps: Mapping[Place, int]) -> bool:
+    """Whether an input has, in every firing, messages of its stamp that no firing had before."""
+    seen: set[Place] = set()
+    for record in calls:
+        for place in _places(record.inputs.get(name)):
+            stamp = stamps.get(place, record.stamp)
+            if place in seen or abs(stamp - record.stamp) > node.tolerance:
+                return False
+            seen.add(place)
+    return bool(seen)
 
 
 def _in_order(graph: Graph, causes: Mapping[str, Sequence[str]]) -> list[str]:

@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from rich.text import Text
 
 from dataflow.cli.arguments import Json, ModuleFolders, RecordingFile, existing, find_modules_in
 from dataflow.cli.output import count, fail, friendly_errors, out, print_json, table
-
-if TYPE_CHECKING:
-    from dataflow.analysis.latency import PathLatency
 
 
 def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json = False) -> None:
@@ -28,17 +23,20 @@ def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json 
     """
     from dataflow.analysis.latency import recorded_latencies
     from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import recorded_graph
+    from dataflow.reexecution.recorded_run import recorded_graph, resolved_graph
 
     find_modules_in(folders)
     with friendly_errors(), Recording(existing(recording, "a recording")) as opened:
-        found = recorded_latencies(opened, recorded_graph(opened))
+        found = recorded_latencies(opened, resolved_graph(opened) or recorded_graph(opened))
     if not found:
         raise fail(f"{recording}: no firing of a sink is recorded that a source's message caused")
     if json:
-        print_json([_as_json(path) for path in found])
+        print_json([path.as_json() for path in found])
         return
-    made = table("from", "to", "count", "p50", "p99", "max", "costs most", "work", "wait", right=_NUMBERS)
+    made = table("from", "to", *_NUMBERS[:4], "costs most", *_NUMBERS[4:], right=_NUMBERS)
+    made.padding = (0, 0, 0, 0)
+    for name in (0, 1, 6):
+        made.columns[name].min_width = 8
     for path in found:
         share = next(s for s in path.shares if s.operator == path.costliest)
         numbers = (_ms(path.p50), _ms(path.p99), _ms(path.largest))
@@ -54,21 +52,8 @@ def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json 
     out.print(made)
 
 
-_NUMBERS = ("count", "p50", "p99", "max", "work", "wait")
+_NUMBERS = ("count", "p50 ms", "p99 ms", "max ms", "work ms", "wait ms")
 
 
 def _ms(nanoseconds: float) -> str:
-    return f"{nanoseconds * 1e-6:,.2f} ms"
-
-
-def _as_json(path: PathLatency) -> dict[str, Any]:
-    return {
-        "source": path.source,
-        "sink": path.sink,
-        "count": path.count,
-        "p50_ms": path.p50 * 1e-6,
-        "p99_ms": path.p99 * 1e-6,
-        "max_ms": path.largest * 1e-6,
-        "costliest": path.costliest,
-        "shares": [{"operator": s.operator, "work_ms": s.work * 1e-6, "wait_ms": s.wait * 1e-6} for s in path.shares],
-    }
+    return f"{nanoseconds * 1e-6:,.2f}"

@@ -224,6 +224,11 @@ def seconds(duration: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
+def milliseconds(nanoseconds: float) -> str:
+    """1234567 → "1.23 ms"."""
+    return f"{nanoseconds * 1e-6:,.2f} ms"
+
+
 _UNITS = {
     "m": "m",
     "s": "s",

@@ -19,6 +19,8 @@ from dataflow.sync import FOREVER, NEVER
 
 NAMED = 3
 """Processes that are waited for and named at most."""
+ENDING = ("closing", "over")
+"""Phases in which the report follows."""
 RATE_OVER = 0.8
 """Seconds over which rates are taken."""
 
@@ -104,7 +106,7 @@ class RunDisplay:
         table = Table(box=None, pad_edge=False, header_style="dim", padding=(0, 2, 0, 0))
         table.add_column("operator", overflow="fold")
         table.add_column("process", style="dim", overflow="fold")
-        for name in ("firings", "Hz", "out", "dropped", "busy", "lag"):
+        for name in ("firings", "Hz", "out", "dropped", "CPU", "wall", "lag"):
             table.add_column(name, justify="right", no_wrap=True)
         front = max((c.done for c in status.operators.values() if c.done not in (NEVER, FOREVER)), default=None)
         elapsed = now - self.began if self.began is not None else 0.0
@@ -117,7 +119,8 @@ class RunDisplay:
                 "" if rate is None else f"{rate:.1f}",
                 count(counts.emitted) if counts.emitted else "",
                 Text(count(counts.dropped), style="yellow") if counts.dropped else "",
-                f"{counts.busy_ns * 1e-9 / elapsed:.0%}" if elapsed > 0.2 else "",
+                _share(counts.cpu_ns, elapsed),
+                _share(counts.wall_ns, elapsed),
                 _lag(counts, front),
             )
         return table
@@ -131,6 +134,10 @@ def waiting_for(status: Status) -> str:
     return f"waiting for {', '.join(status.waiting[:NAMED])}" + (f" and {more} more" if more > 0 else "")
 
 
+def _share(nanoseconds: int, elapsed: float) -> str:
+    return f"{nanoseconds * 1e-9 / elapsed:.0%}" if elapsed > 0.2 else ""
+
+
 def _lag(counts: OperatorCounts, front: int | None) -> str:
     """How far an operator is behind the foremost one, in event time."""
     if counts.done == FOREVER:
@@ -141,16 +148,42 @@ def _lag(counts: OperatorCounts, front: int | None) -> str:
 
 
 @contextmanager
-def shown(console: Console, display: RunDisplay, *, quiet: bool) -> Iterator[Watch | None]:
-    """Shows `display` while the block runs; a terminal gets a live table, a log a line every few seconds."""
+def shown(console: Console, display: RunDisplay, *, quiet: bool) -> Iterator[Watch]:
+    """Shows `display` while the block runs; a terminal gets a live table, a log a line every few seconds.
+
+    Notes are printed as they come, also where there is no display.
+    """
+    notes = Notes(console)
     if quiet:
-        yield None
-        return
-    if not console.is_terminal:
-        yield _line_printer(console, display)
-        return
-    with Live(display, console=console, refresh_per_second=5, transient=True, redirect_stdout=False):
-        yield display.update
+        yield notes.update
+    elif not console.is_terminal:
+        yield _both(notes.update, _line_printer(console, display))
+    else:
+        with Live(display, console=console, refresh_per_second=5, transient=True, redirect_stdout=False):
+            yield _both(notes.update, display.update)
+
+
+class Notes:
+    """Prints the notes of a run while it goes on, each once; those that it ends with are in its report."""
+
+    def __init__(self, console: Console) -> None:
+        self._console, self._printed = console, 0
+
+    def update(self, status: Status) -> None:
+        """Prints what is new. May be called from any thread."""
+        if status.phase in ENDING:
+            return
+        for note in status.notes[self._printed :]:
+            self._printed += 1
+            self._console.print(Text(f"note: {note}", style="yellow"), soft_wrap=True)
+
+
+def _both(first: Watch, second: Watch) -> Watch:
+    def watch(status: Status) -> None:
+        first(status)
+        second(status)
+
+    return watch
 
 
 def _line_printer(console: Console, display: RunDisplay, every: float = 5.0) -> Watch:

@@ -14,13 +14,14 @@ from rich.text import Text
 
 from dataflow.cli.output import count, figure, plural, seconds, size, table
 from dataflow.supervision.report import RunReport
+from dataflow.sync import TICK
 
 _VALUE_WIDTH = 30
 """Columns that the text of a figure may take before it is folded."""
 
 
 def print_report(console: Console, report: RunReport, *, total: float | None = None) -> None:
-    """Prints operators, figures of metrics sinks side by side, drops, restarts, notes, files.
+    """Prints operators, figures of metrics sinks side by side, losses, restarts, notes, files.
 
     `total`: seconds that the whole command took, with starting and closing its processes.
     """
@@ -39,12 +40,8 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
     ]
     if blocks:
         console.print(Columns(blocks, padding=(0, 3)))
-    if any(report.drops.values()):
-        console.print(Text("dropped", style="bold yellow"))
-        console.print(Padding(_reasons(report.drops), (0, 0, 1, 2), expand=False))
-    if any(report.waits.values()):
-        console.print(Text("waits given up (timeout), messages after their firing (late)", style="bold yellow"))
-        console.print(Padding(_reasons(report.waits), (0, 0, 1, 2), expand=False))
+    if any(report.drops.values()) or any(report.waits.values()):
+        console.print(_losses(report))
     for operator, times in report.restarts.items():
         console.print(Text(f"{operator} was restarted {plural(times, 'time')}", style="yellow"))
     for note in report.notes:
@@ -58,9 +55,19 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
 
 
 def _operators(report: RunReport) -> Table:
-    """A row for each operator; Hz is firings per second of event time."""
-    numbers = ("firings", "out", "Hz", "dropped", "CPU time", "per firing")
+    """A row for each operator; Hz is firings per second of event time, CPU that of its calls, wall s their
+    wall time. What is nothing of all has no column."""
+    timeouts, late = _total(report.waits, "timeout"), _total(report.waits, "late")
+    dropped = {name: counts.dropped for name, counts in report.operators.items()}
+    counted = {
+        heading: numbers
+        for heading, numbers in (("dropped", dropped), ("timeouts", timeouts), ("late", late))
+        if any(numbers.values())
+    }
+    numbers = ("firings", "out", "Hz", *counted, "CPU s", "ms each", "wall s")
     made = table("operator", *numbers, right=numbers)
+    made.padding = (0, 0, 0, 0 if counted else 1)  # one that has all columns fits 80
+    made.columns[0].min_width = 12
     span = 0.0 if report.first is None or report.last is None else (report.last - report.first) * 1e-9
     for name, counts in report.operators.items():
         made.add_row(
@@ -68,11 +75,20 @@ def _operators(report: RunReport) -> Table:
             count(counts.firings) if counts.firings else "",
             count(counts.emitted) if counts.emitted else "",
             f"{(counts.firings - 1) / span:.1f}" if counts.firings > 1 and span > 0 else "",
-            Text(count(counts.dropped), style="yellow") if counts.dropped else "",
-            f"{counts.busy_ns * 1e-9:.2f} s",
-            f"{counts.busy_ns * 1e-6 / counts.firings:.2f} ms" if counts.firings else "",
+            *(Text(count(n) if (n := of.get(name, 0)) else "", style="yellow") for of in counted.values()),
+            f"{counts.cpu_ns * 1e-9:,.2f}",
+            f"{counts.cpu_ns * 1e-6 / counts.firings:,.2f}" if counts.firings else "",
+            f"{counts.wall_ns * 1e-9:,.2f}",
         )
     return made
+
+
+Rows = Mapping[str, tuple[tuple[str, str, int], ...]]
+"""Each operator's (input, what or why, count)."""
+
+
+def _total(rows: Rows, wanted: str) -> dict[str, int]:
+    return {operator: sum(n for _, what, n in found if what == wanted) for operator, found in rows.items()}
 
 
 def _figures(summary: Mapping[str, Any]) -> Table:
@@ -86,17 +102,47 @@ def _figures(summary: Mapping[str, Any]) -> Table:
     return grid
 
 
-def _reasons(found: Mapping[str, tuple[tuple[str, str, int], ...]]) -> Table:
-    """One line for each operator's input and reason."""
-    grid = Table.grid(padding=(0, 2))
-    grid.add_column()
-    grid.add_column(justify="right", no_wrap=True)
-    grid.add_column(overflow="fold")
-    for operator, rows in found.items():
-        for input_name, reason, number in rows:
-            where = f"{operator}.{input_name}" if input_name else operator
-            grid.add_row(Text(where), count(number), Text(reason))
-    return grid
+_MEANS = {
+    "overflow": "the queue was full",
+    "late": "came after its firing",
+    "past": "its stamp lay before one that was sent",
+    "repeated": "had been sent before the restart",
+    "missed": "lost on its way to the process",
+    "reset": "waited when a clock jumped back",
+    "refused": "contradicted its stream's own promise",
+    "non_monotonic": "not sent: its stamp did not increase",
+    "unmatched": "no partner of its stamp",
+    "no_sample": "nothing to sample yet",
+    "stale": "what it would be joined with was too old",
+    "unused": "no firing needed it",
+}
+
+
+def _losses(report: RunReport) -> Table:
+    """A line for each operator's input and what happened there: drops, timeouts and late messages apart."""
+    made = table("input", "what", "number", "", right=("number",))
+    for operator in dict.fromkeys((*report.operators, *report.drops, *report.waits)):
+        drops = report.drops.get(operator, ())
+        for input_name, reason, number in drops:
+            _add(made, operator, input_name, f"dropped: {reason}", number, _meaning(input_name, reason))
+        dropped_late = {input_name: n for input_name, reason, n in drops if reason == "late"}
+        for input_name, what, number in report.waits.get(operator, ()):
+            if what == "timeout":
+                _add(made, operator, input_name, what, number, "wait given up, nothing dropped")
+            elif kept := number - dropped_late.get(input_name, 0):
+                _add(made, operator, input_name, what, kept, "after its firing, for later ones")
+    return made
+
+
+def _meaning(input_name: str, reason: str) -> str:
+    if input_name == TICK:
+        return "came due while it was at work"
+    return _MEANS.get(reason, "")
+
+
+def _add(made: Table, operator: str, input_name: str, what: str, number: int, meaning: str) -> None:
+    where = f"{operator}.{input_name}" if input_name else operator
+    made.add_row(Text(where), Text(what, style="yellow"), count(number), Text(meaning, style="dim"))
 
 
 def timing(report: RunReport) -> str:
@@ -116,7 +162,13 @@ def report_json(report: RunReport) -> dict[str, Any]:
         "first_stamp": report.first,
         "last_stamp": report.last,
         "operators": {
-            name: {"firings": c.firings, "emitted": c.emitted, "dropped": c.dropped, "busy_ms": c.busy_ns * 1e-6}
+            name: {
+                "firings": c.firings,
+                "emitted": c.emitted,
+                "dropped": c.dropped,
+                "cpu_ms": c.cpu_ns * 1e-6,
+                "wall_ms": c.wall_ns * 1e-6,
+            }
             for name, c in report.operators.items()
         },
         "streams": {name: {"messages": n, "digest": digest} for name, (n, digest) in report.streams.items()},

@@ -6,7 +6,7 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgpack
@@ -33,14 +33,19 @@ class Refused(ValueError):
 class HostStatus:
     """What one host says of its operators.
 
-    `counts`: per operator firings, messages emitted, messages dropped, nanoseconds of work, last stamp. `restarts`: how
-    often each was started again; `ended`: those that are through.
+    `counts`: per operator firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns).
+    `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
+    (input, "timeout" or "late"). `behind`: per source the seconds by which its last message was behind the clock when
+    it was read, and when it was sent. `firings`: batches of firing records, where they were asked for.
     """
 
     host: str
     counts: Mapping[str, Sequence[int]]
     restarts: Mapping[str, int]
     ended: frozenset[str]
+    waits: Mapping[str, Mapping[tuple[str, str], int]] = field(default_factory=dict)
+    behind: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    firings: Sequence[bytes] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +71,11 @@ class Hosts:
             time.sleep(AGAIN_AFTER / 5)
         return True
 
-    def statuses(self, timeout: float) -> list[HostStatus]:
-        """Of the hosts that answer, also while their operators are at work."""
-        found = []
-        for answer in self._bus.ask(runtime_key(self._namespace, "status", "**"), timeout=timeout):
-            said = msgpack.unpackb(answer, raw=False)
-            found.append(HostStatus(said["host"], said["counts"], said["restarts"], frozenset(said["ended"])))
-        return sorted(found, key=lambda status: status.host)
+    def statuses(self, timeout: float, *, firings: bool = False) -> list[HostStatus]:
+        """Of the hosts that answer, also while their operators are at work. `firings`: with the last ones."""
+        asked = msgpack.packb({"firings": True}) if firings else b""
+        answers = self._bus.ask(runtime_key(self._namespace, "status", "**"), asked, timeout=timeout)
+        return sorted(map(_status, answers), key=lambda status: status.host)
 
     def parameters(self, operators: Iterable[str], timeout: float) -> dict[str, dict[str, Parameter]]:
         """By operator, of those whose hosts answer: between two firings."""
@@ -104,6 +107,19 @@ class Hosts:
             for answer in self._bus.ask(runtime_key(self._namespace, "param", operator), payload, timeout=left):
                 yield msgpack.unpackb(answer, raw=False)
             time.sleep(AGAIN_AFTER)
+
+
+def _status(answer: bytes) -> HostStatus:
+    said = msgpack.unpackb(answer, raw=False)
+    return HostStatus(
+        said["host"],
+        said["counts"],
+        said["restarts"],
+        frozenset(said["ended"]),
+        {name: {(i, what): n for i, what, n in found} for name, found in said["waits"].items()},
+        {name: (read, sent) for name, (read, sent) in said["behind"].items()},
+        said.get("firings", ()),
+    )
 
 
 @contextlib.contextmanager

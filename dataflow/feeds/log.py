@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter
+from dataflow.firing.work import Work
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import Emission
@@ -63,7 +64,7 @@ class LogFeed:
         self.last = NEVER
         self.firings = 0
         self.ended = False
-        self.busy_ns = 0
+        self.work = Work()
         self.static_digests: dict[str, StreamDigest] = {}
 
     def _final(self, name: str, finals: Mapping[str, int], end: int | None) -> int:
@@ -91,18 +92,21 @@ class LogFeed:
 
     def look_ahead(self) -> int | None:
         if not self._step and not self.ended:
-            started = time.time_ns()
-            first = self._following or next(self._messages, None)
-            self._following = None
-            if first is not None:
-                self._step.append(first)
-                for item in self._messages:
-                    if item.message.stamp != first.message.stamp:
-                        self._following = item
-                        break
-                    self._step.append(item)
-            self.busy_ns += time.time_ns() - started
+            with self.work:
+                self._read_step()
         return self._step[0].message.stamp if self._step else None
+
+    def _read_step(self) -> None:
+        """Reads the messages of the next stamp."""
+        first = self._following or next(self._messages, None)
+        self._following = None
+        if first is not None:
+            self._step.append(first)
+            for item in self._messages:
+                if item.message.stamp != first.message.stamp:
+                    self._following = item
+                    break
+                self._step.append(item)
 
     def admit(self) -> tuple[int, int]:
         step, self._step = self._step, []

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.firing.ports import Emitter, OutputPorts
+from dataflow.firing.work import Work
 from dataflow.graph.model import Node
 from dataflow.operator import Operator, OperatorSpec, ParameterError
 from dataflow.sync import NEVER, Entry
@@ -22,7 +23,8 @@ class Runner:
         self.done = NEVER
         """Every firing at or before this stamp is made."""
         self.ended = False
-        self.busy_ns = 0
+        self.work = Work()
+        """The time of the operator's calls, with checking and sending what came out of them."""
         self.working_since: float | None = None
         """When the call that is under way began (monotonic seconds), for whoever watches over it."""
         self.working_stamp = NEVER
@@ -93,7 +95,3 @@ class Runner:
     def restarted(self) -> int:
         """How often the operator was restarted in this process."""
         return 0
-
-    def report(self) -> Mapping[str, Any]:
-        """What the runner adds to the report of its process at the end."""
-        return {}

@@ -6,7 +6,6 @@ live run are repeated exactly. A `Judge` compares what comes out, digest by dige
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -63,9 +62,6 @@ class RecordedRunner(Runner):
     def result(self) -> Verification:
         """What re-execution has come to so far."""
         return self.judge.result
-
-    def report(self) -> Mapping[str, Any]:
-        return {"verification": self.result.to_wire()}
 
     def setup(self) -> None:
         """`setup()` of the operator; files that have changed since are noted. Raises `OperatorFailure`."""
@@ -128,7 +124,8 @@ class RecordedRunner(Runner):
             self.done = max(self.done, self._records[self._position].stamp - 1)
             return False
         record = self._records[self._position]
-        self._fire(firing, record)
+        with self.work:
+            self._fire(firing, record)
         self._position += 1
         self.done = max(self.done, record.stamp)
         return True
@@ -202,7 +199,6 @@ class RecordedRunner(Runner):
         raise ParameterError("the parameters of a re-execution are the recorded ones")
 
     def _fire(self, firing: Firing, record: FiringRecord) -> None:
-        started = time.time_ns()
         self.judge.given(record, firing)
         if record.detail.get("injected"):  # a fault that was tried out: the operator was not called
             self.result.verified += 1
@@ -224,7 +220,6 @@ class RecordedRunner(Runner):
             self.judge.summary(record, self.calls.summary((record.incarnation, record.stamp)))
         self.firings += record.kind != "finish"
         self.result.verified += 1
-        self.busy_ns += time.time_ns() - started
 
     def _end(self) -> None:
         self.ended, self.done = True, FOREVER

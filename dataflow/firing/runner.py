@@ -117,7 +117,8 @@ class OperatorRunner(Runner):
         self.ports.promise(firing.stamp - 1)
         self.working_stamp, self.working_since = firing.stamp, time.monotonic()
         try:
-            self._fire(firing)
+            with self.work:
+                self._fire(firing)
         finally:
             self.working_since = None
         if firing.kind == "finish":
@@ -153,7 +154,6 @@ class OperatorRunner(Runner):
         self.firings += kind != "finish"
         self._record(kind, firing, started, emissions, None)
         self.ports.publish()
-        self.busy_ns += time.time_ns() - started
         if self.snapshots is not None and kind != "finish":
             self._snapshot_if_due(firing.stamp)
 

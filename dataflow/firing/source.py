@@ -14,6 +14,7 @@ from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter, OutputPorts
 from dataflow.firing.seeding import change_seed, seed_generators
 from dataflow.firing.shared_generators import SharedGenerators, Tripwire
+from dataflow.firing.work import Work
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
 from dataflow.operator import OutputError, Source, outputs_of
@@ -44,7 +45,8 @@ class SourceRunner:
         self.records = FiringLog(node.name, emitter)
         self.firings = 0
         self.ended = False
-        self.busy_ns = 0
+        self.work = Work()
+        """The time of reading `stream()`."""
         self.last = NEVER
         self._read = NEVER  # the stamp that was read last, on whichever thread
         self._steps: Iterator[Mapping[str, Message]] = iter(())
@@ -67,29 +69,23 @@ class SourceRunner:
     def look_ahead(self) -> int | None:
         """The stamp of the next step, or None at the end. Raises `OperatorFailure`."""
         if self._next is None and not self.ended:
-            started = time.time_ns()
-            self._next = self.pull()
-            self.busy_ns += time.time_ns() - started
+            with self.work:
+                self._next = self.pull()
         return None if self._next is None else step_stamp(self._next)
 
     def take(self) -> dict[str, Message] | None:
-        """The next step without emitting it, None at the end: for the thread that reads a source in a live run.
-
-        What counts as work is that thread's CPU time: a device is mostly waited for.
-        """
+        """The next step without emitting it, None at the end: for the thread that reads a source in a live run."""
         step, self._next = self._next, None
         if step is not None:
             return step
-        started = time.thread_time_ns()
-        self._tripwire.set()
-        try:
-            step = self.pull()
-            self._tripwire.check(self.node.name)
-            return step
-        except SharedGenerators as error:
-            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
-        finally:
-            self.busy_ns += time.thread_time_ns() - started
+        with self.work:
+            self._tripwire.set()
+            try:
+                step = self.pull()
+                self._tripwire.check(self.node.name)
+            except SharedGenerators as error:
+                raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
+        return step
 
     def pull(self) -> dict[str, Message] | None:
         """Reads the source's next non-empty step; for live sources called on the reader's own thread.

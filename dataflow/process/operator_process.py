@@ -86,7 +86,7 @@ class OperatorProcess:
             ),
         )
         self.progress = Progress(channel, self.runners, self.feeding, self.live)
-        self.requests = Requests(config, self.runners, self.live, self.progress)
+        self.requests = Requests(config, self.runners, self.live, self.progress, self.outlet.recent)
         self._watch: Watchdog | None = None
         self._probing = False
         self._released = False

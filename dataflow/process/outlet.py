@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel
+from dataflow.process.recent import RecentFirings
 from dataflow.records.black_box import BlackBox
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.sync import NEVER, Entry
@@ -68,6 +69,7 @@ class Outlet:
         incarnations: Mapping[str, int],
     ) -> None:
         self.sent = 0
+        self.recent = RecentFirings()
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
         self._live, self._box, self._firings = live, box, firings
         self._network: Network | None = None
@@ -188,6 +190,7 @@ class Outlet:
         return Envelope(kind, stream, incarnation, seq, stamp, reason=reason)
 
     def record(self, record: FiringRecord) -> None:
+        self.recent.add(record)
         if self._box is not None:  # ahead of its messages, to where it survives this process
             self._box.add(record)
         if self._firings:

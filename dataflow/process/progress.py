@@ -6,8 +6,10 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from dataflow.feeds.log import LogFeed
 from dataflow.firing.calls import summary_of
 from dataflow.firing.protocol import Runner
+from dataflow.firing.source import SourceRunner
 from dataflow.process.channel import Channel
 from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
@@ -33,8 +35,11 @@ class Progress:
         self._clock = clock
         self.counted: dict[str, list[int]] = {}
         """The counts that were last reported."""
+        self.waited: dict[str, list[list[Any]]] = {}
+        """The waits that were last reported."""
+        self.behind: dict[str, list[float]] = {}
+        """By how much sources were last reported to be behind the clock (s): when read, and when sent."""
         self._dropped: dict[str, list[list[Any]]] = {}
-        self._waited: dict[str, list[list[Any]]] = {}
         self._done: dict[str, int] = {}
         self._firings = 0
         self._reported = -REPORT_EVERY
@@ -59,10 +64,10 @@ class Progress:
         self.counted = self.counts()
         drops = {name: found for name, found in self.drops().items() if found != self._dropped.get(name)}
         self._dropped |= drops
-        waits = {name: found for name, found in self.waits().items() if found != self._waited.get(name)}
-        self._waited |= waits
-        behind = self._live.behind()
-        self._channel.send("progress", done=done, counts=self.counted, drops=drops, waits=waits, behind=behind)
+        waits = {name: found for name, found in self.waits().items() if found != self.waited.get(name)}
+        self.waited |= waits
+        self.behind = self._live.behind()
+        self._channel.send("progress", done=done, counts=self.counted, drops=drops, waits=waits, behind=self.behind)
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""
@@ -73,16 +78,16 @@ class Progress:
         return operators + sum(f.firings for f in self._feeding.feeds) + sum(s.firings for s in self._live.runners)
 
     def counts(self) -> dict[str, list[int]]:
-        """For each operator: firings, messages emitted, messages dropped, nanoseconds of work, last stamp."""
+        """For each operator: firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns)."""
         counts = {}
         for source in self._runners.sources:
             refused = source.refused.total()
-            counts[source.node.name] = [source.firings, source.ports.emitted, refused, source.busy_ns, source.last]
+            counts[source.node.name] = _row(source, source.ports.emitted, refused, source.last)
         for runner in self._runners.operators:
             drops = sum(runner.drops.values())
-            counts[runner.node.name] = [runner.firings, runner.ports.emitted, drops, runner.busy_ns, runner.done]
+            counts[runner.node.name] = _row(runner, runner.ports.emitted, drops, runner.done)
         for log in self._feeding.logs:
-            counts["@log"] = [log.firings, sum(n for _, n, _ in log.counts()), 0, log.busy_ns, log.last]
+            counts["@log"] = _row(log, sum(n for _, n, _ in log.counts()), 0, log.last)
         return counts
 
     def drops(self) -> dict[str, list[list[Any]]]:
@@ -122,6 +127,10 @@ class Progress:
             "summaries": {r.node.name: s for r in self._runners.operators if (s := _summary(r))},
             "transport": dict(transport),
         }
+
+
+def _row(maker: SourceRunner | Runner | LogFeed, emitted: int, dropped: int, last: int) -> list[int]:
+    return [maker.firings, emitted, dropped, maker.work.cpu_ns, last, maker.work.wall_ns]
 
 
 def _summary(runner: Runner) -> Mapping[str, Any]:

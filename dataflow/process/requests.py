@@ -13,6 +13,7 @@ from dataflow.process.config import ProcessConfig
 from dataflow.process.inbox import Inbox
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.progress import Progress
+from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
 from dataflow.transport import Bus
 from dataflow.transport.keys import runtime_key
@@ -21,8 +22,11 @@ from dataflow.transport.keys import runtime_key
 class Requests:
     """Takes requests on Zenoh's thread; changes parameters on the main thread, between two firings."""
 
-    def __init__(self, config: ProcessConfig, runners: Runners, live: LiveSources, progress: Progress) -> None:
-        self._config, self._runners, self._live, self._progress = config, runners, live, progress
+    def __init__(
+        self, config: ProcessConfig, runners: Runners, live: LiveSources, progress: Progress, recent: RecentFirings
+    ) -> None:
+        self._config, self._runners, self._live = config, runners, live
+        self._progress, self._recent = progress, recent
 
     def serve(self, bus: Bus, namespace: str, inbox: Inbox) -> None:
         """Declares what is answered."""
@@ -53,20 +57,37 @@ class Requests:
         return maker.set_parameter(asked["name"], asked["value"])
 
     def _answer_status(self, query: Any) -> None:
-        """Answers with the counts of the last report; on Zenoh's thread, so an operator at work holds up nothing."""
+        """Answers with what was reported last; on Zenoh's thread, so an operator at work holds up nothing.
+
+        A request `{"firings": true}` is answered with the firing records of the last seconds too.
+        """
         with query:
-            status = {
+            status: dict[str, Any] = {
                 "host": self._config.label,
                 "counts": self._progress.counted,
+                "waits": self._progress.waited,
+                "behind": self._progress.behind,
                 "restarts": {maker.node.name: self._restarts_of(maker) for maker in self._runners.all},
                 "ended": [maker.node.name for maker in self._runners.all if maker.ended],
             }
+            if _asks_for_firings(query):
+                status["firings"] = self._recent.batches()
             query.reply(query.key_expr, msgpack.packb(status))
 
     def _restarts_of(self, maker: Maker) -> int:
         """How often an operator was restarted, by this process and in the processes before it."""
         here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
         return self._config.resumed(maker.node.name).restarts + here
+
+
+def _asks_for_firings(query: Any) -> bool:
+    payload = b"" if query.payload is None else query.payload.to_bytes()
+    if not payload:
+        return False
+    try:
+        return bool(msgpack.unpackb(payload, raw=False)["firings"])
+    except (ValueError, TypeError, KeyError, msgpack.UnpackException):  # who asks wrongly is told the rest
+        return False
 
 
 def _to_inbox(inbox: Inbox, name: str) -> Callable[[Any], None]:

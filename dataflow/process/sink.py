@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from dataflow.firing.work import Work
 from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
@@ -106,7 +107,7 @@ class SinkProcess:
         self._done = NEVER
         self._report_due = 0.0
         self._flush_due = 0.0
-        self._busy_ns = 0
+        self._work = Work()
         self._ended = False
         self._left = False
         self._outcome = "the supervisor is gone"
@@ -138,9 +139,8 @@ class SinkProcess:
     def _handle(self, item: tuple[Any, ...]) -> None:
         match item:
             case ("envelope", key, payload):
-                started = time.perf_counter_ns()
-                self._receive(key, payload)
-                self._busy_ns += time.perf_counter_ns() - started
+                with self._work:
+                    self._receive(key, payload)
             case ("control", kind, fields):
                 self._control(kind, fields)
 
@@ -218,7 +218,7 @@ class SinkProcess:
             self.channel.send("ended", report={"counts": self._counts(), "transport": self.bus.counters()})
 
     def _counts(self) -> dict[str, list[int]]:
-        return {self.config.label: [0, self.written, 0, self._busy_ns, self._done]}
+        return {self.config.label: [0, self.written, 0, self._work.cpu_ns, self._done, self._work.wall_ns]}
 
     def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
         match kind:

@@ -35,7 +35,7 @@ class DiagnosticsPart(Part):
             return
         self._due = run.steady + DIAGNOSE_EVERY
         counts = {
-            name: (c.firings, c.emitted, c.dropped, c.busy_ns, c.done)
+            name: (c.firings, c.emitted, c.dropped, c.cpu_ns, c.done, c.wall_ns)
             for name, c in run.status.operators.items()
             if not name.startswith("@")
         }

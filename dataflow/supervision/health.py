@@ -6,9 +6,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-State = Literal["starting", "running", "dropping", "silent", "restarting", "ended"]
+State = Literal["starting", "running", "dropping", "timeout", "late", "silent", "restarting", "ended"]
 
-LEVELS: Mapping[State, int] = {"starting": 0, "running": 0, "ended": 0, "dropping": 1, "restarting": 2, "silent": 3}
+LEVELS: Mapping[State, int] = {
+    "starting": 0,
+    "running": 0,
+    "ended": 0,
+    "dropping": 1,
+    "timeout": 1,
+    "late": 1,
+    "restarting": 2,
+    "silent": 3,
+}
 """As in `dataflow.messages.diagnostics.Level`: 0 ok, 1 warn, 2 error, 3 stale."""
 
 SILENT_AFTER = 1.0
@@ -17,7 +26,8 @@ SILENT_AFTER = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """One operator at one moment: rates in Hz, `load` the share of its time at work, `lag` seconds of event time."""
+    """One operator at one moment: rates in Hz; `load` the CPU time of its calls as a share of the time that has passed,
+    `wall` their wall time, with whatever they waited for."""
 
     operator: str
     state: State
@@ -27,6 +37,7 @@ class Health:
     rate: float
     drop_rate: float
     load: float
+    wall: float
     restarts: int = 0
     note: str = ""
     drops: Mapping[tuple[str, str], int] = field(default_factory=dict)
@@ -48,6 +59,7 @@ class Health:
                 "rate_hz": f"{self.rate:.2f}",
                 "drop_rate_hz": f"{self.drop_rate:.2f}",
                 "load": f"{self.load:.3f}",
+                "wall": f"{self.wall:.3f}",
                 "restarts": str(self.restarts),
             }
             | {
@@ -62,9 +74,20 @@ class Health:
 class _Past:
     firings: int = 0
     dropped: int = 0
-    busy_ns: int = 0
+    cpu_ns: int = 0
+    wall_ns: int = 0
+    timeouts: int = 0
+    late: int = 0
     moved: float = 0.0
     period: float = 0.0
+
+    def take_pace(self, past: _Past, now: float) -> None:
+        """Takes over when the operator last fired, and its usual period (s)."""
+        self.moved, self.period = past.moved, past.period
+        if fired := self.firings - past.firings:
+            period = (now - past.moved) / fired
+            self.period = period if not past.period else 0.7 * past.period + 0.3 * period
+            self.moved = now
 
 
 @dataclass(slots=True)
@@ -85,46 +108,69 @@ class HealthMonitor:
         drops: Mapping[str, Mapping[tuple[str, str], int]] | None = None,
         waits: Mapping[str, Mapping[tuple[str, str], int]] | None = None,
     ) -> list[Health]:
-        """`counts`: per operator firings, emitted, dropped, nanoseconds of work, as hosts report them. `away`: those
-        that are being started again, and why; `restarts`: how often each was; `drops`: how many, by (input, reason);
-        `waits`: how many, by (input, "timeout" or "late")."""
+        """Returns the health of every operator since the last call.
+
+        `counts`: per operator firings, emitted, dropped, CPU time (ns), last stamp, wall time (ns), as processes report
+        them. `away`: those that are being restarted, and why; `restarts`: how often each was; `drops`: how many, by
+        (input, reason); `waits`: how many, by (input, "timeout" or "late").
+        """
         span = 0.0 if self._taken is None else now - self._taken
         self._taken = now
         found = []
-        for name, (firings, emitted, dropped, busy_ns, *_) in counts.items():
-            past = self._past.get(name)
-            if past is None:
-                past = self._past[name] = _Past(firings, dropped, busy_ns, now)
+        for name, (firings, emitted, dropped, cpu_ns, _, wall_ns) in counts.items():
+            waited = dict((waits or {}).get(name, {}))
+            fresh = _Past(firings, dropped, cpu_ns, wall_ns, _sum(waited, "timeout"), _sum(waited, "late"), now)
+            past = self._past.get(name, fresh)
             if firings < past.firings:  # a new process counts from nothing
-                past.firings = past.dropped = past.busy_ns = 0
-            fired, lost = firings - past.firings, max(0, dropped - past.dropped)
-            if fired:
-                period = (now - past.moved) / fired
-                past.period = period if not past.period else 0.7 * past.period + 0.3 * period
-                past.moved = now
-            silence = now - past.moved
-            state: State = "running"
-            note = ""
+                past = _Past(moved=past.moved, period=past.period)
+            fresh.take_pace(past, now)
+            silence = now - fresh.moved
+            state, note = _activity(past, fresh, span)
             if name in ended:
-                state = "ended"
+                state, note = "ended", ""
             elif away and name in away:
                 state, note = "restarting", away[name]
             elif not firings:
-                state = "starting"
-            elif silence > max(SILENT_AFTER, 5 * past.period):
+                state, note = "starting", ""
+            elif silence > max(SILENT_AFTER, 5 * fresh.period):
                 state, note = "silent", f"nothing for {silence:.1f} s"
-            elif lost:
-                state, note = "dropping", f"{lost} dropped in {span:.1f} s"
-            rate = fired / span if span else 0.0
-            load = min(1.0, max(0, busy_ns - past.busy_ns) * 1e-9 / span) if span else 0.0
-            past.firings, past.dropped, past.busy_ns = firings, dropped, busy_ns
-            count = (restarts or {}).get(name, 0)
-            drop_rate = lost / span if span else 0.0
-            why = dict((drops or {}).get(name, {}))
-            waited = dict((waits or {}).get(name, {}))
-            health = Health(name, state, firings, emitted, dropped, rate, drop_rate, load, count, note, why, waited)
+            self._past[name] = fresh
+            health = Health(
+                name,
+                state,
+                firings,
+                emitted,
+                dropped,
+                rate=(firings - past.firings) / span if span else 0.0,
+                drop_rate=max(0, dropped - past.dropped) / span if span else 0.0,
+                load=_share(cpu_ns - past.cpu_ns, span),
+                wall=_share(wall_ns - past.wall_ns, span),
+                restarts=(restarts or {}).get(name, 0),
+                note=note,
+                drops=dict((drops or {}).get(name, {})),
+                waits=waited,
+            )
             found.append(health)
         return found
+
+
+def _activity(past: _Past, now: _Past, span: float) -> tuple[State, str]:
+    """The state of an operator that fires, and a note: drops come before timeouts, these before lateness."""
+    if (lost := now.dropped - past.dropped) > 0:
+        return "dropping", f"{lost} dropped in {span:.1f} s"
+    if (given_up := now.timeouts - past.timeouts) > 0:
+        return "timeout", f"{given_up} waits for an input given up in {span:.1f} s"
+    if (late := now.late - past.late) > 0:
+        return "late", f"{late} messages in {span:.1f} s came after their firing"
+    return "running", ""
+
+
+def _sum(waits: Mapping[tuple[str, str], int], kind: str) -> int:
+    return sum(number for (_, what), number in waits.items() if what == kind)
+
+
+def _share(nanoseconds: int, span: float) -> float:
+    return min(1.0, max(0, nanoseconds) * 1e-9 / span) if span else 0.0
 
 
 def diagnostics_fields(healths: Sequence[Health], stamp: int) -> dict[str, Any]:

@@ -6,7 +6,7 @@ time, event time falls behind, and everything after it looks healthy; so it is s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dataflow.supervision.part import Part
@@ -19,7 +19,22 @@ LATE = 1.0
 ITS_OWN = 0.5
 """Share of its lateness that a source must have when it is read, to be the one that is slow."""
 AT_WORK = 0.7
-"""Share of its time that a source is at work when reading it takes longer than real time."""
+"""CPU time of a source, as a share of the time that has passed, from which reading it takes longer than real time."""
+
+
+def held_up_by(others: Sequence[str], read: float, sent: float, load: float) -> str:
+    """Names who holds a source up.
+
+    `others`: the other operators of its process; `read`, `sent`: seconds by which its last message was late when it was
+    read, and when it was sent; `load`: CPU time of reading it, as a share of the time that has passed.
+    """
+    named = ", ".join(others)
+    if read < ITS_OWN * sent:
+        return f"its process is busy with {named or 'sending'}"
+    if load > AT_WORK:
+        return "reading it takes longer than real time"
+    beside = f"with {named}, its process's others, " if named else "with other processes "
+    return f"reading it waits, for a device or a file, or because it shares the CPU {beside}which are busy"
 
 
 class Lateness(Part):
@@ -49,17 +64,11 @@ class Lateness(Part):
             self._said.discard(source)
 
     def _why(self, process: Supervised, source: str, read: float, sent: float) -> str:
-        """Names who holds a source up."""
-        others = ", ".join(name for name in process.nodes if name != source)
-        if read < ITS_OWN * sent:
-            return f"its process is busy with {others or 'sending'}"
         run = self.run
         assert run.release is not None
         elapsed = max(run.steady - run.release.at.steady, 1e-9)
-        if run.status.operators[source].busy_ns * 1e-9 > AT_WORK * elapsed:
-            return "reading it takes longer than real time"
-        beside = f"with {others}, its process's others, " if others else "with other processes "
-        return f"reading it waits, for a device or a file, or because it shares the CPU {beside}which are busy"
+        load = run.status.operators[source].cpu_ns * 1e-9 / elapsed
+        return held_up_by([name for name in process.nodes if name != source], read, sent, load)
 
     def _waits(self, source: str, last: int | None, stamp: int, seconds: float) -> None:
         jump = "" if last is None else f", its stamps jump from {last} to {stamp}"

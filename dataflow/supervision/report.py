@@ -13,13 +13,17 @@ from dataflow.sync import NEVER
 
 @dataclass(frozen=True, slots=True)
 class OperatorCounts:
-    """Progress of one operator: counts so far, nanoseconds of work, and the stamp it has reached."""
+    """Progress of one operator: counts so far, CPU time of its calls, the stamp it has reached, wall time of its calls.
+
+    Times are in nanoseconds.
+    """
 
     firings: int = 0
     emitted: int = 0
     dropped: int = 0
-    busy_ns: int = 0
+    cpu_ns: int = 0
     done: int = NEVER
+    wall_ns: int = 0
 
     def after(self, base: OperatorCounts) -> OperatorCounts:
         """These counts and those of the process before."""
@@ -27,8 +31,9 @@ class OperatorCounts:
             self.firings + base.firings,
             self.emitted + base.emitted,
             self.dropped + base.dropped,
-            self.busy_ns + base.busy_ns,
+            self.cpu_ns + base.cpu_ns,
             self.done,
+            self.wall_ns + base.wall_ns,
         )
 
 

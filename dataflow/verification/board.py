@@ -15,18 +15,19 @@ from dataflow.firing.recorded import RecordedRunner
 
 PHASES = ("start", "setup", "fire", "read", "close")
 _HEAD = 3
-_COUNTS = 5
+_COUNTS = 6
 _WORD = 8
 
 
 class Counts(NamedTuple):
-    """Of one operator: firings and messages so far, nanoseconds of work, the stamp it has done, calls repeated."""
+    """Of one operator: firings and messages so far, CPU time, the stamp it has done, calls repeated, wall time (ns)."""
 
     firings: int
     emitted: int
-    busy_ns: int
+    cpu_ns: int
     done: int
     repeated: int
+    wall_ns: int
 
 
 class Place(NamedTuple):
@@ -65,9 +66,10 @@ class Board:
         at = _HEAD + _COUNTS * self._index[runner.node.name]
         self._cells[at] = runner.firings
         self._cells[at + 1] = runner.ports.emitted
-        self._cells[at + 2] = runner.busy_ns
+        self._cells[at + 2] = runner.work.cpu_ns
         self._cells[at + 3] = runner.done
         self._cells[at + 4] = runner.result.verified
+        self._cells[at + 5] = runner.work.wall_ns
 
     @property
     def steps(self) -> int:

@@ -14,7 +14,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.layout import OUTCOME
 from dataflow.records.comparison import Verification
-from dataflow.records.firing import WITHHELD
+from dataflow.records.firing import CALLS, WITHHELD
 from dataflow.records.reading import FiringLog, Place, whole
 from dataflow.sync import messages_of
 
@@ -27,7 +27,8 @@ class Account:
 
     `unaccounted` were stored, or taken by another operator, and no firing record made them; `not_stored` were made by a
     record and are not in a stream that was recorded. `lost` calls follow a gap in the records. `finished`: the last
-    record is that of `finish()`, but for the `setup()` of a process that was restarted when the node had ended.
+    call is that of `finish()`. What may follow it is no call: a parameter that was changed, the `setup()` of a process
+    that was restarted when the node had ended.
     """
 
     unaccounted: int
@@ -77,7 +78,7 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
                     made[stream].add((record.incarnation, emission.seq))
             if (record.incarnation, record.index) > last:
                 last = (record.incarnation, record.index)
-                finished[name] = record.kind == "finish" or (finished[name] and record.kind == "setup")
+                finished[name] = record.kind == "finish" or (finished[name] and record.kind not in CALLS)
         if name in lost:
             lost[name] = whole(log.of(name))[1]
     accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}

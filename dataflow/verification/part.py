@@ -57,7 +57,10 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         "comparisons": {name: asdict(comparison) for name, comparison in compared.items()},
         "stored": [check.result().to_wire() for check in checks.values()],
         "digests": {s.stream: [s.digest.count, s.digest.hexdigest()] for s in states if s.digest is not None},
-        "work": {n: [r.firings, r.ports.emitted, 0, r.busy_ns, r.done] for n, r in work.runners.items()},
+        "work": {
+            name: [r.firings, r.ports.emitted, 0, r.work.cpu_ns, r.done, r.work.wall_ns]
+            for name, r in work.runners.items()
+        },
         "wall": wall,
     }
 

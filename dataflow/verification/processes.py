@@ -88,9 +88,9 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
         if worker.board.steps:
             status.phase = "running"
         for name in worker.call.operators:
-            counts = worker.board.counts(name)
+            c = worker.board.counts(name)
             status.host_of[name] = f"worker {worker.number}"
-            status.operators[name] = OperatorCounts(counts.firings, counts.emitted, 0, counts.busy_ns, counts.done)
+            status.operators[name] = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
     return status
 
 

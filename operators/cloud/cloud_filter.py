@@ -14,6 +14,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
 from operators.cloud.filtering import Voxels, finite, in_box, in_range, radius_inliers, statistical_inliers
 from operators.cloud.normals import FEWEST, estimate_normals
+from operators.status import counted_status
 
 Corner = tuple[float, float, float]
 
@@ -173,13 +174,6 @@ def _status(cloud: PointCloud, dropped: Mapping[str, int], kept: int) -> Diagnos
         text = f"none of {cloud.count} points is left; most went by: {max(dropped, key=lambda step: dropped[step])}"
     else:
         text = f"{kept} of {cloud.count} points kept"
-    pairs = {"points": cloud.count} | {f"dropped, {step}": n for step, n in dropped.items()} | {"kept": kept}
-    return Diagnostics(
-        stamp=cloud.stamp,
-        names=("cloud_filter",),
-        messages=(text,),
-        levels=np.array([Level.OK if kept else Level.WARN], np.uint8),
-        keys=tuple(pairs),
-        values=tuple(str(n) for n in pairs.values()),
-        owners=np.zeros(len(pairs), np.int32),
-    )
+    counts = {"points": cloud.count} | {f"dropped, {step}": n for step, n in dropped.items()} | {"kept": kept}
+    level = Level.OK if kept else Level.WARN
+    return counted_status("cloud_filter", cloud.stamp, text, level, counts)

@@ -25,6 +25,7 @@ from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.clustering import Shape, dbscan, kept, shape_of
 from operators.cloud.filtering import Voxels, finite
 from operators.cloud.gravity import gravity, unit
+from operators.status import counted_status
 
 FEATURES = "cluster shape: volume (m³), linearity, planarity, sphericity"
 """The model's name on the port `features`."""
@@ -156,12 +157,4 @@ def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
     text = f"{counts['clusters']} clusters of {counts['points in clusters']} points; {counts['points in none']} in none"
     if not usable:
         text = "the cloud has no finite point" if counts["points"] else "the cloud is empty"
-    return Diagnostics(
-        stamp=stamp,
-        names=("clusterer",),
-        messages=(text,),
-        levels=np.array([Level.OK if usable else Level.WARN], np.uint8),
-        keys=tuple(counts),
-        values=tuple(str(n) for n in counts.values()),
-        owners=np.zeros(len(counts), np.int32),
-    )
+    return counted_status("clusterer", stamp, text, Level.OK if usable else Level.WARN, counts)

@@ -17,6 +17,7 @@ from operators.cloud.filtering import finite
 from operators.cloud.gravity import gravity, unit
 from operators.cloud.plane_search import Plane, Scene, Search, find_planes, tolerances
 from operators.cloud.surfaces import SURFACES, Rules, Surface, recognised
+from operators.status import counted_status
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
@@ -200,14 +201,6 @@ def _status(cloud: PointCloud, found: Mapping[str, int], floor_known: bool) -> D
     text = ", ".join(f"{found[name]} {name}" for name in SURFACES if found[name]) or "no plane in the cloud"
     if not floor_known:
         text += "; no floor so far, so level planes have no class"
-    keys = ("points", *SURFACES)
-    values = (str(cloud.count), *(str(found[name]) for name in SURFACES))
-    return Diagnostics(
-        stamp=cloud.stamp,
-        names=("plane_segmenter",),
-        messages=(text,),
-        levels=np.array([Level.OK if found and floor_known else Level.WARN], np.uint8),
-        keys=keys,
-        values=values,
-        owners=np.zeros(len(keys), np.int32),
-    )
+    level = Level.OK if found and floor_known else Level.WARN
+    counts = {"points": cloud.count} | {name: found[name] for name in SURFACES}
+    return counted_status("plane_segmenter", cloud.stamp, text, level, counts)

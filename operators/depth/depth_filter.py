@@ -12,6 +12,7 @@ from dataflow.messages import DepthImage, Diagnostics
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
 from operators.depth.despeckling import bilateral, flying, median, outlying, replaced, valid
+from operators.status import counted_status
 
 
 class DepthFilter(Operator):
@@ -96,12 +97,4 @@ def _status(stamp: int, counts: Mapping[str, int], blind: bool) -> Diagnostics:
     text = f"{counts['replaced']} of {counts['returns']} returns replaced, {counts['removed']} removed"
     if blind:
         text = "no return in range" if counts["returns"] else "the image has no return"
-    return Diagnostics(
-        stamp=stamp,
-        names=("depth_filter",),
-        messages=(text,),
-        levels=np.array([Level.WARN if blind else Level.OK], np.uint8),
-        keys=tuple(counts),
-        values=tuple(str(n) for n in counts.values()),
-        owners=np.zeros(len(counts), np.int32),
-    )
+    return counted_status("depth_filter", stamp, text, Level.WARN if blind else Level.OK, counts)

@@ -1,7 +1,8 @@
 """Sinks that score streams against ground truth."""
 
 from operators.evaluation.detection_metrics import DetectionMetrics
+from operators.evaluation.orientation_metrics import OrientationMetrics
 from operators.evaluation.segmentation_metrics import SegmentationMetrics
 from operators.evaluation.trajectory_metrics import TrajectoryMetrics
 
-__all__ = ["DetectionMetrics", "SegmentationMetrics", "TrajectoryMetrics"]
+__all__ = ["DetectionMetrics", "OrientationMetrics", "SegmentationMetrics", "TrajectoryMetrics"]

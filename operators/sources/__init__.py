@@ -1,8 +1,10 @@
 """Sources: datasets, devices, made-up sequences and a simulated robot."""
 
+from operators.sources.broad_imu import BroadImu
+from operators.sources.euroc_imu import EurocImu
 from operators.sources.rgbd_folder import RgbdFolder
 from operators.sources.simulated_robot import SimulatedRobot
 from operators.sources.synthetic_rgbd import SyntheticRgbd
 from operators.sources.victoria_park import VictoriaPark
 
-__all__ = ["RgbdFolder", "SimulatedRobot", "SyntheticRgbd", "VictoriaPark"]
+__all__ = ["BroadImu", "EurocImu", "RgbdFolder", "SimulatedRobot", "SyntheticRgbd", "VictoriaPark"]

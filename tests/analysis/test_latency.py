@@ -5,16 +5,17 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
-from dataflow.analysis.latency import latencies
+from dataflow.analysis.latency import batch_latencies, latencies
 from dataflow.cli.main import app
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph
-from dataflow.records.firing import WITHHELD, Emission, FiringRecord
+from dataflow.records.firing import WITHHELD, Emission, FiringRecord, encode_batch
 from dataflow.sync import InputRef, MessageRef, RunRef
 
 sys.path.append(str(Path(__file__).resolve().parent))
@@ -38,16 +39,24 @@ operators:
 
 
 def record(
-    operator: str, index: int, begin: float, work: float, inputs: Mapping[str, InputRef] | None = None, seq: int = -2
+    operator: str,
+    index: int,
+    begin: float,
+    work: float,
+    inputs: Mapping[str, InputRef] | None = None,
+    seq: int = -2,
+    stamp: int | None = None,
 ) -> FiringRecord:
-    """A call that began at `begin` ms and took `work` ms, and emitted its `index`-th message, or that of `seq`."""
-    output = Emission(index if seq == -2 else seq, index, bytes(16))
+    """A call that began at `begin` ms and took `work` ms, and emitted its `index`-th message, or that of `seq`. Its
+    stamp is its index where none is given."""
+    stamp = index if stamp is None else stamp
+    output = Emission(index if seq == -2 else seq, stamp, bytes(16))
     return FiringRecord(
         operator,
         0,
         index,
         "fire",
-        index,
+        stamp,
         inputs=inputs or {},
         outputs=(output,),
         wall_start=round(begin * MS),
@@ -104,9 +113,42 @@ def test_percentiles_are_over_all_firings(diamond: Graph) -> None:
 def test_what_is_sampled_causes_nothing_while_there_is_a_trigger(diamond: Graph) -> None:
     given = one_round(diamond, 0, 100, slow=10)
     join = given["join"][0]
-    given["lidar"] = [record("lidar", 0, 1, 0.5)]
+    given["lidar"] = [record("lidar", 0, 1, 0.5, stamp=-5)]
     given["join"] = [record("join", 0, 114, 2, {**join.inputs, "hint": message(diamond, "lidar", 0)})]
     assert [path.source for path in latencies(diamond, given)] == ["camera"]
+
+
+def test_a_message_that_is_given_twice_is_sampled(diamond: Graph) -> None:
+    """Even where it once had the stamp of the firing."""
+    rounds = [one_round(diamond, k, 100.0 + 50 * k, slow=10) for k in range(2)]
+    given = {name: [r for each in rounds for r in each[name]] for name in rounds[0]}
+    hint = message(diamond, "lidar", 0)
+    given["lidar"] = [record("lidar", 0, 1, 0.5)]
+    given["join"] = [replace(r, inputs={**r.inputs, "hint": hint}) for r in given["join"]]
+    assert [path.source for path in latencies(diamond, given)] == ["camera"]
+
+
+def test_partners_within_the_tolerance_trigger(diamond: Graph) -> None:
+    join = replace(diamond.nodes["join"], tolerance=5)
+    graph = replace(diamond, nodes={**diamond.nodes, "join": join})
+    given = one_round(graph, 0, 100, slow=10)
+    given["lidar"] = [record("lidar", 0, 120, 0.5, stamp=-5)]
+    (fired,) = given["join"]
+    given["join"] = [replace(fired, inputs={**fired.inputs, "hint": message(graph, "lidar", 0)})]
+    assert [path.source for path in latencies(graph, given)] == ["camera", "lidar"]
+
+
+def test_no_operator_is_imported(diamond: Graph) -> None:
+    elsewhere = Graph.from_json(json.loads(json.dumps(diamond.to_json())))
+    nodes = {name: replace(node, use=f"there_is_none:{name}") for name, node in elsewhere.nodes.items()}
+    given = one_round(diamond, 0, 100, slow=10)
+    assert latencies(replace(elsewhere, nodes=nodes), given) == latencies(diamond, given)
+
+
+def test_batches_of_a_running_graph_give_the_same_latencies(diamond: Graph) -> None:
+    given = one_round(diamond, 0, 100, slow=10)
+    batches = [encode_batch(records) for records in given.values()]
+    assert batch_latencies(diamond, batches) == latencies(diamond, given)
 
 
 def test_a_timer_is_caused_by_the_newest_message_of_its_batch() -> None:

@@ -109,6 +109,7 @@ def test_looking_at_a_recording_imports_none_of_its_modules(made: tuple[Path, Pa
     for words in (
         ["info", recording],
         ["diff", recording, recording],
+        ["latency", recording],
         ["view", recording, "--to", saved],
     ):
         told = run(tmp_path, *words)

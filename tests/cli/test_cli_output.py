@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from rich.console import Console
 from dataflow.cli.arguments import chosen_streams, existing, output_file, window
 from dataflow.cli.output import figure, friendly_errors, jsonable, plural, seconds, size
 from dataflow.cli.progress import RunDisplay, shown
-from dataflow.cli.report import print_report
+from dataflow.cli.report import print_report, report_json
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
 
 
@@ -160,7 +161,7 @@ def test_the_summary_of_a_run_fits_the_terminal(width: int) -> None:
     lines = file.getvalue().splitlines()
     assert max(map(len, lines)) <= width
     assert any(line.split() == ["ate", "rmse", "0.0123", "m"] for line in lines)
-    assert ["camera", "7", "past"] in [line.split() for line in lines]
+    assert any(line.split()[:4] == ["camera", "dropped:", "past", "7"] for line in lines)
     assert "10.0 s of event time in 5.00 s, 2.00 × real time" in lines[0]
     assert "wrote out/run.mcap (1 message, 5.0 MB)" in lines
 
@@ -172,6 +173,85 @@ def test_progress_shows_no_duration_of_what_has_no_beginning() -> None:
         watch(Status("running", operators={"smooth": OperatorCounts(3)}))
 
     assert console.file.getvalue().split() == ["running", "3", "firings"]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_notes_are_printed_as_they_come_each_once_and_not_those_of_the_end(quiet: bool) -> None:
+    console = Console(file=io.StringIO(), width=100)
+    status = Status("running")
+    with shown(console, RunDisplay(console), quiet=quiet) as watch:
+        watch(status)
+        status.notes.append("source 'robot' has fallen behind the clock: reading it takes longer than real time")
+        watch(status)
+        at_once = console.file.getvalue()  # type: ignore[attr-defined]
+        watch(status)
+        status.phase = "closing"
+        status.notes.append("source 'robot' was 15.0 s behind the clock at the end, 16.0 s at most")
+        watch(status)
+
+    note = "note: source 'robot' has fallen behind the clock: reading it takes longer than real time"
+    assert note in at_once.splitlines()
+    whole = console.file.getvalue()  # type: ignore[attr-defined]
+    assert whole.count("behind the clock") == 1
+
+
+def lossy_report() -> RunReport:
+    """A run in which messages were dropped, waits were given up, and messages came late."""
+    return RunReport(
+        graph="robot",
+        streams={},
+        operators={
+            "camera": OperatorCounts(500, 500, cpu_ns=10**9, wall_ns=2 * 10**9),
+            "fusion": OperatorCounts(100, 100, dropped=14, cpu_ns=5 * 10**8, wall_ns=30 * 10**9),
+        },
+        drops={"fusion": (("image", "late", 2), ("image", "unmatched", 12))},
+        summaries={},
+        transport={},
+        files={},
+        first=0,
+        last=10**10,
+        wall=10.0,
+        interrupted=False,
+        notes=(),
+        waits={"fusion": (("image", "late", 5), ("image", "timeout", 3))},
+    )
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_a_report_tells_drops_timeouts_and_late_messages_apart(width: int) -> None:
+    console = Console(file=io.StringIO(), width=width)
+
+    print_report(console, lossy_report())
+
+    lines = [text.rstrip() for text in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
+    assert max(map(len, lines)) <= width
+    told = [text.split() for text in lines]
+    headings = "operator firings out Hz dropped timeouts late CPU s ms each wall s"
+    assert headings.split() in told
+    assert ["fusion", "100", "100", "9.9", "14", "3", "5", "0.50", "5.00", "30.00"] in told
+    text = "\n".join(" ".join(words) for words in told)
+    assert "fusion.image dropped: late 2 came after its firing" in text
+    assert "fusion.image dropped: unmatched 12 " in text
+    assert "fusion.image late 3 after its firing, for later ones" in text  # of 5, 2 were dropped
+    assert "fusion.image timeout 3 wait given up, nothing dropped" in text
+
+
+def test_a_report_without_losses_has_no_columns_for_them() -> None:
+    console = Console(file=io.StringIO(), width=80)
+    report = lossy_report()
+    counts = {name: replace(c, dropped=0) for name, c in report.operators.items()}
+
+    print_report(console, replace(report, operators=counts, drops={}, waits={}))
+
+    told = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "dropped" not in told
+    assert "timeout" not in told
+
+
+def test_the_json_report_has_cpu_and_wall_time() -> None:
+    fusion = report_json(lossy_report())["operators"]["fusion"]
+
+    assert (fusion["cpu_ms"], fusion["wall_ms"], fusion["dropped"]) == (500.0, 30_000.0, 14)
 
 
 def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkeypatch, capsys) -> None:

@@ -2,27 +2,31 @@
 
 from __future__ import annotations
 
+import io
 import json
 import signal
 import threading
-import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
+from rich.console import Console
 
-from dataflow.cli.top import Board, _table, _title
+from dataflow.cli.board import Board, Sample, heading, line, shown
 from dataflow.client.attach import find_running
 from dataflow.client.processes import HostStatus
-from dataflow.graph import load_graph
+from dataflow.graph import load_graph, load_text
+from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
 from dataflow.supervision.supervisor import Supervisor
 from dataflow.sync import NEVER
+from dataflow.transport.registry import RunningGraph
 
 GRAPH = """\
 graph: tunable
@@ -137,7 +141,8 @@ def test_top_tells_rates_drops_load_and_hosts(dataflow) -> None:
     assert rows["tuned"]["state"] == rows["left"]["state"] == "running"
     assert 20 < rows["left"]["rate"] < 150  # 100 Hz, where the machine can
     assert rows["slow"]["state"] == "dropping"
-    assert rows["slow"]["load"] > 0.5
+    assert rows["slow"]["wall"] > 0.5
+    assert rows["slow"]["load"] < 0.5  # it sleeps
     assert rows["slow"]["drop_rate"] > 5
     assert rows["tuned"]["restarts"] == 0
     assert rows["other"]["host"] == "far"
@@ -149,8 +154,20 @@ def test_top_prints_a_table(dataflow) -> None:
     told = dataflow("top", "--once", "--every", "0.3").stdout
 
     assert told.startswith("tunable  running for ")
-    assert [line.split()[0] for line in told.splitlines()[1:]] == ["operator", "left", "tuned", "slow", "other"]
+    assert [text.split()[0] for text in told.splitlines()[1:6]] == ["operator", "left", "tuned", "slow", "other"]
     assert "expected seconds, 0.05 or more" in dataflow("top", "--every", "0", code=2).stderr
+
+
+@pytest.mark.usefixtures("running")
+def test_top_tells_the_latency_of_every_path_of_the_last_seconds(dataflow) -> None:
+    paths = {(p["source"], p["sink"]): p for p in json.loads(dataflow("top", "--json").stdout)["latencies"]}
+
+    assert set(paths) == {("left", "tuned"), ("left", "slow"), ("left", "other")}
+    for path in paths.values():
+        assert 0 < path["p50_ms"] <= path["p99_ms"]
+    assert paths["left", "slow"]["costliest"] == "slow"
+    assert paths["left", "slow"]["p50_ms"] > 100  # it sleeps as long at every firing
+    assert "costs most" in dataflow("top", "--once", "--every", "0.3").stdout
 
 
 def test_a_host_that_does_not_answer_is_shown_as_such_and_a_change_waits_for_it(dataflow, running: Background) -> None:
@@ -178,6 +195,9 @@ def test_the_changes_stand_in_the_recording_and_top_ends_with_the_graph(dataflow
     running.thread.join(60)
 
     assert "tunable has ended" in told.stderr
+    lines = told.stdout.splitlines()
+    assert [text for text in lines if "operator" in text] == lines[:1]  # one heading
+    assert {text.split()[1] for text in lines[1:]} == {"left", "tuned", "slow", "other"}
     with Recording(running.recording) as recording:
         changed = [r.detail["value"] for r in recorded_firings(recording, "tuned") if r.kind == "param"]
     assert changed[:2] == [2.5, 3.0]
@@ -187,54 +207,131 @@ def test_the_changes_stand_in_the_recording_and_top_ends_with_the_graph(dataflow
 # The board alone
 
 
+Counts = tuple[int, int, int, int, int, int]
+
+
+def graph_with(*names: str) -> Graph:
+    """A graph of operators with these names, of which a board needs no more."""
+    graph = load_text(GRAPH)
+    return replace(graph, nodes={name: replace(graph.nodes["left"], name=name) for name in names})
+
+
 def status(
-    host: str, *, restarts: int = 0, ended: bool = False, **counts: tuple[int, int, int, int, int]
+    host: str,
+    *,
+    restarts: int = 0,
+    ended: bool = False,
+    waits: dict[str, dict[tuple[str, str], int]] | None = None,
+    behind: dict[str, tuple[float, float]] | None = None,
+    **counts: Counts,
 ) -> HostStatus:
-    return HostStatus(host, counts, dict.fromkeys(counts, restarts), frozenset(counts if ended else ()))
+    through = frozenset(counts if ended else ())
+    return HostStatus(host, counts, dict.fromkeys(counts, restarts), through, waits or {}, behind or {})
 
 
 def test_the_board_follows_operators_from_answer_to_answer() -> None:
-    board = Board(["camera", "detector", "planner"])
-    board.update([status("eyes", camera=(10, 10, 0, 0, 10**9)), status("brain", detector=(0, 0, 0, 0, NEVER))], 1.0)
-    rows = board.update(
-        [status("eyes", camera=(40, 40, 0, 0, 4 * 10**9)), status("brain", detector=(5, 5, 6, 10**9, 2 * 10**9))], 3.0
+    board = Board(graph_with("camera", "detector", "planner"))
+    board.update(
+        [status("eyes", camera=(10, 10, 0, 0, 10**9, 0)), status("brain", detector=(0, 0, 0, 0, NEVER, 0))], 1.0
+    )
+    sample = board.update(
+        [
+            status("eyes", camera=(40, 40, 0, 0, 4 * 10**9, 0)),
+            status("brain", detector=(5, 5, 6, 10**9, 2 * 10**9, 15 * 10**8)),
+        ],
+        3.0,
     )
 
-    camera, detector, planner = rows
+    camera, detector, planner = sample.rows
     assert (camera.rate, camera.lag, camera.state, camera.host) == (15.0, 0.0, "running", "eyes")
-    assert (detector.rate, detector.load, detector.drop_rate) == (2.5, 0.5, 3.0)
+    assert (detector.rate, detector.load, detector.wall, detector.drop_rate) == (2.5, 0.5, 0.75, 3.0)
     assert (detector.lag, detector.state) == (2.0, "dropping")
     assert (planner.state, planner.host, planner.lag) == ("no answer", "", None)
 
 
 def test_the_board_keeps_the_last_counts_of_a_host_that_is_away_and_takes_up_its_successor() -> None:
-    board = Board(["camera"])
-    board.update([status("eyes", camera=(10, 10, 2, 0, 10**9))], 1.0)
+    board = Board(graph_with("camera"))
+    board.update([status("eyes", camera=(10, 10, 2, 0, 10**9, 0))], 1.0)
 
-    (away,) = board.update([], 2.0)
+    (away,) = board.update([], 2.0).rows
     assert (away.state, away.firings, away.dropped, away.rate) == ("no answer", 10, 2, 0.0)
-    (back,) = board.update([status("eyes", restarts=1, camera=(1, 1, 0, 0, 2 * 10**9))], 3.0)
+    (back,) = board.update([status("eyes", restarts=1, camera=(1, 1, 0, 0, 2 * 10**9, 0))], 3.0).rows
     assert (back.state, back.restarts, back.rate) == ("running", 1, 1.0)
-    (over,) = board.update([status("eyes", restarts=1, ended=True, camera=(5, 5, 0, 0, 2 * 10**9))], 4.0)
+    (over,) = board.update([status("eyes", restarts=1, ended=True, camera=(5, 5, 0, 0, 2 * 10**9, 0))], 4.0).rows
     assert over.state == "ended"
 
 
+def test_timeouts_and_late_messages_are_no_drops() -> None:
+    board = Board(graph_with("fusion"))
+    board.update([status("brain", fusion=(10, 10, 0, 0, 10**9, 0))], 1.0)
+    waits = {"fusion": {("image", "timeout"): 3, ("image", "late"): 2, ("cloud", "late"): 1}}
+    sample = board.update([status("brain", fusion=(20, 20, 0, 0, 2 * 10**9, 0), waits=waits)], 2.0)
+
+    (fusion,) = sample.rows
+    assert (fusion.state, fusion.dropped, fusion.timeouts, fusion.late) == ("timeout", 0, 3, 3)
+    headings = next(text for text in printed(sample, 80) if text.startswith("operator")).split()
+    assert headings == ["operator", "process", "state", "Hz", "timeouts", "late", "CPU", "wall", "lag"]
+
+
+@pytest.mark.parametrize(
+    ("read", "sent", "cpu", "told"),
+    [
+        (15.0, 15.1, 0.9, "reading it takes longer than real time"),
+        (15.0, 15.1, 0.1, "reading it waits, for a device or a file, or because it shares the CPU with detector"),
+        (0.1, 15.1, 0.1, "its process is busy with detector"),
+    ],
+)
+def test_a_source_behind_the_clock_is_named_with_who_holds_it_up(
+    read: float, sent: float, cpu: float, told: str
+) -> None:
+    board = Board(graph_with("camera", "detector"))
+    board.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
+    counts = {"camera": (20, 20, 0, round(cpu * 1e9), 2 * 10**9, 10**9), "detector": (9, 9, 0, 0, 2 * 10**9, 0)}
+
+    sample = board.update([status("all", behind={"camera": (read, sent)}, **counts)], 2.0)
+
+    note = sample.behind["camera"]
+    assert note.startswith(f"source 'camera' is 15.1 s behind the clock: {told}")
+    camera, detector = sample.rows
+    assert (camera.behind_clock, detector.behind_clock) == (15.1, None)
+    row = next(text for text in printed(sample, 100) if text.startswith("camera"))
+    assert row.split()[-2:] == ["15.1", "s"]
+
+
+def printed(sample: Sample, width: int) -> list[str]:
+    """The lines of a sample on a terminal."""
+    console = Console(width=width, file=io.StringIO(), record=True, legacy_windows=False)
+    console.print(shown(sample, RunningGraph("robot", "robot", 1, 0.0, (), 0.0, {})))
+    return [text.rstrip() for text in console.export_text().splitlines()]
+
+
 def test_the_table_fits_a_terminal_of_80_columns() -> None:
-    from rich.console import Console
-
     names = ["robot", "front_camera/depth_decoder", "trajectory_score", "detector"]
-    board = Board(names)
-    counts = dict.fromkeys(names, (12345678, 1, 1234567, 10**9, 10**18))
+    board = Board(graph_with(*names))
+    counts = dict.fromkeys(names, (12345678, 1, 1234567, 10**9, 10**18, 10**9))
     board.update([HostStatus("perception_host", counts, dict.fromkeys(names, 12), frozenset())], 1.0)
-    more = {name: (12345999, 1, 1239999, 10**10, 10**18 - 10**9 * k) for k, name in enumerate(names)}
-    rows = board.update([HostStatus("perception_host", more, dict.fromkeys(names, 12), frozenset())], 2.0)
-    console = Console(width=80, record=True, file=open("/dev/null", "w"), legacy_windows=False)  # noqa: SIM115
+    more = {name: (12345999, 1, 1239999, 10**10, 10**18 - 10**9 * k, 10**10) for k, name in enumerate(names)}
+    sample = board.update([HostStatus("perception_host", more, dict.fromkeys(names, 12), frozenset())], 2.0)
 
-    console.print(_table(rows, _title("robot", time.time() - 100)))
+    lines = printed(sample, 80)
 
-    lines = console.export_text().splitlines()
     assert max(map(len, lines)) <= 80
     text = "\n".join(lines)
-    assert "…" not in "".join(line[-50:] for line in lines)  # numbers are whole
+    assert "…" not in "".join(each[-50:] for each in lines)  # numbers are whole
     assert "1,239,999" in text
-    assert "5432.0" in text
+    assert "321.0" in text
+
+
+def test_lines_stand_under_their_heading() -> None:
+    board = Board(graph_with("camera", "detector"))
+    board.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
+    sample = board.update(
+        [status("all", camera=(20, 20, 1234, 10**8, 2 * 10**9, 0), detector=(9, 9, 0, 0, 10**9, 0))], 2.0
+    )
+
+    top = heading(sample)
+    for row in sample.rows:
+        text = line(row, sample, 12.0)
+        assert text[top.index("state") :].startswith(row.state)
+        assert text[: top.index("Hz") + 2].endswith(f"{row.rate:.1f}")
+        assert len(text) <= len(top)

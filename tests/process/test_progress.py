@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from process_doubles import RecordedChannel
 
+from dataflow.firing.work import Work
 from dataflow.process.progress import REPORT_EVERY, REPORT_IDLE, Progress
 
 
@@ -17,8 +18,9 @@ class Reporting:
     def __init__(self) -> None:
         ports = SimpleNamespace(emitted=0, states={})
         node = SimpleNamespace(name="last")
-        counts: dict[str, Any] = {"drops": {}, "timeouts": {}, "late": {}}
-        self.operator = SimpleNamespace(node=node, done=0, firings=0, ports=ports, busy_ns=0, **counts)
+        self.operator = SimpleNamespace(
+            node=node, done=0, firings=0, drops={}, timeouts={}, late={}, ports=ports, work=Work()
+        )
         self.channel, self.now = RecordedChannel(), 0.0
         runners: Any = SimpleNamespace(operators=[self.operator], sources=[])
         feeding: Any = SimpleNamespace(feeds=[], logs=[])

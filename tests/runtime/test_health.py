@@ -9,7 +9,7 @@ from dataflow.messages import Diagnostics, Level
 from dataflow.process.sink import _diagnostics
 from dataflow.supervision.health import SILENT_AFTER, Health, HealthMonitor, diagnostics_fields
 
-Counts = dict[str, tuple[int, int, int, int]]
+Counts = dict[str, tuple[int, int, int, int, int, int]]
 
 
 def only(healths: list[Health]) -> Health:
@@ -18,10 +18,21 @@ def only(healths: list[Health]) -> Health:
 
 
 def after(*samples: tuple[float, int, int, float]) -> Health:
-    """The health at the last of (time s, firings, dropped, work s)."""
+    """The health at the last of (time s, firings, dropped, CPU time s); calls take twice that in wall time."""
     monitor = HealthMonitor()
-    found = [monitor.update({"op": (n, n, lost, round(busy * 1e9))}, at) for at, n, lost, busy in samples]
+    found = [monitor.update({"op": counts(n, lost, cpu)}, at) for at, n, lost, cpu in samples]
     return only(found[-1])
+
+
+def counts(firings: int, dropped: int = 0, cpu: float = 0.0) -> tuple[int, int, int, int, int, int]:
+    return firings, firings, dropped, round(cpu * 1e9), 0, round(2 * cpu * 1e9)
+
+
+def while_waiting(before: dict[tuple[str, str], int], now: dict[tuple[str, str], int], dropped: int = 0) -> Health:
+    """The health of an operator that fires on while its waits go from `before` to `now`, within 2 s."""
+    monitor = HealthMonitor()
+    monitor.update({"op": counts(10)}, 10.0, waits={"op": before})
+    return only(monitor.update({"op": counts(30, dropped)}, 12.0, waits={"op": now}))
 
 
 def test_rates_and_load_are_those_since_the_last_update() -> None:
@@ -30,6 +41,7 @@ def test_rates_and_load_are_those_since_the_last_update() -> None:
     assert health.state == "running"
     assert health.rate == pytest.approx(20.0)
     assert health.load == pytest.approx(0.5)
+    assert health.wall == 1.0
     assert health.drop_rate == 0.0
     assert health.level == Level.OK
 
@@ -39,6 +51,31 @@ def test_an_operator_that_drops_says_how_many() -> None:
 
     assert (health.state, health.drop_rate, health.note) == ("dropping", 3.0, "6 dropped in 2.0 s")
     assert health.level == Level.WARN
+
+
+def test_a_timeout_is_no_drop_and_has_a_word_of_its_own() -> None:
+    health = while_waiting({("image", "timeout"): 2}, {("image", "timeout"): 5})
+
+    assert (health.state, health.dropped, health.drop_rate) == ("timeout", 0, 0.0)
+    assert health.note == "3 waits for an input given up in 2.0 s"
+    assert health.level == Level.WARN
+
+
+def test_messages_that_came_late_have_a_word_of_their_own() -> None:
+    health = while_waiting({}, {("image", "late"): 4})
+
+    assert (health.state, health.note) == ("late", "4 messages in 2.0 s came after their firing")
+    assert health.drop_rate == 0.0
+
+
+def test_waits_of_long_ago_say_nothing_of_now() -> None:
+    old = {("image", "late"): 4, ("image", "timeout"): 2}
+
+    assert while_waiting(old, old).state == "running"
+
+
+def test_a_drop_is_said_before_the_wait_that_came_with_it() -> None:
+    assert while_waiting({}, {("image", "late"): 4, ("image", "timeout"): 4}, dropped=1).state == "dropping"
 
 
 def test_an_operator_that_has_not_fired_is_starting() -> None:
@@ -62,10 +99,10 @@ def test_one_that_is_slow_by_nature_is_given_longer() -> None:
 
 def test_one_that_is_away_or_through_says_so_before_anything_else() -> None:
     monitor = HealthMonitor()
-    counts: Counts = {"gone": (5, 5, 0, 0), "through": (5, 5, 0, 0)}
-    monitor.update(counts, 0.0)
+    of: Counts = {"gone": counts(5), "through": counts(5)}
+    monitor.update(of, 0.0)
     gone, through = monitor.update(
-        counts, 60.0, away={"gone": "was killed by SIGKILL"}, ended=frozenset({"through"}), restarts={"gone": 3}
+        of, 60.0, away={"gone": "was killed by SIGKILL"}, ended=frozenset({"through"}), restarts={"gone": 3}
     )
 
     assert (gone.state, gone.note, gone.restarts, gone.level) == ("restarting", "was killed by SIGKILL", 3, Level.ERROR)
@@ -84,7 +121,7 @@ def test_drops_are_told_by_input_and_reason() -> None:
     monitor = HealthMonitor()
     drops = {"op": {("image", "overflow"): 3, ("image", "late"): 1, ("", "past"): 2}}
 
-    values = only(monitor.update({"op": (5, 5, 6, 0)}, 0.0, drops=drops)).values()
+    values = only(monitor.update({"op": counts(5, 6)}, 0.0, drops=drops)).values()
 
     assert values["dropped"] == "6"
     told = {key: count for key, count in values.items() if key.startswith("dropped.")}
@@ -93,8 +130,8 @@ def test_drops_are_told_by_input_and_reason() -> None:
 
 def test_the_diagnostics_stream_says_the_same() -> None:
     healths = [
-        Health("camera", "silent", 7, 7, 0, 0.0, 0.0, 0.0, 0, "nothing for 3.0 s"),
-        Health("detector", "dropping", 9, 9, 4, 5.0, 2.0, 0.9, 1, "4 dropped in 2.0 s"),
+        Health("camera", "silent", 7, 7, 0, 0.0, 0.0, 0.0, 0.0, 0, "nothing for 3.0 s"),
+        Health("detector", "dropping", 9, 9, 4, 5.0, 2.0, 0.9, 1.0, 1, "4 dropped in 2.0 s"),
     ]
 
     message = _diagnostics(diagnostics_fields(healths, 123))

@@ -189,16 +189,19 @@ def test_a_sink_is_compared_by_what_it_sums_up(recorded: Path) -> None:
     assert of(fed, "sum").verdict == "identical"  # given the recorded inputs
 
 
-@pytest.mark.parametrize(("more", "finished"), [(("setup",), True), (("setup", "fire"), False)])
-def test_a_process_that_was_restarted_after_its_operators_had_ended_owes_no_second_end(
-    recorded: Path, more: tuple[Kind, ...], finished: bool
+@pytest.mark.parametrize(
+    ("more", "finished"),
+    [(((1, 0, "setup"),), True), (((0, 99, "param"),), True), (((1, 0, "setup"), (1, 1, "fire")), False)],
+)
+def test_an_operator_that_has_finished_owes_no_second_end_unless_it_is_called_again(
+    recorded: Path, more: tuple[tuple[int, int, Kind], ...], finished: bool
 ) -> None:
+    """A parameter may change, and its process be restarted, while others are still at work."""
     with Recording(recorded) as recording:
         graph = recorded_graph(recording)
         known = FiringLog.read(recording)
         batches = {name: list(known.batches(name)) for name in known.operators}
-        again = [FiringRecord("sum", 1, index, kind, 10**10) for index, kind in enumerate(more)]
-        batches["sum"].append(encode_batch(again))
+        batches["sum"] += [encode_batch([FiringRecord("sum", *place, kind, 10**10)]) for *place, kind in more]
         account = read_ledger(recording, graph, FiringLog(batches, "test"), ["sum"]).accounts["sum"]
     assert account.finished is finished
 

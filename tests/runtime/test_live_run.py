@@ -53,12 +53,12 @@ def test_what_a_source_computes_counts_as_its_work() -> None:
     graph = load_graph(HERE / "live.yaml", settings=["count=60"], live=True)
     source = SourceRunner(graph.nodes["left"], Outlets(), live=True)
     source.setup()
-    assert source.busy_ns == 0
+    assert source.work.cpu_ns == 0
 
     while source.take() is not None:
         pass
 
-    assert source.busy_ns > 0
+    assert source.work.cpu_ns > 0
 
 
 class Outlets:

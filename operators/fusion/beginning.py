@@ -1,0 +1,106 @@
+"""The first estimate of an inertial body: level by gravity, gyroscope bias by rest, heading as far as it is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.fusion.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, updated
+from operators.fusion.late_filter import Hypothesis, Node, Sample
+from operators.fusion.measurements import AngularRate, RestingForce
+from operators.geometry.se3 import skew
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known before anything is measured.
+
+    `position` and `heading` (rad), with standard deviations; without a heading, every one is as likely. Standard
+    deviations of the biases; limits on the readings' standard deviations below which the body rests; the standard
+    deviations of velocity (m/s) and of the mean acceleration (m/s²) of one that does not.
+    """
+
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position_sigma: float = 1000.0
+    heading: float | None = None
+    heading_sigma: float = 0.1
+    gyro_bias: float = 0.02
+    accel_bias: float = 0.2
+    rest_gyro: float = 0.02
+    rest_accel: float = 0.3
+    moving_velocity: float = 1.0
+    moving_accel: float = 0.5
+    headings: int = 12
+
+
+def rests(samples: Sequence[Sample], prior: Prior) -> bool:
+    """Says whether the readings are those of a body at rest: steady, and of about the strength of gravity."""
+    gyro, accel = np.array([s.gyro for s in samples]), np.array([s.accel for s in samples])
+    steady = float(gyro.std(axis=0).max()) < prior.rest_gyro and float(accel.std(axis=0).max()) < prior.rest_accel
+    mean = float(np.linalg.norm(gyro.mean(axis=0)))
+    return steady and mean < 5 * prior.gyro_bias and abs(float(np.linalg.norm(accel.mean(axis=0))) - 9.81) < 0.5
+
+
+def first_node(
+    samples: Sequence[Sample], prior: Prior, gravity: float, *, at_rest: bool, T_body_base: Array | None = None
+) -> Node:
+    """Returns the estimate at the last of the samples, with one hypothesis for each heading in question.
+
+    `T_body_base` (4, 4): the frame whose position and heading the prior knows; the body itself if none.
+    """
+    base = np.eye(4) if T_body_base is None else T_body_base
+    gyro = np.mean([s.gyro for s in samples], axis=0)
+    accel = np.mean([s.accel for s in samples], axis=0)
+    count = len(samples)
+    up = accel / np.linalg.norm(accel)
+    level = _levelling(up)
+    forward = level @ base[:3, 0]
+    level = _turn(-math.atan2(forward[1], forward[0])) @ level  # now the base heads along x
+    known = prior.heading is not None
+    centre = prior.heading if prior.heading is not None else 0.0
+    headings = [centre] if known else [centre + 2 * math.pi * k / prior.headings for k in range(prior.headings)]
+    spread = prior.heading_sigma if known else math.pi / prior.headings
+    period = (samples[-1].time - samples[0].time) * 1e-9 / max(count - 1, 1)
+    noise = samples[-1].noise
+    down = np.array([0.0, 0.0, -gravity])
+    made = []
+    for heading in headings:
+        R = _turn(heading) @ level
+        P = np.zeros((SIZE, SIZE))
+        P[POSITION, POSITION] = np.eye(3) * prior.position_sigma**2
+        P[VELOCITY, VELOCITY] = np.eye(3) * (0.01 if at_rest else prior.moving_velocity) ** 2
+        tilt = np.eye(3) - np.outer(R[2], R[2])  # in the body: what gravity tells, and the heading about it
+        P[ROTATION, ROTATION] = tilt * 0.1**2 + np.outer(R[2], R[2]) * spread**2
+        P[GYRO_BIAS, GYRO_BIAS] = np.eye(3) * prior.gyro_bias**2
+        P[ACCEL_BIAS, ACCEL_BIAS] = np.eye(3) * prior.accel_bias**2
+        state = State(np.array(prior.position) - R @ base[:3, 3], np.zeros(3), R, np.zeros(3), np.zeros(3), P)
+        force = RestingForce(accel, down)
+        sigma2 = noise.accel**2 / period / count if at_rest else prior.moving_accel**2
+        state = updated(state, *force.innovation(state, gyro), np.eye(3) * sigma2)
+        if at_rest:
+            rate = AngularRate(np.zeros(3), np.eye(3))
+            sigma2 = noise.gyro**2 / period / count + 1e-8
+            state = updated(state, *rate.innovation(state, gyro), np.eye(3) * sigma2)
+        made.append(Hypothesis(0.0, state))
+    last = samples[-1]
+    return Node(last.time, tuple(made), last.gyro, last.accel)
+
+
+def _levelling(up: Array) -> Array:
+    """The rotation (3, 3) that brings a direction to z by the shortest way, or about x where it points down."""
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    if up[2] < -0.999999:
+        return np.diag([1.0, -1.0, -1.0])
+    W = skew(axis)
+    return np.asarray(np.eye(3) + W + W @ W / (1.0 + up[2]))
+
+
+def _turn(angle: float) -> Array:
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,330 @@
+"""The state of a robot from all its sensors as an operator."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import (
+    Diagnostics,
+    Imu,
+    LandmarkSightings,
+    MagneticField,
+    Message,
+    NavSatFix,
+    Odometry,
+    Pose,
+    RadarScan,
+    Transforms,
+    Twist,
+)
+from dataflow.messages.geometry import invert
+from dataflow.operator import Context, In, Operator, Out, Param, Sampled
+from operators.fusion.beginning import Prior, first_node, rests
+from operators.fusion.error_state import POSITION, Noise
+from operators.fusion.gate import GateConfig
+from operators.fusion.late_filter import FilterConfig, LateFilter, Measurement, Sample
+from operators.fusion.output import diagnostics, odometry_of
+from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, measurements, use_of
+from operators.geometry.extrinsics import transform_between
+
+Array = NDArray[np.float64]
+_NEVER_AGREE = 1_000_000
+_WITHOUT_PATIENCE = ("doppler", "range")
+
+
+class EkfFusion(Operator):
+    """Fuses inertial, satellite, odometry, pose, velocity, heading, radar and range measurements by an error-state EKF.
+
+    The state is position, velocity, orientation and the biases of the inertial sensor. Inertial samples move it;
+    without them (`motion: constant_velocity`) velocity and angular velocity stay but for noise. Everything else
+    corrects it, at the time when it was measured: what comes late, up to `window`, is put in its place and the rest is
+    done again.
+
+    Settings of a stream stand under the end of its name (`robot/fix`). A chi-square gate refuses what does not
+    fit; measurements that fit only because the filter knows little wait for a second one that agrees, and refused ones
+    that agree with each other show the filter to be wrong, which makes room for them. Detections of a radar and ranges
+    may be of something else, so the filter never yields to those.
+
+    It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
+    rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
+    around are tried side by side until one is left, and the covariance holds them all. Odometry begins when the
+    position's standard deviation is below `sure` for the first time. With `start: origin` the first pose is the world
+    frame.
+
+    Method: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017.
+    """
+
+    measurements: In[Imu | NavSatFix | Pose | Odometry | Twist | MagneticField | RadarScan | LandmarkSightings] = In(
+        many=True, doc="the streams of all sensors"
+    )
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="where the sensors are on the robot; those it does not name are at the base"
+    )
+    landmark_map: Sampled[LandmarkSightings] = Sampled(required=False, doc="where the landmarks of ranges are")
+    odometry: Out[Odometry] = Out(doc="the base in the world frame, with velocity and covariance; with every sample")
+    status: Out[Diagnostics] = Out(doc="what became of each sensor's measurements; every second")
+
+    sensors: dict[str, SensorSettings] = Param(
+        {}, doc="settings by stream, such as robot/fix; the others have defaults"
+    )
+    motion: Literal["inertial", "constant_velocity"] = Param("inertial", doc="what moves the state")
+    start: Literal["unknown", "origin"] = Param("unknown", doc="what is known of the first position and heading")
+    heading: float | None = Param(
+        None, doc="first heading of the base, if known though the position is not", unit="rad"
+    )
+    heading_sigma: float = Param(0.1, gt=0, doc="its standard deviation", unit="rad")
+    world_frame: str = Param("world", min_length=1, doc="frame of the estimate and of absolute poses; z up")
+    base_frame: str = Param("base_link", min_length=1, doc="frame that is posed")
+    origin: tuple[float, float, float] | None = Param(
+        None, doc="latitude, longitude, altitude of the world frame's origin, x east; the first fix if none"
+    )
+    gravity: float = Param(9.80665, gt=0, doc="strength of gravity", unit="m/s²")
+    gyro_noise: float | None = Param(
+        None, gt=0, doc="density of the gyroscope's noise; the samples' covariance if none", unit="rad/s/√Hz"
+    )
+    accel_noise: float | None = Param(
+        None, gt=0, doc="density of the accelerometer's; the samples' covariance if none", unit="m/s²/√Hz"
+    )
+    gyro_walk: float = Param(2e-5, ge=0, doc="random walk of the gyroscope's bias", unit="rad/s²/√Hz")
+    accel_walk: float = Param(3e-4, ge=0, doc="random walk of the accelerometer's bias", unit="m/s³/√Hz")
+    gyro_bias: float = Param(0.02, gt=0, doc="standard deviation of the gyroscope's first bias", unit="rad/s")
+    accel_bias: float = Param(0.2, gt=0, doc="standard deviation of the accelerometer's first bias", unit="m/s²")
+    free_acceleration: float = Param(1.0, gt=0, doc="noise of the velocity without inertial samples", unit="m/s²/√Hz")
+    free_turning: float = Param(0.5, gt=0, doc="noise of the angular velocity without samples", unit="rad/s²/√Hz")
+    rest: float = Param(0.5, gt=0, doc="rest that the filter begins with", unit="s")
+    patience: float = Param(3.0, ge=0, doc="time after which it begins in motion", unit="s")
+    sure: float = Param(1.0, gt=0, doc="odometry begins when the position is known so well", unit="m")
+    window: float = Param(1.0, gt=0, doc="how late measurements may come", unit="s")
+    max_gap: float = Param(0.1, gt=0, doc="time without inertial samples after which motion is unknown", unit="s")
+
+    def setup(self) -> None:
+        self._begin()
+
+    def _begin(self) -> None:
+        self._filter: LateFilter | None = None
+        self._samples: list[Sample] = []
+        self._first_stamp = self._last_sample = self._reported = -1
+        self._before: dict[str, Message] = {}
+        self._origin, self._sure = self.origin, False
+        self._ignored: Counter[str] = Counter()
+        self._body = "" if self.motion == "inertial" else self.base_frame
+        self._extrinsics: Transforms | None = None
+
+    def process(
+        self,
+        measurements: Mapping[str, Message],
+        context: Context,
+        extrinsics: Transforms | None = None,
+        landmark_map: LandmarkSightings | None = None,
+    ) -> dict[str, Any] | None:
+        """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
+        self._extrinsics = extrinsics
+        named = {self._name(stream): message for stream, message in measurements.items()}
+        felt = False
+        for name, message in named.items():
+            settings = self._settings(name)
+            if isinstance(message, Imu) and use_of(name, message, settings) == "inertial":
+                felt = self._feel(name, message, settings)
+        around = Surroundings(self._place, self.world_frame, self._origin, landmark_map)
+        for name, message in named.items():
+            if not (isinstance(message, Imu) and use_of(name, message, self._settings(name)) == "inertial"):
+                self._measure(name, message, around)
+        self._origin = around.origin
+        if self._filter is None or not (felt or self.motion == "constant_velocity"):
+            return None
+        return {"odometry": self._odometry(context.stamp), "status": self._status(context.stamp)}
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: so does the filter."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "filter": None if self._filter is None else self._filter.snapshot(),
+            "samples": [
+                [s.time, s.gyro, s.accel, s.noise.gyro, s.noise.accel, s.noise.gyro_walk, s.noise.accel_walk]
+                for s in self._samples
+            ],
+            "stamps": [self._first_stamp, self._last_sample, self._reported],
+            "before": {
+                name: [m.stamp, m.frame, m.child_frame, m.position, m.orientation]
+                for name, m in self._before.items()
+                if isinstance(m, Odometry)
+            },
+            "origin": None if self._origin is None else list(self._origin),
+            "body": self._body,
+            "sure": int(self._sure),
+            "ignored": dict(self._ignored),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        if state["filter"] is not None:
+            self._filter = LateFilter.restored(self._config(), state["filter"])
+        self._samples = [Sample(int(t), gyro, accel, Noise(*noise)) for t, gyro, accel, *noise in state["samples"]]
+        self._first_stamp, self._last_sample, self._reported = (int(stamp) for stamp in state["stamps"])
+        self._before = {
+            name: Odometry(stamp=int(stamp), frame=frame, child_frame=child, position=p, orientation=q)
+            for name, (stamp, frame, child, p, q) in state["before"].items()
+        }
+        self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
+        self._body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        figures: dict[str, float | int | str] = {}
+        if self._filter is not None:
+            for name, health in sorted(self._filter.health.items()):
+                figures[f"{name}, used"] = health.used + health.widened
+                figures[f"{name}, used after making room"] = health.widened
+                figures[f"{name}, refused"] = health.refused
+                figures[f"{name}, unconfirmed"] = health.unconfirmed
+        ignored = self._ignored + (self._filter.ignored if self._filter is not None else Counter())
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}
+
+    def _name(self, stream: str) -> str:
+        """The name in `sensors` that a stream's name ends with, else its name without the namespace."""
+        for name in self.sensors:
+            if stream == name or stream.endswith(f"/{name}"):
+                return name
+        return stream.partition("/")[2]
+
+    def _settings(self, name: str) -> SensorSettings:
+        return self.sensors.get(name) or SensorSettings()
+
+    def _place(self, frame: str) -> Array:
+        """`T_body_sensor` (4, 4) of a sensor's frame."""
+        if frame == self._body or self._extrinsics is None:
+            return np.eye(4)
+        T_base_sensor = transform_between(self._extrinsics, frame, self.base_frame)
+        return (
+            invert(transform_between(self._extrinsics, self._body or self.base_frame, self.base_frame)) @ T_base_sensor
+        )
+
+    def _config(self) -> FilterConfig:
+        inertial = self.motion == "inertial"
+        gates = {}
+        for name, s in self.sensors.items():
+            never = s.use in _WITHOUT_PATIENCE
+            gates[name] = GateConfig(share=s.share, agreeing=_NEVER_AGREE if never else s.agreeing)
+        return FilterConfig(
+            window=self.window,
+            gravity=self.gravity,
+            max_gap=self.max_gap,
+            inertial=inertial,
+            unknown=Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
+            if inertial
+            else Noise(0.0, self.free_acceleration, self.free_turning, 0.0),
+            gates=gates,
+        )
+
+    def _prior(self) -> Prior:
+        prior = Prior(
+            heading=self.heading,
+            heading_sigma=self.heading_sigma,
+            gyro_bias=self.gyro_bias,
+            accel_bias=self.accel_bias,
+        )
+        if self.start == "origin":
+            return replace(prior, position_sigma=1e-3, heading=self.heading or 0.0, heading_sigma=1e-3)
+        return prior
+
+    def _feel(self, name: str, imu: Imu, settings: SensorSettings) -> bool:
+        """Takes an inertial sample; False where it is ignored."""
+        if self.motion == "constant_velocity":
+            self._ignored[f"{name}: motion is constant_velocity"] += 1
+            return False
+        if not (np.isfinite(imu.angular_velocity).all() and np.isfinite(imu.linear_acceleration).all()):
+            self._ignored[f"{name}: not finite"] += 1
+            return False
+        if self._body not in ("", imu.frame):
+            raise ValueError(
+                f"{name}: a second inertial sensor, {imu.frame!r} beside {self._body!r}: only one can move"
+            )
+        self._body = imu.frame
+        time = imu.stamp - round(settings.offset * 1e9)
+        sample = Sample(time, imu.angular_velocity, imu.linear_acceleration, self._noise(name, imu, time))
+        self._last_sample = time
+        if self._filter is not None:
+            self._filter.feel(sample)
+            return True
+        if self._first_stamp < 0:
+            self._first_stamp = time
+        self._samples = [s for s in self._samples if time - s.time <= self.rest * 1e9] + [sample]
+        waited = (time - self._first_stamp) * 1e-9
+        if waited < self.rest or len(self._samples) < 3:
+            return False
+        prior = self._prior()
+        resting = rests(self._samples, prior)
+        if resting or waited >= self.patience:
+            place = self._place(self.base_frame)
+            node = first_node(self._samples, prior, self.gravity, at_rest=resting, T_body_base=place)
+            self._filter = LateFilter(self._config(), node)
+            self._ignored["begun in motion"] += int(not resting)
+            self._samples = []
+        return self._filter is not None
+
+    def _noise(self, name: str, imu: Imu, time: int) -> Noise:
+        """Densities of the parameters, else of the sample's covariance and the time since the last."""
+        period = min((time - self._last_sample) * 1e-9, 0.1) if self._last_sample >= 0 else 0.01
+        found = []
+        for given, covariance, word in (
+            (self.gyro_noise, imu.angular_velocity_covariance, "gyro_noise"),
+            (self.accel_noise, imu.linear_acceleration_covariance, "accel_noise"),
+        ):
+            if given is None and covariance is None:
+                raise ValueError(f"{name}: its samples have no covariance, so {word} must say how good they are")
+            found.append(given if covariance is None or given is not None else math.sqrt(covariance[0, 0] * period))
+        gyro, accel = found
+        assert gyro is not None
+        assert accel is not None
+        return Noise(gyro, accel, self.gyro_walk, self.accel_walk)
+
+    def _measure(self, name: str, message: Message, around: Surroundings) -> None:
+        if self._filter is None and self.motion == "constant_velocity":
+            self._filter = self._coasting(message.stamp)
+        before = self._before.get(name)
+        if isinstance(message, Odometry):
+            self._before[name] = message
+        if self._filter is None:
+            self._ignored[f"{name}: before the beginning"] += 1
+            return
+        try:
+            for time, sensor, model, noise in measurements(name, message, before, self._settings(name), around):
+                self._filter.measure(Measurement(time, sensor, model, noise))
+        except Unusable as reason:
+            self._ignored[f"{name}: {reason}"] += 1
+
+    def _coasting(self, stamp: int) -> LateFilter:
+        """A filter without inertial sensor: level, with the heading known or not, at any velocity."""
+        up = np.array([0.0, 0.0, self.gravity])
+        quiet = Noise(1e-3, 1e-3, 0.0, 0.0)
+        samples = [Sample(stamp - 1, np.zeros(3), up, quiet), Sample(stamp, np.zeros(3), up, quiet)]
+        prior = self._prior()
+        if prior.heading is None:
+            prior = replace(prior, heading=0.0, heading_sigma=math.pi)
+        prior = replace(prior, gyro_bias=1.0, accel_bias=1e-3, moving_velocity=10.0, moving_accel=1.0)
+        return LateFilter(self._config(), first_node(samples, prior, self.gravity, at_rest=False))
+
+    def _odometry(self, stamp: int) -> Odometry | None:
+        assert self._filter is not None
+        state, rate = self._filter.estimate(stamp)
+        self._sure = self._sure or float(np.diag(state.covariance)[POSITION].max()) < self.sure**2
+        if not self._sure:
+            return None
+        T_body_base = self._place(self.base_frame)
+        return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
+
+    def _status(self, stamp: int) -> Diagnostics | None:
+        assert self._filter is not None
+        if self._reported >= 0 and stamp - self._reported < 10**9:
+            return None
+        self._reported = stamp
+        ignored = self._ignored + self._filter.ignored
+        return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored)

@@ -1,0 +1,165 @@
+"""The error-state Kalman filter of an inertial body: its state, its motion, and the update by an innovation.
+
+The error is (15,): position and velocity in the world's axes, rotation as a right perturbation R <- R exp(θ), gyroscope
+bias, accelerometer bias. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.geometry.se3 import skew
+
+Array = NDArray[np.float64]
+
+POSITION, VELOCITY, ROTATION, GYRO_BIAS, ACCEL_BIAS = (slice(3 * k, 3 * k + 3) for k in range(5))
+SIZE = 15
+_I3, _I15 = np.eye(3), np.eye(SIZE)
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """An estimate: position (3,) and velocity (3,) in the world, R_world_body (3, 3), biases (3,), covariance (15, 15).
+
+    A body without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose sensor reads 0.
+    """
+
+    position: Array
+    velocity: Array
+    rotation: Array
+    gyro_bias: Array
+    accel_bias: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Densities of white noise: gyroscope rad/s/√Hz, accelerometer m/s²/√Hz, and of the biases' random walks."""
+
+    gyro: float
+    accel: float
+    gyro_walk: float
+    accel_walk: float
+
+
+def exp_rotation(w: Array) -> Array:
+    """Returns the rotation (3, 3) of a rotation vector (3,)."""
+    x, y, z = w.tolist()
+    square = x * x + y * y + z * z
+    W = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    if square < 1e-12:
+        a, b = 1.0 - square / 6.0, 0.5 - square / 24.0
+    else:
+        angle = square**0.5
+        a, b = np.sin(angle) / angle, (1.0 - np.cos(angle)) / square
+    return np.asarray(_I3 + a * W + b * (W @ W))
+
+
+def log_rotation(R: Array) -> Array:
+    """Returns the rotation vector (3,) of a rotation (3, 3)."""
+    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
+    sine, cosine = float(np.linalg.norm(vee)), (float(np.trace(R)) - 1.0) / 2.0
+    if sine > 1e-6:
+        return np.asarray(vee * (math.atan2(sine, cosine) / sine))
+    if cosine > 0:
+        return vee
+    column = int(np.argmax(np.diag(R)))  # half a turn: the axis is the largest column of R + I
+    axis = R[:, column] + _I3[column]
+    return np.asarray(math.pi * axis / np.linalg.norm(axis))
+
+
+def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: Noise, gravity: Array) -> State:
+    """Moves the state by the mean readings (rad/s, m/s²) of a short time; `gravity` (3,) in m/s²."""
+    dt = seconds
+    R = state.rotation
+    force = accel - state.accel_bias
+    turn = (gyro - state.gyro_bias) * dt
+    middle = exp_rotation(turn / 2)
+    half = R @ middle
+    acceleration = half @ force + gravity
+    step = exp_rotation(turn)
+    F = _I15.copy()
+    lever = R @ skew(middle @ force)
+    F[POSITION, VELOCITY] = _I3 * dt
+    F[POSITION, ROTATION] = lever * (-0.5 * dt * dt)
+    F[POSITION, ACCEL_BIAS] = half * (-0.5 * dt * dt)
+    F[VELOCITY, ROTATION] = lever * -dt
+    F[VELOCITY, ACCEL_BIAS] = half * -dt
+    F[VELOCITY, GYRO_BIAS] = lever * (0.5 * dt * dt)
+    F[ROTATION, ROTATION] = step.T
+    F[ROTATION, GYRO_BIAS] = middle.T * -dt
+    P = F @ state.covariance @ F.T
+    a, g = noise.accel**2, noise.gyro**2
+    d = P.reshape(-1)[:: SIZE + 1]  # the diagonal, as a view
+    d[POSITION] += a * dt**3 / 3
+    d[VELOCITY] += a * dt
+    d[ROTATION] += g * dt
+    d[GYRO_BIAS] += noise.gyro_walk**2 * dt
+    d[ACCEL_BIAS] += noise.accel_walk**2 * dt
+    index = np.arange(3)
+    P[index, index + 3] += a * dt * dt / 2
+    P[index + 3, index] += a * dt * dt / 2
+    return State(
+        position=state.position + state.velocity * dt + 0.5 * acceleration * dt * dt,
+        velocity=state.velocity + acceleration * dt,
+        rotation=_orthonormal(R @ step),
+        gyro_bias=state.gyro_bias,
+        accel_bias=state.accel_bias,
+        covariance=P,
+    )
+
+
+def moved(state: State, error: Array) -> State:
+    """Adds an error (15,) to the state; the covariance stays."""
+    return State(
+        position=state.position + error[POSITION],
+        velocity=state.velocity + error[VELOCITY],
+        rotation=_orthonormal(state.rotation @ exp_rotation(error[ROTATION])),
+        gyro_bias=state.gyro_bias + error[GYRO_BIAS],
+        accel_bias=state.accel_bias + error[ACCEL_BIAS],
+        covariance=state.covariance,
+    )
+
+
+def difference(state: State, other: State) -> Array:
+    """Returns the error (15,) that brings `state` to `other`."""
+    return np.concatenate(
+        [
+            other.position - state.position,
+            other.velocity - state.velocity,
+            log_rotation(state.rotation.T @ other.rotation),
+            other.gyro_bias - state.gyro_bias,
+            other.accel_bias - state.accel_bias,
+        ]
+    )
+
+
+def updated(state: State, residual: Array, H: Array, R: Array) -> State:
+    """Corrects the state by a residual (M,) with Jacobian (M, 15) and covariance (M, M); Joseph's form."""
+    P = state.covariance
+    PH = P @ H.T
+    K = np.linalg.solve(H @ PH + R, PH.T).T
+    error = K @ residual
+    A = _I15 - K @ H
+    P = A @ P @ A.T + K @ R @ K.T
+    reset = _I15.copy()  # the error is from now on one of the corrected rotation
+    reset[ROTATION, ROTATION] -= 0.5 * skew(error[ROTATION])
+    P = reset @ P @ reset.T
+    return replace(moved(state, error), covariance=0.5 * (P + P.T))
+
+
+def mahalanobis(state: State, residual: Array, H: Array, R: Array) -> tuple[float, float]:
+    """Returns the normalised innovation squared, and the logarithm of the determinant of its covariance."""
+    S = H @ state.covariance @ H.T + R
+    L = np.linalg.cholesky(S)
+    white = np.linalg.solve(L, residual)
+    return float(white @ white), 2.0 * float(np.log(np.diag(L)).sum())
+
+
+def _orthonormal(R: Array) -> Array:
+    """Keeps a nearly orthonormal matrix so: one step of Newton's iteration for the nearest rotation."""
+    return np.asarray(R @ (1.5 * _I3 - 0.5 * (R.T @ R)))

@@ -1,0 +1,338 @@
+"""An error-state filter of measurements in any order: what comes late is put in its place and the rest is done again.
+
+The filter keeps what it was given within a window, in the order of time, with the estimate after each. A late
+measurement therefore gives the same bits as one in time.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.fusion.error_state import (
+    ROTATION,
+    Noise,
+    State,
+    difference,
+    mahalanobis,
+    propagated,
+    updated,
+)
+from operators.fusion.gate import Doubt, GateConfig, Health, judge
+from operators.fusion.measurements import Model, from_plain, to_plain
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Readings of the inertial sensor: time (ns), rad/s (3,), m/s² (3,), and their noise."""
+
+    time: int
+    gyro: Array
+    accel: Array
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What a sensor said about a time (ns), with covariance (M, M)."""
+
+    time: int
+    sensor: str
+    model: Model
+    noise: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One of several estimates, with the logarithm of its weight."""
+
+    weight: float
+    state: State
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor."""
+
+    time: int
+    hypotheses: tuple[Hypothesis, ...]
+    gyro: Array
+    accel: Array
+    health: Mapping[str, Health] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class FilterConfig:
+    """The rules of the filter.
+
+    `window`: seconds for which late measurements are taken; `gravity` in m/s²; `max_gap`: seconds without an inertial
+    sample after which the motion in between is unknown, with the noise `unknown`; `inertial`: there are samples at all.
+    Without them velocity and angular velocity stay but for the noise `unknown`. `gates`: those of single sensors, by
+    the first word of their name.
+    """
+
+    window: float = 1.0
+    gravity: float = 9.80665
+    max_gap: float = 0.1
+    inertial: bool = True
+    unknown: Noise = field(default_factory=lambda: Noise(0.0, 1.0, 1.0, 0.0))
+    gate: GateConfig = field(default_factory=GateConfig)
+    gates: Mapping[str, GateConfig] = field(default_factory=dict)
+
+
+class LateFilter:
+    """Takes inertial samples in order and measurements in any; several hypotheses until one has explained the rest."""
+
+    def __init__(self, config: FilterConfig, start: Node) -> None:
+        self._config = config
+        self._down = np.array([0.0, 0.0, -config.gravity])
+        self._nodes = [start]
+        self._entries: list[Sample | Measurement] = []
+        self._keys: list[tuple[int, int, str, int]] = []
+        self._sample_times: list[int] = []
+        self._samples: list[Sample] = []
+        self._count = 0
+        self.ignored: Counter[str] = Counter()
+
+    @property
+    def time(self) -> int:
+        """The time of the newest estimate, ns."""
+        return self._nodes[-1].time
+
+    @property
+    def health(self) -> Mapping[str, Health]:
+        return self._nodes[-1].health
+
+    @property
+    def hypotheses(self) -> int:
+        return len(self._nodes[-1].hypotheses)
+
+    def feel(self, sample: Sample) -> None:
+        """Takes an inertial sample, later than the last one."""
+        if sample.time <= (self._sample_times[-1] if self._sample_times else self._nodes[0].time):
+            self.ignored["inertial sample not later than the last"] += 1
+            return
+        self._sample_times.append(sample.time)
+        self._samples.append(sample)
+        self._insert(sample, (sample.time, 0, "", 0))
+
+    def measure(self, measurement: Measurement) -> bool:
+        """Takes a measurement; False where it is too late."""
+        if measurement.time < max(self.time - round(self._config.window * 1e9), self._nodes[0].time):
+            self.ignored[f"{measurement.sensor}: too late"] += 1
+            return False
+        self._count += 1
+        self._insert(measurement, (measurement.time, 1, measurement.sensor, self._count))
+        return True
+
+    def estimate(self, time: int) -> tuple[State, Array]:
+        """Returns the state at a time, not before the newest entry, and the gyroscope's reading."""
+        node = self._nodes[-1]
+        if time > node.time:
+            node = self._moved(node, time, node.gyro, node.accel, self._noise())
+        return combined(node.hypotheses), node.gyro
+
+    def snapshot(self) -> dict[str, Any]:
+        """The oldest estimate of the window and what was given since: the rest follows from them."""
+        first = max(0, bisect_right(self._sample_times, self._nodes[0].time))
+        return {
+            "base": _plain_node(self._nodes[0]),
+            "samples": [_plain_sample(s) for s in self._samples[first:]],
+            "measurements": [
+                [e.time, e.sensor, to_plain(e.model), e.noise, key[3]]
+                for e, key in zip(self._entries, self._keys, strict=True)
+                if isinstance(e, Measurement)
+            ],
+            "count": self._count,
+            "ignored": dict(self.ignored),
+        }
+
+    @classmethod
+    def restored(cls, config: FilterConfig, state: Mapping[str, Any]) -> LateFilter:
+        """Goes on where a snapshot was taken."""
+        made = cls(config, _node_of(state["base"]))
+        rows = [(_sample_of(s), 0, "", 0) for s in state["samples"]]
+        entries: list[tuple[Sample | Measurement, int, str, int]] = list(rows)
+        for time, sensor, model, noise, number in state["measurements"]:
+            entries.append((Measurement(int(time), sensor, from_plain(model), noise), 1, sensor, int(number)))
+        entries.sort(key=lambda row: (row[0].time, *row[1:]))
+        made._samples = [row[0] for row in rows]
+        made._sample_times = [s.time for s in made._samples]
+        made._entries = [row[0] for row in entries]
+        made._keys = [(row[0].time, *row[1:]) for row in entries]
+        made._count, made.ignored = int(state["count"]), Counter(state["ignored"])
+        made._advance()
+        return made
+
+    def _noise(self) -> Noise:
+        return self._samples[-1].noise if self._samples else self._config.unknown
+
+    def _insert(self, entry: Sample | Measurement, key: tuple[int, int, str, int]) -> None:
+        place = bisect_right(self._keys, key)
+        self._keys.insert(place, key)
+        self._entries.insert(place, entry)
+        del self._nodes[place + 1 :]
+        self._advance()
+        self._trim()
+
+    def _advance(self) -> None:
+        while len(self._nodes) <= len(self._entries):
+            following = self._entries[len(self._nodes) - 1]
+            if self._config.inertial and isinstance(following, Measurement) and following.time > self._newest_sample():
+                break  # until the readings up to there are known
+            self._nodes.append(self._after(self._nodes[-1], following))
+
+    def _newest_sample(self) -> int:
+        return self._sample_times[-1] if self._sample_times else self._nodes[0].time
+
+    def _trim(self) -> None:
+        """Forgets what lies before the window; in portions, since lists are cut at their beginning."""
+        limit = self.time - round(self._config.window * 1e9)
+        old = bisect_right(self._keys, (limit, -1, "", 0))
+        if old < 64:
+            return
+        old = min(old, len(self._nodes) - 1)
+        del self._nodes[:old], self._keys[:old], self._entries[:old]
+        gone = bisect_right(self._sample_times, self._nodes[0].time)
+        del self._sample_times[:gone], self._samples[:gone]
+
+    def _after(self, node: Node, entry: Sample | Measurement) -> Node:
+        if isinstance(entry, Sample):
+            return self._moved(node, entry.time, entry.gyro, entry.accel, entry.noise)
+        if entry.time > node.time:
+            if self._config.inertial:
+                following = self._samples[bisect_right(self._sample_times, entry.time - 1)]
+                share = (entry.time - node.time) / (following.time - node.time)
+                gyro = node.gyro + share * (following.gyro - node.gyro)
+                accel = node.accel + share * (following.accel - node.accel)
+                noise = following.noise
+            else:
+                gyro, accel, noise = node.gyro, node.accel, self._config.unknown
+            node = self._moved(node, entry.time, gyro, accel, noise)
+        return self._measured(node, entry)
+
+    def _moved(self, node: Node, time: int, gyro: Array, accel: Array, noise: Noise) -> Node:
+        """Moves to a later time by the mean of the readings before and then."""
+        seconds = (time - node.time) * 1e-9
+        inertial = self._config.inertial
+        if inertial and seconds <= self._config.max_gap:
+            mean_gyro, mean_accel = 0.5 * (node.gyro + gyro), 0.5 * (node.accel + accel)
+            hypotheses = tuple(
+                replace(h, state=propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down))
+                for h in node.hypotheses
+            )
+        else:
+            hypotheses = tuple(replace(h, state=self._coasted(h.state, seconds, gyro)) for h in node.hypotheses)
+        return Node(time, hypotheses, gyro, accel, node.health)
+
+    def _coasted(self, state: State, seconds: float, gyro: Array) -> State:
+        """Goes on at the same velocities: what is felt is gravity alone."""
+        steps = max(1, math.ceil(seconds / 0.05))
+        turning = gyro if self._config.inertial else np.zeros(3)
+        for _ in range(steps):
+            force = state.accel_bias - state.rotation.T @ self._down
+            state = propagated(state, turning, force, seconds / steps, self._config.unknown, self._down)
+        return state
+
+    def _measured(self, node: Node, entry: Measurement) -> Node:
+        config = self._config.gates.get(entry.sensor.partition(" ")[0], self._config.gate)
+        health = node.health.get(entry.sensor, Health())
+        found = [entry.model.innovation(h.state, node.gyro) for h in node.hypotheses]
+        scores = [mahalanobis(h.state, r, H, entry.noise) for h, (r, H) in zip(node.hypotheses, found, strict=True)]
+        best = min(range(len(scores)), key=lambda k: scores[k][0])
+        residual, H = found[best]
+        doubt = Doubt(entry.time, residual, entry.noise)
+        verdict = judge(config, health.doubts, doubt, node.hypotheses[best].state, H, scores[best][0])
+        after = health.after(verdict, entry.time, scores[best][0] / len(residual), doubt, config)
+        hypotheses = node.hypotheses
+        if verdict == "widened":
+            since = (entry.time - (health.last_used or self._nodes[0].time)) * 1e-9
+            room = np.diag(entry.model.widening(residual, since))
+            hypotheses = tuple(
+                replace(h, state=replace(h.state, covariance=h.state.covariance + room)) for h in hypotheses
+            )
+        if verdict in ("used", "widened"):
+            hypotheses = _reduced(
+                [
+                    Hypothesis(h.weight - 0.5 * (nis + spread), updated(h.state, r, J, entry.noise))
+                    for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
+                ]
+            )
+        return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after})
+
+
+def _plain_node(node: Node) -> dict[str, Any]:
+    return {
+        "time": node.time,
+        "readings": [node.gyro, node.accel],
+        "hypotheses": [[h.weight, *(getattr(h.state, f.name) for f in fields(State))] for h in node.hypotheses],
+        "health": {
+            name: [
+                *(h.used, h.widened, h.refused, h.unconfirmed, h.last_used, h.nis),
+                [[d.time, d.residual, d.noise] for d in h.doubts],
+            ]
+            for name, h in node.health.items()
+        },
+    }
+
+
+def _node_of(content: Mapping[str, Any]) -> Node:
+    hypotheses = tuple(Hypothesis(float(weight), State(*arrays)) for weight, *arrays in content["hypotheses"])
+    health = {}
+    for name, (used, widened, refused, unconfirmed, last, nis, doubts) in content["health"].items():
+        kept = tuple(Doubt(int(time), residual, noise) for time, residual, noise in doubts)
+        health[name] = Health(used, widened, refused, unconfirmed, last, nis, kept)
+    gyro, accel = content["readings"]
+    return Node(int(content["time"]), hypotheses, gyro, accel, health)
+
+
+def _plain_sample(sample: Sample) -> list[Any]:
+    noise = sample.noise
+    return [sample.time, sample.gyro, sample.accel, noise.gyro, noise.accel, noise.gyro_walk, noise.accel_walk]
+
+
+def _sample_of(content: Sequence[Any]) -> Sample:
+    time, gyro, accel, *noise = content
+    return Sample(int(time), gyro, accel, Noise(*noise))
+
+
+def combined(hypotheses: Sequence[Hypothesis]) -> State:
+    """Returns the likeliest state, with a covariance that holds the others too."""
+    best = max(hypotheses, key=lambda h: h.weight)
+    if len(hypotheses) == 1:
+        return best.state
+    weights = np.exp([h.weight - best.weight for h in hypotheses])
+    weights /= weights.sum()
+    covariance = np.zeros_like(best.state.covariance)
+    for weight, h in zip(weights, hypotheses, strict=True):
+        apart = difference(best.state, h.state)
+        covariance += weight * (h.state.covariance + np.outer(apart, apart))
+    return replace(best.state, covariance=covariance)
+
+
+def _reduced(hypotheses: list[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Drops hypotheses that have become unlikely, and unites those that have become alike."""
+    if len(hypotheses) == 1:
+        return (replace(hypotheses[0], weight=0.0),)
+    ordered = sorted(hypotheses, key=lambda h: -h.weight)
+    kept: list[Hypothesis] = []
+    for h in ordered:
+        if h.weight < ordered[0].weight - 14.0:  # one in a million
+            continue
+        for k, other in enumerate(kept):
+            apart = difference(other.state, h.state)[ROTATION]
+            if float(apart @ np.linalg.solve(other.state.covariance[ROTATION, ROTATION], apart)) < 1.0:
+                kept[k] = replace(other, weight=float(np.logaddexp(other.weight, h.weight)))
+                break
+        else:
+            kept.append(h)
+    return tuple(replace(h, weight=h.weight - kept[0].weight) for h in kept)

@@ -1,0 +1,173 @@
+"""The orientation of an inertial sensor as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from dataflow.messages import Diagnostics, Imu, MagneticField
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.fusion.orientation import Orientation, OrientationConfig
+
+_WARM_UP = 16
+
+
+class OrientationFilter(Operator):
+    """Estimates the orientation of an inertial sensor from its gyroscope, accelerometer and magnetometer.
+
+    With a magnetic field (9-D) the orientation maps the sensor to magnetic east-north-up, and fields that do not look
+    like the earth's are rejected for a while; without one (6-D) the heading begins at 0 and drifts. The gyroscope's
+    bias is estimated at rest and in motion. The output begins when the rate of the samples is known, after 16 of them.
+    Missing samples are bridged up to `max_gap`, with the readings in a straight line; after a longer gap the filter
+    begins anew.
+
+    Method: Laidig and Seel, "VQF: highly accurate IMU orientation estimation with bias estimation and magnetic
+    disturbance rejection", 2023; by the package vqf.
+    """
+
+    imu: In[Imu] = In(doc="angular velocity and specific force")
+    magnetic_field: Sampled[MagneticField] = Sampled(
+        required=False, doc="in the same frame, at the rate of the inertial samples or less"
+    )
+    oriented: Out[Imu] = Out(doc="the samples with their orientation")
+    status: Out[Diagnostics] = Out(doc="whether the sensor rests, the field is disturbed; at every change")
+
+    heading: Literal["magnetic", "relative"] = Param(
+        "magnetic", doc="magnetic uses the field where there is one; relative lets the heading begin at 0"
+    )
+    tau_acc: float = Param(3.0, gt=0, doc="time constant by which the accelerometer corrects the inclination", unit="s")
+    tau_mag: float = Param(9.0, gt=0, doc="and the magnetometer the heading", unit="s")
+    field_rate: float | None = Param(
+        None, gt=0, doc="magnetic fields a second; the rate of the inertial samples if none", unit="Hz"
+    )
+    max_gap: float = Param(0.5, gt=0, doc="longest time without a sample that is bridged", unit="s")
+
+    def setup(self) -> None:
+        self._ignored: Counter[str] = Counter()
+        self._rested = self._samples = 0
+        self._begin()
+
+    def _begin(self) -> None:
+        self._filter: Orientation | None = None
+        self._waiting: list[tuple[int, np.ndarray, np.ndarray]] = []
+        self._last_field = self._last_stamp = -1
+        self._state = ""
+
+    def process(self, imu: Imu, magnetic_field: MagneticField | None = None) -> dict[str, Any] | None:
+        """Raises ValueError where the magnetic field is in another frame."""
+        gyro, accel = imu.angular_velocity, imu.linear_acceleration
+        if not (np.isfinite(gyro).all() and np.isfinite(accel).all()):
+            self._ignored["sample not finite"] += 1
+            return None
+        if self._last_stamp >= 0 and imu.stamp - self._last_stamp > self.max_gap * 1e9:
+            self._ignored["gap, begun anew"] += 1
+            self._begin()
+        self._last_stamp = imu.stamp
+        field = self._new_field(imu, magnetic_field)
+        if self._filter is None and not self._warm(imu):
+            return None
+        assert self._filter is not None
+        if imu.stamp > self._filter.stamp:
+            self._filter.feel(imu.stamp, gyro, accel)
+        if field is not None:
+            self._filter.see(field)
+        self._samples += 1
+        self._rested += self._filter.at_rest
+        q = self._filter.orientation(magnetic=self.heading == "magnetic")
+        oriented = Imu(
+            stamp=imu.stamp,
+            frame=imu.frame,
+            temperature=imu.temperature,
+            angular_velocity=gyro,
+            linear_acceleration=accel,
+            orientation=q,
+            angular_velocity_covariance=imu.angular_velocity_covariance,
+            linear_acceleration_covariance=imu.linear_acceleration_covariance,
+        )
+        return {"oriented": oriented, "status": self._status(imu.stamp)}
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: so does the filter."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "filter": None if self._filter is None else self._filter.snapshot(),
+            "waiting": [list(sample) for sample in self._waiting],
+            "last": [self._last_field, self._last_stamp],
+            "state": self._state,
+            "counts": [self._samples, self._rested],
+            "ignored": dict(self._ignored),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        if state["filter"] is not None:
+            self._filter = Orientation.restored(self._config(), state["filter"])
+        self._waiting = [(int(stamp), gyro, accel) for stamp, gyro, accel in state["waiting"]]
+        self._last_field, self._last_stamp = state["last"]
+        self._samples, self._rested = state["counts"]
+        self._state, self._ignored = state["state"], Counter(state["ignored"])
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        figures: dict[str, float | int | str] = {"samples": self._samples, "at rest": self._rested}
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(self._ignored.items())}
+
+    def _config(self) -> OrientationConfig:
+        return OrientationConfig(self.tau_acc, self.tau_mag, self.field_rate)
+
+    def _new_field(self, imu: Imu, field: MagneticField | None) -> np.ndarray | None:
+        """The field (3,) where it is one that was not used before, and usable."""
+        if field is None or self.heading == "relative" or field.stamp == self._last_field:
+            return None
+        if field.frame != imu.frame:
+            raise ValueError(
+                f"the magnetic field is in the frame {field.frame!r} but the inertial samples in {imu.frame!r}: the "
+                "filter needs both in one"
+            )
+        self._last_field = field.stamp
+        if not np.isfinite(field.field).all() or not field.field.any():
+            self._ignored["field not finite or zero"] += 1
+            return None
+        return field.field
+
+    def _warm(self, imu: Imu) -> bool:
+        """Collects the first samples; makes the filter, and gives them to it, when their rate is known."""
+        self._waiting.append((imu.stamp, imu.angular_velocity, imu.linear_acceleration))
+        if len(self._waiting) < _WARM_UP:
+            return False
+        stamps = [stamp for stamp, _, _ in self._waiting]
+        self._filter = Orientation(self._config(), float(np.median(np.diff(stamps))) * 1e-9)
+        for stamp, gyro, accel in self._waiting:
+            self._filter.feel(stamp, gyro, accel)
+        self._waiting = []
+        return True
+
+    def _status(self, stamp: int) -> Diagnostics | None:
+        """The status, where it differs from the last one that was given."""
+        made = self._filter
+        assert made is not None
+        rest = "at rest" if made.at_rest else "in motion"
+        if self.heading == "relative":
+            field, level = "heading from the gyroscope alone, as asked", 0
+        elif not made.fields:
+            field, level = "no magnetic field: heading from the gyroscope alone", 1
+        elif made.disturbed:
+            field, level = "magnetic field disturbed: heading from the gyroscope meanwhile", 1
+        else:
+            field, level = "heading from the magnetic field", 0
+        state = f"{rest}; {field}"
+        if state == self._state:
+            return None
+        self._state = state
+        return Diagnostics(
+            stamp=stamp,
+            names=("orientation",),
+            messages=(state,),
+            levels=np.array([level], np.uint8),
+            keys=tuple(self._ignored),
+            values=tuple(str(count) for count in self._ignored.values()),
+            owners=np.zeros(len(self._ignored), np.int32) if self._ignored else None,
+        )

@@ -1,0 +1,68 @@
+"""What the fusion says: the pose of the base with its covariance, and the health of the sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Diagnostics, Odometry
+from dataflow.messages.diagnostics import Level
+from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State
+from operators.fusion.gate import Health
+from operators.geometry.se3 import skew
+
+Array = NDArray[np.float64]
+
+
+def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame: str, child_frame: str) -> Odometry:
+    """Returns pose and velocity of the base; `rate` is the gyroscope's reading (3,)."""
+    R, lever, turn = state.rotation, T_body_base[:3, 3], T_body_base[:3, :3]
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R @ turn, state.position + R @ lever
+    pose = np.zeros((6, SIZE))
+    pose[:3, POSITION], pose[:3, ROTATION], pose[3:, ROTATION] = np.eye(3), -R @ skew(lever), R
+    own, angular = R.T @ state.velocity, rate - state.gyro_bias
+    twist = np.zeros((6, SIZE))
+    twist[:3, VELOCITY], twist[:3, ROTATION] = turn.T @ R.T, turn.T @ skew(own)
+    twist[:3, GYRO_BIAS], twist[3:, GYRO_BIAS] = turn.T @ skew(lever), -turn.T
+    P = state.covariance
+    return Odometry.from_matrix(
+        T,
+        stamp=stamp,
+        frame=frame,
+        child_frame=child_frame,
+        linear=turn.T @ (own + np.cross(angular, lever)),
+        angular=turn.T @ angular,
+        pose_covariance=pose @ P @ pose.T,
+        twist_covariance=twist @ P @ twist.T,
+    )
+
+
+def diagnostics(stamp: int, health: Mapping[str, Health], hypotheses: int, ignored: Mapping[str, int]) -> Diagnostics:
+    """Returns a status for the filter and one for every sensor."""
+    text = "one hypothesis" if hypotheses == 1 else f"{hypotheses} headings in question"
+    rows = [("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))]
+    for name, h in sorted(health.items()):
+        silent = h.last_used is None or stamp - h.last_used > 2e9
+        if h.doubts and silent:
+            level, text = Level.ERROR, "refused"
+        elif silent:
+            level, text = Level.STALE, "silent"
+        elif h.nis > 3:
+            level, text = Level.WARN, "worse than it says"
+        else:
+            level, text = Level.OK, "used"
+        counts = {"used": h.used, "made room for": h.widened, "refused": h.refused, "unconfirmed": h.unconfirmed}
+        rows.append((name, text, level, counts))
+    pairs = [(key, str(value), k) for k, row in enumerate(rows) for key, value in row[3].items()]
+    return Diagnostics(
+        stamp=stamp,
+        names=tuple(row[0] for row in rows),
+        messages=tuple(row[1] for row in rows),
+        levels=np.array([row[2] for row in rows], np.uint8),
+        keys=tuple(key for key, _, _ in pairs),
+        values=tuple(value for _, value, _ in pairs),
+        owners=np.array([owner for _, _, owner in pairs], np.int32) if pairs else None,
+    )

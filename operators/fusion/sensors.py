@@ -1,0 +1,285 @@
+"""What the messages of a sensor measure: from types, frames and covariances to measurements of the body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from dataflow.messages import (
+    Imu,
+    LandmarkSightings,
+    MagneticField,
+    Message,
+    NavSatFix,
+    Odometry,
+    Pose,
+    RadarScan,
+    Twist,
+)
+from dataflow.messages.geometry import invert, quaternion_to_matrix, transform_matrix
+from operators.fusion.measurements import (
+    AngularRate,
+    FullPose,
+    MagneticHeading,
+    Model,
+    Orientation,
+    Position,
+    Range,
+    Velocity,
+)
+from operators.geometry import se3
+from operators.geometry.geodesy import east_north_up
+
+Array = NDArray[np.float64]
+Use = Literal[
+    "auto", "inertial", "position", "pose", "orientation", "velocity", "wheels", "heading", "doppler", "range"
+]
+Found = tuple[int, str, Model, Array]
+_I3 = np.eye(3)
+
+
+class SensorSettings(BaseModel):
+    """What a stream is used for and how far it is believed."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    use: Use = Field("auto", description="what it measures; by the type of its messages if auto")
+    offset: float = Field(0.0, ge=-10, le=10, description="seconds by which a measurement is older than its stamp")
+    sigma: float | None = Field(
+        None, gt=0, description="standard deviation of what has a length (m, m/s); the message's covariance if none"
+    )
+    angular_sigma: float | None = Field(
+        None, gt=0, description="standard deviation of what turns (rad, rad/s); the message's covariance if none"
+    )
+    share: float = Field(0.999, gt=0, lt=1, description="share of true measurements that the gate lets through")
+    agreeing: int = Field(3, ge=2, description="refused measurements that must agree until the filter yields to them")
+    still: float = Field(0.002, ge=0, description="wheels slower than this (m/s at the rim) stand still")
+    azimuth: float = Field(
+        math.pi / 2, description="of magnetic north, radians from x towards y; a half π less declination if y is north"
+    )
+
+
+DEFAULT_USE: dict[type[Message], Use] = {
+    Imu: "inertial",
+    NavSatFix: "position",
+    Pose: "pose",
+    Odometry: "velocity",
+    Twist: "velocity",
+    MagneticField: "heading",
+    RadarScan: "doppler",
+    LandmarkSightings: "range",
+}
+_FITTING: dict[str, tuple[type[Message], ...]] = {
+    "inertial": (Imu,),
+    "position": (NavSatFix, Pose, Odometry),
+    "pose": (Pose, Odometry),
+    "orientation": (Imu, Pose, Odometry),
+    "velocity": (Odometry, Twist),
+    "wheels": (Odometry, Twist),
+    "heading": (MagneticField,),
+    "doppler": (RadarScan,),
+    "range": (LandmarkSightings,),
+}
+
+
+class Unusable(Exception):
+    """A message that is ignored: says why."""
+
+
+@dataclass
+class Surroundings:
+    """What measurements are related to: places of sensors on the body, the world's frame, origin and landmarks."""
+
+    place: Callable[[str], Array]
+    world_frame: str
+    origin: tuple[float, float, float] | None = None
+    landmarks: LandmarkSightings | None = None
+
+
+def use_of(name: str, message: Message, settings: SensorSettings) -> str:
+    """Returns what a message is used for. Raises ValueError where it cannot be used so."""
+    use = DEFAULT_USE[type(message)] if settings.use == "auto" else settings.use
+    if not isinstance(message, _FITTING[use]):
+        fitting = " or ".join(t.__name__ for t in _FITTING[use])
+        raise ValueError(f"{name}: {type(message).__name__} cannot be used as {use!r}, which takes {fitting}")
+    return use
+
+
+def measurements(
+    name: str, message: Message, before: Message | None, settings: SensorSettings, around: Surroundings
+) -> Iterator[Found]:
+    """Yields (time, sensor, model, covariance) of a message; `before` is the sensor's last.
+
+    Raises Unusable for a message without use, ValueError for one that its settings do not fit.
+    """
+    use = use_of(name, message, settings)
+    time = message.stamp - round(settings.offset * 1e9)
+    if isinstance(message, NavSatFix):
+        yield time, name, *_fix(name, message, settings, around)
+    elif use in ("position", "pose", "orientation"):
+        yield time, name, *_absolute(name, use, message, settings, around)
+    elif use == "wheels":
+        yield from _wheels(time, name, message, settings, around)
+    elif use == "velocity":
+        yield from _velocity(time, name, message, before, settings, around)
+    elif isinstance(message, MagneticField):
+        field = around.place(message.frame)[:3, :3] @ message.field
+        _check(field)
+        sigma = settings.angular_sigma or 0.1
+        yield time, name, MagneticHeading(field, settings.azimuth), np.array([[sigma**2]])
+    elif isinstance(message, RadarScan):
+        yield from _doppler(time, name, message, settings, around)
+    elif isinstance(message, LandmarkSightings):
+        yield from _ranges(time, name, message, settings, around)
+
+
+def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundings) -> tuple[Model, Array]:
+    if fix.status == "no_fix":
+        raise Unusable("no fix")
+    _check(np.array([fix.latitude, fix.longitude]))
+    if around.origin is None:
+        around.origin = (fix.latitude, fix.longitude, fix.altitude if math.isfinite(fix.altitude) else 0.0)
+    high = math.isfinite(fix.altitude)
+    place = east_north_up(fix.latitude, fix.longitude, fix.altitude if high else around.origin[2], around.origin)
+    if not high:
+        place[2] = np.nan
+    known = np.isfinite(place)
+    noise = _covariance(name, fix.covariance, settings.sigma, "sigma")
+    return Position(place, around.place(fix.frame)[:3, 3]), noise[np.ix_(known, known)]
+
+
+def _absolute(
+    name: str, use: str, message: Message, settings: SensorSettings, around: Surroundings
+) -> tuple[Model, Array]:
+    if isinstance(message, Imu):
+        if message.orientation is None:
+            raise Unusable("no orientation")
+        _check(message.orientation)
+        R = quaternion_to_matrix(message.orientation) @ around.place(message.frame)[:3, :3].T
+        C = _covariance(name, message.orientation_covariance, settings.angular_sigma, "angular_sigma")
+        return Orientation(R), R.T @ C @ R
+    assert isinstance(message, Pose | Odometry)
+    if message.frame != around.world_frame:
+        raise ValueError(
+            f"{name}: poses are in the frame {message.frame!r}, the filter's is {around.world_frame!r}: odometry of a "
+            "frame of its own is used as 'velocity'"
+        )
+    _check(message.position, message.orientation)
+    given = message.covariance if isinstance(message, Pose) else message.pose_covariance
+    T_body_child = around.place(message.child_frame)
+    T = transform_matrix(message.position, message.orientation) @ invert(T_body_child)
+    R = T[:3, :3]
+    C = np.zeros((6, 6))
+    if use != "orientation":
+        C[:3, :3] = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
+    if use == "position":
+        return Position(message.position, T_body_child[:3, 3]), C[:3, :3]
+    angular = _covariance(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
+    C[3:, 3:] = angular
+    if given is not None and settings.sigma is None and settings.angular_sigma is None:
+        C[:3, 3:], C[3:, :3] = given[:3, 3:], given[3:, :3]
+    J = np.eye(6)
+    J[3:, 3:] = R.T
+    if use == "orientation":
+        return Orientation(R), R.T @ angular @ R
+    J[:3, 3:] = -se3.skew(T[:3, 3] - message.position)
+    return FullPose(T[:3, 3], R), J @ C @ J.T
+
+
+def _twist(message: Message, before: Message | None) -> tuple[int, Array, Array, Array | None]:
+    """Half the time since, linear and angular velocity (3,) in the child frame, and their covariance, of a message."""
+    if isinstance(message, Twist):
+        return 0, message.linear, message.angular, message.covariance
+    assert isinstance(message, Odometry)
+    if message.linear is not None and message.angular is not None:
+        return 0, message.linear, message.angular, message.twist_covariance
+    if not isinstance(before, Odometry) or before.frame != message.frame:
+        raise Unusable("first of its kind")
+    span = message.stamp - before.stamp
+    step = se3.log(invert(before.matrix()) @ message.matrix()) / (span * 1e-9)
+    return span // 2, step[:3], step[3:], None
+
+
+def _velocity(
+    time: int, name: str, message: Message, before: Message | None, settings: SensorSettings, around: Surroundings
+) -> Iterator[Found]:
+    half, linear, angular, given = _twist(message, before)
+    _check(linear, angular)
+    frame = message.child_frame if isinstance(message, Odometry) else message.frame  # type: ignore[attr-defined]
+    T_body_sensor = around.place(frame)
+    axes = T_body_sensor[:3, :3].T
+    C = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
+    yield time - half, f"{name} linear", Velocity(linear, axes, T_body_sensor[:3, 3]), C
+    C = _covariance(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
+    yield time - half, f"{name} angular", AngularRate(angular, axes), C
+
+
+def _wheels(time: int, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> Iterator[Found]:
+    """Forward speed, no slip aside or upwards, and rest when the wheels stand."""
+    half, linear, angular, given = _twist(message, None)
+    _check(linear, angular)
+    frame = message.child_frame if isinstance(message, Odometry) else message.frame  # type: ignore[attr-defined]
+    T_body_base = around.place(frame)
+    axes, lever = T_body_base[:3, :3].T, T_body_base[:3, 3]
+    if abs(linear[0]) + abs(angular[2]) * 0.2 <= settings.still:
+        yield time, f"{name} standstill", Velocity(np.zeros(3), axes, lever), _I3 * 0.005**2
+        yield time, f"{name} no turn", AngularRate(np.zeros(3), axes), _I3 * 0.002**2
+        return
+    C = np.diag([0.0, 0.02**2, 0.02**2])
+    C[0, 0] = _covariance(name, None if given is None else given[:1, :1], settings.sigma, "sigma")[0, 0]
+    yield time - half, name, Velocity(np.array([linear[0], 0.0, 0.0]), axes, lever), C
+
+
+def _doppler(time: int, name: str, scan: RadarScan, settings: SensorSettings, around: Surroundings) -> Iterator[Found]:
+    if scan.velocities is None:
+        raise Unusable("no Doppler velocities")
+    T_body_radar = around.place(scan.frame)
+    a = scan.azimuths.astype(np.float64)
+    e = np.zeros_like(a) if scan.elevations is None else scan.elevations.astype(np.float64)
+    directions = np.column_stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]) @ T_body_radar[:3, :3].T
+    sigma = settings.sigma or 0.1
+    for direction, velocity in zip(directions, scan.velocities.tolist(), strict=True):
+        if np.isfinite(direction).all() and math.isfinite(velocity):
+            model = Velocity(np.array([-velocity]), direction[None], T_body_radar[:3, 3])
+            yield time, name, model, np.array([[sigma**2]])
+
+
+def _ranges(
+    time: int, name: str, sightings: LandmarkSightings, settings: SensorSettings, around: Surroundings
+) -> Iterator[Found]:
+    if sightings.ranges is None:
+        raise Unusable("no ranges")
+    if around.landmarks is None or around.landmarks.positions is None:
+        raise Unusable("no map of landmarks")
+    if around.landmarks.positions.shape[1] != 3:
+        raise ValueError(f"{name}: the map of landmarks is planar, and ranges are measured in space")
+    places = dict(zip(around.landmarks.ids.tolist(), around.landmarks.positions, strict=True))
+    lever = around.place(sightings.frame)[:3, 3]
+    for k, (identity, distance) in enumerate(zip(sightings.ids.tolist(), sightings.ranges.tolist(), strict=True)):
+        if identity not in places or not math.isfinite(distance):
+            continue
+        C = None if sightings.covariances is None else sightings.covariances[k, :1, :1]
+        noise = _covariance(name, C, settings.sigma, "sigma")[:1, :1]
+        yield time, name, Range(np.array([distance]), places[identity], lever), noise
+
+
+def _covariance(name: str, given: Array | None, sigma: float | None, setting: str) -> Array:
+    """The covariance that counts: of the setting, else of the message."""
+    if sigma is not None:
+        return np.eye(3) * sigma**2
+    if given is None:
+        raise ValueError(f"{name}: its messages have no covariance, so its {setting} must say how good it is")
+    if not np.isfinite(given).all() or (np.diag(given) <= 0).any():
+        raise Unusable("covariance not positive")
+    return given
+
+
+def _check(*values: Array) -> None:
+    if not all(np.isfinite(v).all() for v in values):
+        raise Unusable("not finite")
