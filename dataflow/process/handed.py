@@ -30,10 +30,11 @@ def take_handed(descriptors: Sequence[int], config: Mapping[str, Any]) -> Handed
     """
     rest = iter(descriptors)
     wake = next(rest)
-    most = None
-    if config["live"]:
-        most = tuple(size * times for size, times in zip(config.get("window", (256, 64 << 20)), BACKLOG, strict=True))
-    outgoing = [(keys, Outgoing(*_three(rest), most)) for keys in config.get("rings_out", ())]
+    window, factors = config.get("window", (256, 64 << 20)), BACKLOG
+    bound = window[0] * factors[0], window[1] * factors[1]
+    outgoing = [
+        (keys, Outgoing(*_three(rest), bound if lossy else None)) for lossy, keys in config.get("rings_out", ())
+    ]
     pools = PoolReader()
     incoming = [Incoming(*_three(rest), keys, pools) for keys in config["rings_in"]]
     return Handed(wake, outgoing, incoming, next(rest, None))

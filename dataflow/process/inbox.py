@@ -66,6 +66,14 @@ class Inbox:
                 self._items.append(("envelope", key, payload))
         return not self._items
 
+    def counters(self) -> dict[str, int]:
+        """Returns what has arrived through the rings."""
+        return {
+            "received_messages": sum(ring.messages for ring in self._incoming),
+            "received_bytes": sum(ring.nbytes for ring in self._incoming),
+            "unresolved": sum(ring.unresolved for ring in self._incoming),
+        }
+
     def qsize(self) -> int:
         return len(self._items)
 

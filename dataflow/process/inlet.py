@@ -6,20 +6,16 @@ envelopes that contradict what their stream has said so far (`misplaced`). Neith
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from dataflow.process.channel import Channel
 from dataflow.process.complaints import Complaints
 from dataflow.process.stream_order import StreamOrder
-from dataflow.transport import Bus, DecodeError, Envelope, Kind, decode
+from dataflow.transport import DecodeError, Envelope, Kind, decode
 
 Deliver = Callable[[str, Envelope], None]
 """Takes the next envelope of a stream."""
-
-
-STATICS_WITHIN = 5.0
 
 
 class StreamDamaged(RuntimeError):
@@ -125,24 +121,6 @@ class Inlet:
                 f"number {first} was due, {following} came"
             )
         self._channel.send("gap", stream=stream, first=first, following=following)
-
-
-def fetch_statics(bus: Bus, namespace: str, inlet: Inlet, streams: Collection[str]) -> None:
-    """Asks for the static ones of some streams, which were given before this process came to be.
-
-    Raises `StreamDamaged` when they do not come in time.
-    """
-    deadline = time.monotonic() + STATICS_WITHIN
-    while missing := inlet.statics_missing(streams):
-        for stream, payload in bus.fetch_statics(namespace, timeout=1.0).items():
-            if stream in missing:
-                inlet.take(stream, payload)
-        if time.monotonic() > deadline and (missing := inlet.statics_missing(streams)):
-            raise StreamDamaged(
-                f"process {inlet.label!r} was restarted and did not get the static streams "
-                f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"
-            )
-        time.sleep(0.01)
 
 
 def _described(envelope: Envelope) -> str:

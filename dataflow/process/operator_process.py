@@ -24,7 +24,7 @@ from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
 from dataflow.process.handed import BACKLOG
 from dataflow.process.inbox import Inbox
-from dataflow.process.inlet import Inlet, fetch_statics
+from dataflow.process.inlet import Inlet, StreamDamaged
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.network import network_config
 from dataflow.process.outlet import Network, Outlet, incarnations_of
@@ -35,13 +35,17 @@ from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
-from dataflow.transport import Bus, Envelope, Outgoing, TapServer
-from dataflow.transport.publisher import BusError
+from dataflow.transport import Bus, BusError, Counters, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
+from dataflow.transport.fanout import POOL_BYTES
 
 IDLE_WAIT = 0.1
 TAKE_WITHIN = 0.001
 """Seconds for what has arrived, before what is decided is run; live runs take all, to know the newest."""
 PROBE_EVERY = 0.01
+STATICS_WITHIN = 5.0
+
+Links = Sequence[tuple[Sequence[str], Outgoing]]
+"""The links to other processes, each with the keys of its channels."""
 
 
 class OperatorProcess:
@@ -52,7 +56,7 @@ class OperatorProcess:
         config: ProcessConfig,
         channel: Channel,
         inbox: Inbox,
-        outgoing: Sequence[tuple[Sequence[str], Outgoing]] = (),
+        outgoing: Links = (),
         box: int | None = None,
     ) -> None:
         """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
@@ -72,10 +76,12 @@ class OperatorProcess:
             static=self.static,
             live=config.live,
         )
+        self.counted = Counters()
+        pool_bytes = POOL_BYTES if self.graph.network.shared_memory else 0
         self.outlet = Outlet(
             channel,
             self.runners.taking,
-            outgoing=outgoing,
+            fanout=Fanout(outgoing, self.counted, pool_bytes=pool_bytes),
             namespace=self.graph.namespace,
             static=self.static,
             live=config.live,
@@ -100,11 +106,13 @@ class OperatorProcess:
     def open(self) -> None:
         """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
         config, graph = self.config, self.graph
-        settings = network_config(graph.network, config.secret, config.listen, config.connect, live=config.live)
-        self.bus = Bus(settings)
+        settings = network_config(graph.network, config.listen, live=config.live)
+        self.bus = Bus(settings, self.counted)
+        self.outside = OutsidePublisher(self.counted, lossless=not config.live)
         self.taps = TapServer(self.bus, graph.namespace)
         made = {*config.publish, *(s for name in config.nodes for s in graph.nodes[name].outputs.values())}
-        self.outlet.open(Network(self.bus, self.taps, {stream: self.bus.publisher(stream) for stream in sorted(made)}))
+        publishers = {stream: self.bus.publisher(stream) for stream in sorted(made)}
+        self.outlet.open(Network(self.bus, self.taps, self.outside, publishers))
         self.channel.send("joined")
         for stream in config.subscribe:
             graph.message_types(stream)  # its messages may be of a type that no operator here names
@@ -112,12 +120,24 @@ class OperatorProcess:
         self.requests.serve(self.bus, graph.namespace, self.inbox)
         self.set_up()
         if config.resume is not None:
-            fetch_statics(self.bus, graph.namespace, self.inlet, config.subscribe)
+            self._await_statics()
         for log in self.feeding.logs:
             log.setup()
         first = [*self.feeding.first_stamps(), *self.live.first_stamps()]
         lengths = [n for source in self.runners.sources if (n := source.source.length()) is not None]
         self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
+
+    def _await_statics(self) -> None:
+        """Waits (bounded) for the static messages that were given before this process came to be: those who made them
+        send them again. Raises `StreamDamaged`."""
+        deadline = time.monotonic() + STATICS_WITHIN
+        while (missing := self.inlet.statics_missing(self.config.subscribe)) and not self._left:
+            if time.monotonic() > deadline:
+                raise StreamDamaged(
+                    f"process {self.config.label!r} was restarted and did not get the static streams "
+                    f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"
+                )
+            self._take(PROBE_EVERY)
 
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
@@ -200,6 +220,8 @@ class OperatorProcess:
         for log in self.feeding.logs:
             log.close()
         self.taps.close()
+        self.outside.close()
+        self.outlet.close()
         try:
             self.bus.close()
         except BusError as error:  # a neighbour that hangs takes no leave; everything that was to be done is done
@@ -294,8 +316,12 @@ class OperatorProcess:
             self._ended = True
             self.outlet.flush_all()
             self.progress.report(idle=True)
-            transport = {**self.bus.counters(), "malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
-            self.channel.send("ended", report=self.progress.final_report(transport))
+            self.channel.send("ended", report=self.progress.final_report(self._moved()))
+
+    def _moved(self) -> dict[str, int]:
+        """Counts what has passed between this process and others."""
+        refused = {"malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
+        return self.counted.as_dict() | self.inbox.counters() | {"unsent": self.outlet.unsent} | refused
 
     def _answer_poll(self, *, idle: bool) -> None:
         """Answers after the work that was there: a process is idle only when a look at everything found nothing."""

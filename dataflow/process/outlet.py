@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,10 +14,18 @@ from dataflow.process.recent import RecentFirings
 from dataflow.records.black_box import BlackBox
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.sync import NEVER, Entry
-from dataflow.transport import Bus, Envelope, Kind, Outgoing, StreamPublisher, TapServer, encode, encode_parts
+from dataflow.transport import (
+    Bus,
+    Envelope,
+    Fanout,
+    Kind,
+    OutsidePublisher,
+    StreamPublisher,
+    TapServer,
+    encode,
+    encode_parts,
+)
 from dataflow.transport.codec import parts_size
-from dataflow.transport.envelope import Buffer
-from dataflow.transport.shared import THRESHOLD
 
 BATCH_RECORDS = 64
 BATCH_SECONDS = 0.25
@@ -43,6 +51,7 @@ class Network:
 
     bus: Bus
     taps: TapServer
+    outside: OutsidePublisher
     publishers: Mapping[str, StreamPublisher]
 
 
@@ -50,9 +59,9 @@ class Outlet:
     """The emitter of all operators of a process: to local aligners by reference, to other processes and taps as
     envelopes.
 
-    `live`: the supervisor is told that a stream has ended. `box`: what keeps the latest firing records should this
-    process die. `firings`: whether a recorder takes the firing records. `incarnations`: by stream, the ones that begin
-    above 0.
+    `fanout`: the links to the others. `live`: the supervisor is told that a stream has ended. `box`: what keeps the
+    latest firing records should this process die. `firings`: whether a recorder takes the firing records.
+    `incarnations`: by stream, the ones that begin above 0.
     """
 
     def __init__(
@@ -60,7 +69,7 @@ class Outlet:
         channel: Channel,
         consumers: Callable[[str], Iterable[Consumer]],
         *,
-        outgoing: Sequence[tuple[Sequence[str], Outgoing]],
+        fanout: Fanout,
         namespace: str,
         static: frozenset[str],
         live: bool,
@@ -73,12 +82,10 @@ class Outlet:
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
         self._live, self._box, self._firings = live, box, firings
         self._network: Network | None = None
-        self._links = [link for _, link in outgoing]
-        self._takers: dict[str, list[tuple[Outgoing, int]]] = {}
-        for keys, link in outgoing:
-            for number, key in enumerate(keys):
-                self._takers.setdefault(key, []).append((link, number))
-        self._held: list[tuple[str, Envelope | bytes]] | None = []
+        self._fanout = fanout
+        self._once: dict[str, list[Envelope]] = {}
+        """What was said on static streams: a consumer that was started again gets it again."""
+        self._held: list[tuple[str, Envelope | bytes, bool]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
         self._logs: dict[str, list[FiringRecord]] = {}
         self._flushed = time.monotonic()
@@ -90,65 +97,78 @@ class Outlet:
     def release(self) -> None:
         """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
         held, self._held = self._held or [], None
-        for stream, envelope in held:
-            self._send(stream, envelope)
+        for key, said, droppable in held:
+            if isinstance(said, Envelope):
+                self._send(key, said, droppable=droppable)
+            else:
+                self._send_bytes(key, said)
 
     def probe(self) -> None:
         """Sends a probe on every key that another process takes."""
-        for stream, takers in self._takers.items():
+        for stream, takers in self._fanout.takers.items():
             parts = encode_parts(Envelope(Kind.PROBE, stream, 0, 0, 0))
             for link, channel in takers:
                 if not link.waiting:
-                    link.send(channel, parts, parts_size(parts), droppable=True, block=None)
+                    link.send(channel, parts, parts_size(parts))
 
     def push(self) -> None:
-        """Sends what has waited for room, as far as there is some."""
-        for link in self._links:
-            if link.waiting:
-                link.flush()
+        """Sends what has waited for room, as far as there is some, and static messages to who has joined."""
+        for keys, link in self._fanout.joined():
+            for number, key in enumerate(keys):
+                for envelope in self._once.get(key, ()):
+                    parts = encode_parts(envelope)
+                    link.send(number, parts, parts_size(parts), droppable=False)
+        self._fanout.flush()
 
     def push_all(self) -> None:
         """Waits (bounded) until everything has room: before this process leaves."""
         deadline = time.monotonic() + PUSH_WITHIN
-        while sum(not link.flush() for link in self._links) and time.monotonic() < deadline:
+        while not self._fanout.flush() and time.monotonic() < deadline:
             time.sleep(0.001)
 
     def consumer_gone(self, number: int) -> None:
         """The process at the other end of a link has died."""
-        self._links[number].take_leave()
+        self._fanout.take_leave(number)
+
+    @property
+    def unsent(self) -> int:
+        """How many envelopes did not reach other processes, which took nothing for too long."""
+        return self._fanout.dropped
+
+    def close(self) -> None:
+        """Lets go of the memory that other processes read."""
+        self._fanout.close()
 
     def _listened(self, stream: str) -> StreamPublisher | None:
         """Returns the publisher of a stream to which somebody outside the run subscribes."""
         publisher = None if self._network is None else self._network.publishers.get(stream)
         return publisher if publisher is not None and publisher.matched else None
 
-    def _send(self, stream: str, envelope: Envelope | bytes) -> None:
+    def _send(self, stream: str, envelope: Envelope, *, droppable: bool = True) -> None:
         """Sends to every process that takes a stream, and over the network if anybody there subscribes to it."""
-        takers, listened = self._takers.get(stream, ()), self._listened(stream)
         if self._held is not None:
-            self._held.append((stream, envelope))
+            self._held.append((stream, envelope, droppable))
             return
-        if not takers and listened is None:
+        listened = self._listened(stream)
+        if listened is None and stream not in self._fanout.takers:
             return
-        parts: list[Buffer] = [envelope] if isinstance(envelope, bytes) else encode_parts(envelope)
-        size = parts_size(parts)
-        if listened is not None:
-            listened.put_bytes(b"".join(parts))
-        if not takers:
+        parts = encode_parts(envelope)
+        if listened is not None and self._network is not None:
+            self._network.outside.put(listened, b"".join(parts))
+        self.sent += self._fanout.send(stream, parts, envelope=envelope, droppable=droppable)
+
+    def _send_records(self, operator: str, batch: bytes) -> None:
+        """Sends firing records, to the recorder and to who subscribes to them from outside."""
+        self._send_bytes(firings_key(self._namespace, operator), batch)
+
+    def _send_bytes(self, key: str, batch: bytes) -> None:
+        if self._held is not None:
+            self._held.append((key, batch, False))
             return
-        self.sent += len(takers)
-        block = None
-        if size >= THRESHOLD and isinstance(envelope, Envelope) and self._network is not None:
-            claims = tuple(link.claim for link, _ in takers if link.present())
-            shared = self._network.bus.share(envelope, parts, size, claims) if claims else None
-            if shared is not None:
-                reference, block = shared
-                parts, size = [reference], len(reference)
-        droppable = not (isinstance(envelope, Envelope) and envelope.kind is Kind.END)
-        for link, channel in takers:
-            link.send(channel, parts, size, droppable=droppable, block=block)
-        if self._network is not None:
-            self._network.bus.counted.moved("sent", size)
+        listened = self._listened(key)
+        if listened is not None and self._network is not None:
+            self._network.outside.put(listened, batch)
+        self.sent += self._fanout.send(key, [batch], droppable=False)
 
     def message(self, stream: str, entry: Entry) -> None:
         for consumer in self._consumers(stream):
@@ -158,11 +178,14 @@ class Outlet:
             Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
         )
         network = self._network
-        if network is not None and stream in self._static:
-            network.bus.declare_static(stream, encode(envelope))
         begun = entry.incarnation != self._next.get(stream, (0, 0))[0]
         self._next[stream] = entry.incarnation, entry.seq + 1
-        self._send(stream, envelope)
+        static = stream in self._static
+        if static:
+            self._once[stream] = [envelope]
+            if network is not None:
+                network.bus.declare_static(stream, encode(envelope))
+        self._send(stream, envelope, droppable=not static)
         if begun:  # by this a taker knows that the new incarnation is the stream's own
             self._send(stream, self._envelope(Kind.FRONTIER, stream, entry.stamp))
         if network is not None and network.taps.active:
@@ -177,13 +200,16 @@ class Outlet:
         for consumer in self._consumers(stream):
             consumer.end(stream, final_stamp, reason)
         if stream in self._static:
-            self._send(stream, self._envelope(Kind.END, stream, NEVER, reason))
+            over = self._envelope(Kind.END, stream, NEVER, reason)
+            self._once.setdefault(stream, []).append(over)
+            self._send(stream, over, droppable=False)
             return
         if self._live:
             self._channel.send("stream_ended", stream=stream, reason=reason)
         if final_stamp is not None:  # by this a taker that has lost the last messages believes the end
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, final_stamp))
-        self._send(stream, self._envelope(Kind.END, stream, NEVER if final_stamp is None else final_stamp, reason))
+            self._send(stream, self._envelope(Kind.FRONTIER, stream, final_stamp), droppable=False)
+        over = self._envelope(Kind.END, stream, NEVER if final_stamp is None else final_stamp, reason)
+        self._send(stream, over, droppable=False)
 
     def _envelope(self, kind: Kind, stream: str, stamp: int, reason: str = "") -> Envelope:
         incarnation, seq = self._next.get(stream, (0, 0))
@@ -204,7 +230,7 @@ class Outlet:
     def flush(self, operator: str, *, last: bool = False) -> None:
         log = self._logs.get(operator)
         if log:
-            self._send(firings_key(self._namespace, operator), encode_batch(log, last=last))
+            self._send_records(operator, encode_batch(log, last=last))
             log.clear()
 
     def flush_due(self) -> None:
@@ -223,7 +249,7 @@ class Outlet:
             return
         for part in consecutive(self._box.kept(operator)):
             for first in range(0, len(part), BATCH_RECORDS):
-                self._send(firings_key(self._namespace, operator), encode_batch(part[first : first + BATCH_RECORDS]))
+                self._send_records(operator, encode_batch(part[first : first + BATCH_RECORDS]))
 
     def put_raw(self, stream: str, payload: bytes) -> None:
         """Publishes bytes that are no envelope: a planned fault."""

@@ -22,10 +22,9 @@ from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
-from dataflow.process.network import network_config
 from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
-from dataflow.transport import Bus, Envelope, Kind
+from dataflow.transport import Envelope, Kind
 from dataflow.transport.envelope import MAGIC
 
 IDLE_WAIT = 0.1
@@ -44,8 +43,6 @@ class SinkConfig:
     graph: dict[str, Any]
     streams: list[str]
     firings: list[str]
-    connect: list[str]
-    secret: str
     options: dict[str, Any]
     rings_in: Sequence[Sequence[str]] = ()
     live: bool = False
@@ -113,8 +110,6 @@ class SinkProcess:
         self._outcome = "the supervisor is gone"
 
     def open(self) -> None:
-        config = self.config
-        self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
         self.channel.send("ready", first=None, steps=None)
@@ -215,7 +210,7 @@ class SinkProcess:
             self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
             self._ended = True
-            self.channel.send("ended", report={"counts": self._counts(), "transport": self.bus.counters()})
+            self.channel.send("ended", report={"counts": self._counts(), "transport": self.inbox.counters()})
 
     def _counts(self) -> dict[str, list[int]]:
         return {self.config.label: [0, self.written, 0, self._work.cpu_ns, self._done, self._work.wall_ns]}
@@ -267,7 +262,6 @@ class SinkProcess:
         facts: Mapping[str, Any] = {}
         if self.sink is not None:
             facts = self.sink.close(self._outcome)
-        self.bus.close()
         return facts
 
 

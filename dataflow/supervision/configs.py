@@ -12,36 +12,34 @@ Config = tuple[str, dict[str, Any]]
 """Kind of process ("host" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
 
 
-def configurations(
-    plan: RunPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str], secret: str
-) -> dict[str, Config]:
+def configurations(plan: RunPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str]) -> dict[str, Config]:
     """Returns every process's configuration by label.
 
-    `endpoints` are those on which the processes listen, `secret` what the run's messages are sealed with.
+    `endpoints` are those on which the processes listen.
     """
     first = next(iter(hosts))
     configs: dict[str, Config] = {}
     for label, host in hosts.items():
-        common = _common(plan, host, hosts, endpoints) | {"secret": secret}
+        common = _common(plan, host, hosts)
         if host.sink is None:
             configs[label] = _host(plan, host, common, endpoints, label == first)
             pairs = pairs_of(plan.graph, hosts)
-            configs[label][1]["rings_out"] = [list(keys) for (maker, _), keys in pairs.items() if maker == label]
+            configs[label][1]["rings_out"] = [
+                (plan.live and hosts[taker].sink is None, list(keys))
+                for (maker, taker), keys in pairs.items()
+                if maker == label
+            ]
         else:
             configs[label] = _sink(plan, host, common)
     return configs
 
 
-def _common(
-    plan: RunPlan, host: HostPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str]
-) -> dict[str, Any]:
-    connect = [endpoints[up] for up in host.upstream]
+def _common(plan: RunPlan, host: HostPlan, hosts: Mapping[str, HostPlan]) -> dict[str, Any]:
     pairs = pairs_of(plan.graph, hosts)
     rings_in = [list(keys) for (_, consumer), keys in pairs.items() if consumer == host.label]
     common = {
         "label": host.label,
         "graph": plan.graph.to_json(),
-        "connect": connect,
         "live": plan.live,
     }
     return common | {"rings_in": rings_in}

@@ -69,7 +69,6 @@ class HostPlan:
     nodes: tuple[str, ...]
     publish: Mapping[str, int]
     subscribe: tuple[str, ...]
-    upstream: tuple[str, ...]
     has_log: bool = False
     sink: str | None = None
     streams: tuple[str, ...] = ()
@@ -134,16 +133,10 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
             tuple(node for node in nodes if node not in replaced),
             publish,
             subscribe,
-            tuple(sorted({made_in[s] for s in subscribe})),
             has_log=bool(replaced & set(nodes)),
         )
     for label, (kind, taken, chosen) in sinks.items():
-        upstream = {made_in[s] for s in taken}
-        if kind == "record":
-            upstream |= set(hosts)
-        plans[label] = HostPlan(
-            label, (), {}, (), tuple(sorted(upstream)), sink=kind, streams=tuple(sorted(taken)), options=chosen
-        )
+        plans[label] = HostPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
     return plans
 
 

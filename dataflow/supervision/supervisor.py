@@ -25,7 +25,7 @@ from dataflow.supervision.plan import RunPlan, host_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.rings import Rings, pairs_of
 from dataflow.supervision.words import Words
-from dataflow.transport import new_secret, registry, reserve_endpoints
+from dataflow.transport import registry, reserve_endpoints
 
 TICK = 0.05
 NOT_READING_AFTER = 1.0
@@ -48,7 +48,7 @@ class Supervisor:
         self._hosts = host_plans(plan)
         self._reserved = reserve_endpoints(len(self._hosts))
         self._endpoints = dict(zip(self._hosts, self._reserved.endpoints, strict=True))
-        self.core = core_of(plan, self._hosts, configurations(plan, self._hosts, self._endpoints, new_secret()))
+        self.core = core_of(plan, self._hosts, configurations(plan, self._hosts, self._endpoints))
         self._on_output = on_output or _print
         self._children: dict[str, Child] = {}
         self._boxes: dict[str, int] = {}

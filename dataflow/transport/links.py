@@ -2,16 +2,16 @@
 
 A large message lies in the pool and passes as a reference; where the pool has no room, it passes whole: what does not
 fit a quarter of the ring in pieces, in its place in the order. What the ring has no room for waits here, in order.
-A run that loses nothing bounds that by its windows. In a live run it is bounded here: beyond `most`, the oldest
-messages are dropped, and the consumer sees a gap in their numbers; ends of streams are kept.
+A run that loses nothing bounds that by its windows, and so does any run for a recorder. For other consumers of a live
+run it is bounded here: beyond `most`, the oldest messages are dropped, and the consumer sees a gap in their numbers;
+what is said once (ends of streams, static messages) is kept.
 """
 
 from __future__ import annotations
 
 import mmap
-import os
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 from dataflow.transport.envelope import Buffer, DecodeError
@@ -30,13 +30,6 @@ _FIRST, _LAST = 1 << 31, 1 << 30
 _CHANNEL = _LAST - 1
 _PIECE_OVERHEAD = 16
 _AT_ONCE = 1024
-
-
-def make_board() -> int:
-    """Makes the memory in which a consumer says which blocks of its producer's pool it has released."""
-    descriptor = os.memfd_create("board")
-    os.ftruncate(descriptor, BOARD_BYTES)
-    return descriptor
 
 
 class LinkClaim:
@@ -79,11 +72,14 @@ class Outgoing:
         self._reader = self._ring.reader()
         self._waiting: deque[_Waiting] = deque()
         self._bytes = 0
+        self._lent: deque[tuple[int, int, int]] = deque()  # slot, generation and bytes of blocks that it may hold
         self.claim = LinkClaim(self._cells)
         self.away = False
         """The consumer has died: what is sent now is for nobody."""
+        self.joined = False
+        """Another process has taken the consumer's place, and nobody has noticed yet: it lacks what is said once."""
         self.dropped = 0
-        """Messages that did not reach the consumer: there was no room for too long."""
+        """Envelopes that did not reach the consumer: it took nothing for too long."""
 
     @property
     def waiting(self) -> bool:
@@ -100,12 +96,32 @@ class Outgoing:
         self._new_reader()
         return not self.away
 
-    def send(self, channel: int, parts: Sequence[Buffer], size: int, *, droppable: bool, block: Block | None) -> None:
+    def may_borrow(self, size: int, free: Callable[[], int]) -> bool:
+        """Whether the consumer may be lent another block: where messages may be dropped, it may hold as much of the
+        pool as is free, so that one that releases nothing leaves room for the others."""
+        if self._most is None:
+            return True
+        while self._lent and self.claim.released(*self._lent[0][:2]):
+            self._lent.popleft()
+        if len(self._lent) * size <= free():
+            return True
+        self._lent = deque(lent for lent in self._lent if not self.claim.released(*lent[:2]))
+        return sum(held for _, _, held in self._lent) + size <= free()
+
+    def refuse(self) -> None:
+        """Drops a message that is not sent at all."""
+        self.dropped += 1
+
+    def send(
+        self, channel: int, parts: Sequence[Buffer], size: int, *, droppable: bool = True, block: Block | None = None
+    ) -> None:
         """Sends one envelope, given as consecutive buffers, or keeps it until there is room."""
         if not self.present():
             if block is not None:
                 self.claim.drop(block)
             return
+        if block is not None and self._most is not None:
+            self._lent.append((block.slot, block.generation, block.capacity))
         if not self._waiting and self._ring.fits(size):
             if self._ring.put(channel | _FIRST | _LAST, parts):
                 return
@@ -163,11 +179,13 @@ class Outgoing:
             return False
         self._reader = reader
         self.away = False
+        self.joined = True
         self._begin_anew()
         return True
 
     def _begin_anew(self) -> None:
         self._waiting.clear()
+        self._lent.clear()
         self._bytes = 0
         self.claim.gone = True
         self.claim = LinkClaim(self._cells)
@@ -182,6 +200,7 @@ class Incoming:
         self._keys, self._pools = keys, pools
         self._pieces: dict[int, list[bytes]] = {}
         self.messages = self.nbytes = self.unresolved = 0
+        """What was taken so far, and how much of it lies in memory that could not be opened."""
 
     def sleep(self) -> bool:
         """Announces a wait; False when there is something to take instead."""

@@ -38,7 +38,7 @@ class Play:
         self.plan = RunPlan(graph, live=live, **{"placement": "host_each"} | options)
         self.hosts = host_plans(self.plan)
         endpoints = {label: f"tcp/127.0.0.1:{7000 + k}" for k, label in enumerate(self.hosts)}
-        self.core = core_of(self.plan, self.hosts, configurations(self.plan, self.hosts, endpoints, "secret"))
+        self.core = core_of(self.plan, self.hosts, configurations(self.plan, self.hosts, endpoints))
         self.now = 100.0
         self.commands: list[Command] = []
         self.over: Over | None = None
