@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -19,6 +19,7 @@ from dataflow.transport import (
     Envelope,
     Fanout,
     Kind,
+    Outgoing,
     OutsidePublisher,
     StreamPublisher,
     TapServer,
@@ -112,13 +113,18 @@ class Outlet:
                     link.send(channel, parts, parts_size(parts))
 
     def push(self) -> None:
-        """Sends what has waited for room, as far as there is some, and static messages to who has joined."""
+        """Sends what has waited for room, as far as there is some, and static messages to who was started again."""
         for keys, link in self._fanout.joined():
-            for number, key in enumerate(keys):
-                for envelope in self._once.get(key, ()):
-                    parts = encode_parts(envelope)
-                    link.send(number, parts, parts_size(parts), droppable=False)
+            if self._held is None:
+                self._say_again(keys, link)
         self._fanout.flush()
+
+    def _say_again(self, keys: Sequence[str], link: Outgoing) -> None:
+        for number, key in enumerate(keys):
+            for envelope in self._once.get(key, ()):
+                parts = encode_parts(envelope)
+                link.send(number, parts, parts_size(parts), droppable=False)
+                self.sent += 1
 
     def push_all(self) -> None:
         """Waits (bounded) until everything has room: before this process leaves."""
