@@ -20,7 +20,7 @@ _VARIABLES = (
 
 
 def environment(threads: int) -> dict[str, str]:
-    """The environment of a host process: thread counts, the import path of this one, and hashing without a salt."""
+    """Returns the environment of operators: thread counts, the import path of this process, hashing without a salt."""
     return {
         **os.environ,
         "PYTHONPATH": import_path(),

@@ -78,7 +78,7 @@ class Barrier:
 def expect_probes(run: RunState, process: Supervised) -> None:
     """Tells the consumers of a process that took another's place that its streams are to be proven again."""
     tell_consumers(run, process, absent=False)
-    made = set(process.host.publish)
+    made = set(process.plan.publish)
     for other in run.processes.values():
         if other is not process and other.reachable and other.life not in ON_ITS_WAY - {Life.PROBING}:
             other.unseen |= made & run.takes(other)
@@ -86,7 +86,7 @@ def expect_probes(run: RunState, process: Supervised) -> None:
 
 def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
     """Tells who takes a process's streams that it is away, or that it is to be heard again."""
-    made = set(process.host.publish)
+    made = set(process.plan.publish)
     for other in run.processes.values():
         taken = made & run.takes(other)
         if other is process or not taken:

@@ -9,19 +9,19 @@ import os
 from collections.abc import Mapping
 
 from dataflow.graph.model import Graph
-from dataflow.supervision.plan import HostPlan, taken_keys
+from dataflow.supervision.plan import ProcessPlan, taken_keys
 from dataflow.transport import make_board, make_ring
 
 Pairs = Mapping[tuple[str, str], tuple[str, ...]]
 """(producer, consumer) → the keys that pass between them, sorted: the number of a channel is a place in it."""
 
 
-def pairs_of(graph: Graph, hosts: Mapping[str, HostPlan]) -> dict[tuple[str, str], tuple[str, ...]]:
+def pairs_of(graph: Graph, processes: Mapping[str, ProcessPlan]) -> dict[tuple[str, str], tuple[str, ...]]:
     """Returns which processes are linked."""
     found = {}
-    for consumer, host in hosts.items():
-        taken = taken_keys(graph, host)
-        for producer, maker in hosts.items():
+    for consumer, process in processes.items():
+        taken = taken_keys(graph, process)
+        for producer, maker in processes.items():
             if producer != consumer and (keys := taken.intersection(maker.publish)):
                 found[producer, consumer] = tuple(sorted(keys))
     return found

@@ -21,7 +21,7 @@ from dataflow.supervision import commands, events
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
-from dataflow.supervision.plan import RunPlan, host_plans
+from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.rings import Rings, pairs_of
 from dataflow.supervision.words import Words
@@ -45,10 +45,10 @@ class Supervisor:
 
     def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
         self.plan = plan
-        self._hosts = host_plans(plan)
-        self._reserved = reserve_endpoints(len(self._hosts))
-        self._endpoints = dict(zip(self._hosts, self._reserved.endpoints, strict=True))
-        self.core = core_of(plan, self._hosts, configurations(plan, self._hosts, self._endpoints))
+        self._processes = process_plans(plan)
+        self._reserved = reserve_endpoints(len(self._processes))
+        self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
+        self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or _print
         self._children: dict[str, Child] = {}
         self._boxes: dict[str, int] = {}
@@ -96,7 +96,7 @@ class Supervisor:
 
     def _make_rings(self) -> Rings:
         try:
-            return Rings(list(self._hosts), pairs_of(self.plan.graph, self._hosts))
+            return Rings(list(self._processes), pairs_of(self.plan.graph, self._processes))
         except OSError as error:
             raise RunFailed(f"cannot link the processes: {error}; raise the limit of open files (ulimit -n)") from error
 
@@ -189,7 +189,7 @@ class Supervisor:
             return
         try:
             nodes = self.plan.graph.nodes
-            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._hosts[label].nodes})
+            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._processes[label].nodes})
         finally:
             os.close(box)
         self._feed(events.Remained(label, remains))
@@ -279,7 +279,7 @@ class Supervisor:
 
     def _make_box(self, label: str) -> tuple[int, ...]:
         """Makes what a process writes its firing records to, where another one may take its place."""
-        if not self.plan.live or self._hosts[label].sink is not None:
+        if not self.plan.live or self._processes[label].sink is not None:
             return ()
         self._boxes[label] = make_black_box()
         return (self._boxes[label],)

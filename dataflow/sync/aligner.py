@@ -168,7 +168,7 @@ class Aligner:
         for lane in state.lanes:
             lane.reopen(self._decided)
 
-    # What the host decides when it will not wait
+    # What the process decides when it will not wait
 
     def force(self, input: str, frontier: int) -> bool:
         """Pretends that the streams of `input`, but for static ones, have promised `frontier`; False when that is no

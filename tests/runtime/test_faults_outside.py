@@ -115,7 +115,7 @@ def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_p
 
 def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
     graph = load_graph(graph_file(tmp_path, count=250), live=True)
-    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="host_each")
+    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="process_each")
     find_running("outside", wait=30)
     viewer = subprocess.Popen(
         [sys.executable, "-m", "dataflow.cli.main", "echo", "--json"],
@@ -132,7 +132,7 @@ def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
 
     assert report.summaries["sum"]["count"] == 250
     assert not report.restarts
-    assert verify(tmp_path / "run.mcap", placement="one_host").identical
+    assert verify(tmp_path / "run.mcap", jobs=1).identical
 
 
 # A process that is stopped
@@ -163,7 +163,7 @@ def test_a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_i
     path = tmp_path / "outside.yaml"
     path.write_text(STOPPED.replace("COUNT", "360").replace("FILE", str(tmp_path / "pid")))
 
-    report = run(load_graph(path, live=True), live=True, placement="host_each")
+    report = run(load_graph(path, live=True), live=True, placement="process_each")
 
     assert report.summaries["waker"]["count"] == 360, report.drops
     assert "left" not in report.drops
@@ -202,7 +202,7 @@ class Outside:
 @pytest.mark.parametrize("live", [False, True])
 def test_a_plain_subscriber_gets_every_message_in_the_documented_envelope(tmp_path: Path, live: bool) -> None:
     graph = load_graph(graph_file(tmp_path, count=150), live=live)
-    running = Background(graph, live=live, rate=1.0, record=tmp_path / "run.mcap", placement="host_each")
+    running = Background(graph, live=live, rate=1.0, record=tmp_path / "run.mcap", placement="process_each")
     outside = Outside(slow=False)
     try:
         running.end()
@@ -223,7 +223,7 @@ def test_a_slow_subscriber_from_outside_costs_nobody_anything(tmp_path: Path) ->
     """Messages of 1 MB: it blocks what publishes to it at once."""
     path = tmp_path / "outside.yaml"
     path.write_text(STOPPED.replace("COUNT", "250").replace("at: 20", "at: -1").replace("FILE", str(tmp_path / "pid")))
-    running = Background(load_graph(path, live=True), live=True, placement="host_each")
+    running = Background(load_graph(path, live=True), live=True, placement="process_each")
     outside = Outside(slow=True)
     try:
         report = running.end()
@@ -236,7 +236,7 @@ def test_a_slow_subscriber_from_outside_costs_nobody_anything(tmp_path: Path) ->
 
 
 def test_nothing_is_published_while_nobody_listens(tmp_path: Path) -> None:
-    report = run(load_graph(graph_file(tmp_path, count=20)), placement="host_each")
+    report = run(load_graph(graph_file(tmp_path, count=20)), placement="process_each")
 
     assert {label: counts["published_messages"] for label, counts in report.transport.items()} == dict.fromkeys(
         ("left", "smooth", "sum"), 0

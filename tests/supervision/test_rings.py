@@ -13,7 +13,7 @@ import pytest
 from dataflow.graph import load_text
 from dataflow.process.handed import Handed, take_handed
 from dataflow.supervision.configs import configurations
-from dataflow.supervision.plan import RunPlan, host_plans
+from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.rings import Rings, pairs_of
 
 GRAPH = """\
@@ -27,12 +27,12 @@ operators:
 
 
 def plan(**options: Any) -> RunPlan:
-    return RunPlan(load_text(GRAPH.replace("[smooth/mean]", "smooth/mean")), **{"placement": "host_each"} | options)
+    return RunPlan(load_text(GRAPH.replace("[smooth/mean]", "smooth/mean")), **{"placement": "process_each"} | options)
 
 
 def test_a_process_is_linked_to_those_it_takes_from() -> None:
     made = plan()
-    assert pairs_of(made.graph, host_plans(made)) == {
+    assert pairs_of(made.graph, process_plans(made)) == {
         ("left", "smooth"): ("test/left/fast",),
         ("smooth", "sum"): ("test/smooth/mean",),
     }
@@ -40,7 +40,7 @@ def test_a_process_is_linked_to_those_it_takes_from() -> None:
 
 def test_a_recorder_is_linked_to_every_process_also_for_its_firing_records() -> None:
     made = plan(record=Path("run.mcap"))
-    found = pairs_of(made.graph, host_plans(made))
+    found = pairs_of(made.graph, process_plans(made))
     assert found["sum", "@recorder"] == ("test/@/firings/sum",)
     assert set(found["left", "@recorder"]) == {
         "test/@/firings/left",
@@ -51,17 +51,17 @@ def test_a_recorder_is_linked_to_every_process_also_for_its_firing_records() -> 
 
 
 def test_one_process_needs_no_link() -> None:
-    made = plan(placement="one_host")
-    assert pairs_of(made.graph, host_plans(made)) == {}
+    made = plan(placement="one_process")
+    assert pairs_of(made.graph, process_plans(made)) == {}
 
 
 @contextmanager
 def opened(made: RunPlan) -> Iterator[Mapping[str, Handed]]:
     """What each process of a run is handed, opened as it would open it."""
-    hosts = host_plans(made)
-    rings = Rings(list(hosts), pairs_of(made.graph, hosts))
-    configs = configurations(made, hosts, dict.fromkeys(hosts, "unixsock-stream//nowhere"))
-    yield {label: take_handed(rings.handed(label), configs[label][1]) for label in hosts}
+    processes = process_plans(made)
+    rings = Rings(list(processes), pairs_of(made.graph, processes))
+    configs = configurations(made, processes, dict.fromkeys(processes, "unixsock-stream//nowhere"))
+    yield {label: take_handed(rings.handed(label), configs[label][1]) for label in processes}
     rings.close()
 
 
