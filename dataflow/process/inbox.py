@@ -37,12 +37,18 @@ class Inbox:
     def get(self, timeout: float) -> Item:
         """Returns the next item, or raises `queue.Empty` when there is none in time, or something else woke it."""
         if self.empty() and timeout > 0:
-            self._asleep = True
-            if not self._items and not sum(not ring.sleep() for ring in self._incoming):
-                select.select([self.wake], [], [], timeout)
-            self._asleep = False
-            self._forget_wakes()
+            self._wait(timeout)
         return self.get_nowait()
+
+    def _wait(self, timeout: float) -> None:
+        self._asleep = True
+        if not self._items and not sum(not ring.sleep() for ring in self._incoming):
+            woken, _, _ = select.select([self.wake], [], [], timeout)
+            if woken:
+                self._forget_wakes()
+        self._asleep = False
+        for ring in self._incoming:
+            ring.awake()
 
     def get_nowait(self) -> Item:
         """Returns the next item; raises `queue.Empty` when there is none."""

@@ -185,7 +185,7 @@ class OperatorProcess:
             if self._probing:
                 self.outlet.probe()
             self.outlet.push()
-            self._take(self._wait_time())
+            self._take(self._wait_time() if self.inbox.empty() else 0.0)
             if self._left:
                 break
             self.live.restart_due()
@@ -304,8 +304,10 @@ class OperatorProcess:
         if self.config.live and not self._released:
             return False  # a restarted process is sent messages before it is told what time it is
         worked = False
+        self.outlet.promise()
         for runner in reversed(self.runners.operators):
             worked = runner.step() or worked
+            self.outlet.promise()
         return worked
 
     def _admit(self) -> bool:

@@ -206,6 +206,10 @@ class Incoming:
         """Announces a wait; False when there is something to take instead."""
         return self._ring.sleep()
 
+    def awake(self) -> None:
+        """Says that the wait is over: until the next one nobody needs to wake this process."""
+        self._ring.awake()
+
     def take(self) -> Iterator[tuple[str, Buffer]]:
         """Yields (key, payload) of what has arrived."""
         for flagged, content in self._ring.take(_AT_ONCE):

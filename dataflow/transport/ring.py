@@ -159,6 +159,10 @@ class RingReader(_End):
         self._words[_ASLEEP] = 0
         return False
 
+    def awake(self) -> None:
+        """Says that the wait is over."""
+        self._words[_ASLEEP] = 0
+
 
 def _room(size: int) -> int:
     """What a frame takes of the ring: its head and content, in whole words, so that a head never wraps."""
