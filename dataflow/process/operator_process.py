@@ -288,6 +288,8 @@ class OperatorProcess:
             if self._step_all() or (self.inbox.empty() and self._admit()):
                 worked = True
             elif self.inbox.empty():
+                if not self.feeding.feeds:
+                    break
                 self.feeding.promise()
                 if not self._step_all():
                     break

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from typing import Final
+from typing import Final, Literal
 
 NAMES: Final = (
     "sent_messages",  # to other processes of the run
@@ -16,6 +16,13 @@ NAMES: Final = (
     "unpublished",  # not published because subscribers from outside were too slow
     "stalled",  # publications that waited until the link of a subscriber that took nothing was closed
 )
+
+Direction = Literal["sent", "shared", "published"]
+_MOVED: Final[dict[Direction, tuple[str, str]]] = {
+    "sent": ("sent_messages", "sent_bytes"),
+    "shared": ("shared_messages", "shared_bytes"),
+    "published": ("published_messages", "published_bytes"),
+}
 
 
 class Counters:
@@ -30,11 +37,12 @@ class Counters:
         with self._lock:
             self._counts[name] += number
 
-    def moved(self, direction: str, nbytes: int) -> None:
-        """Counts one message of `nbytes` as "sent", "shared" or "published"."""
+    def moved(self, direction: Direction, nbytes: int) -> None:
+        """Counts one message of `nbytes`."""
+        messages, size = _MOVED[direction]
         with self._lock:
-            self._counts[f"{direction}_messages"] += 1
-            self._counts[f"{direction}_bytes"] += nbytes
+            self._counts[messages] += 1
+            self._counts[size] += nbytes
 
     def as_dict(self) -> dict[str, int]:
         """Returns the counts by name."""

@@ -232,7 +232,6 @@ def test_a_slow_subscriber_from_outside_costs_nobody_anything(tmp_path: Path) ->
     assert report.summaries["waker"]["count"] == 250
     assert "left" not in report.drops
     assert report.summaries["stopped"]["count"] + sum(n for *_, n in report.drops.get("stopped", ())) == 250
-    assert report.transport["left"]["published_messages"] < 250
 
 
 def test_nothing_is_published_while_nobody_listens(tmp_path: Path) -> None:
