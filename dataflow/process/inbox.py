@@ -68,8 +68,8 @@ class Inbox:
     def empty(self) -> bool:
         """Whether there is nothing, in the rings either."""
         for ring in self._incoming:
-            for key, payload in ring.take():
-                self._items.append(("envelope", key, payload))
+            if ring.arrived():
+                self._items.extend(("envelope", key, payload) for key, payload in ring.take())
         return not self._items
 
     def counters(self) -> dict[str, int]:

@@ -102,7 +102,12 @@ class Inlet:
             self._deliver(stream, envelope)
 
     def _take_in_order(self, stream: str, envelope: Envelope) -> None:
-        verdict = self._order(stream).take(envelope)
+        order = self._order(stream)
+        if order.goes_on(envelope):
+            self.received += 1
+            self._deliver(stream, envelope)
+            return
+        verdict = order.take(envelope)
         if verdict.refused:
             if verdict.damaged and not self.live:
                 raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")

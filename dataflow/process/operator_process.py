@@ -35,7 +35,7 @@ from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
-from dataflow.transport import Bus, BusError, Counters, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
+from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
 from dataflow.transport.fanout import POOL_BYTES
 
 IDLE_WAIT = 0.1
@@ -76,12 +76,11 @@ class OperatorProcess:
             static=self.static,
             live=config.live,
         )
-        self.counted = Counters()
         pool_bytes = POOL_BYTES if self.graph.network.shared_memory else 0
         self.outlet = Outlet(
             channel,
             self.runners.taking,
-            fanout=Fanout(outgoing, self.counted, pool_bytes=pool_bytes),
+            fanout=Fanout(outgoing, pool_bytes=pool_bytes),
             namespace=self.graph.namespace,
             static=self.static,
             live=config.live,
@@ -107,8 +106,8 @@ class OperatorProcess:
         """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
         config, graph = self.config, self.graph
         settings = network_config(graph.network, config.listen, live=config.live)
-        self.bus = Bus(settings, self.counted)
-        self.outside = OutsidePublisher(self.counted, lossless=not config.live)
+        self.bus = Bus(settings)
+        self.outside = OutsidePublisher(self.bus.counted, lossless=not config.live)
         self.taps = TapServer(self.bus, graph.namespace)
         made = {*config.publish, *(s for name in config.nodes for s in graph.nodes[name].outputs.values())}
         publishers = {stream: self.bus.publisher(stream) for stream in sorted(made)}
@@ -325,7 +324,7 @@ class OperatorProcess:
     def _moved(self) -> dict[str, int]:
         """Counts what has passed between this process and others."""
         refused = {"malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
-        return self.counted.as_dict() | self.inbox.counters() | {"unsent": self.outlet.unsent} | refused
+        return self.outlet.counters() | self.inbox.counters() | self.bus.counters() | refused
 
     def _answer_poll(self, *, idle: bool) -> None:
         """Answers after the work that was there: a process is idle only when a look at everything found nothing."""

@@ -141,10 +141,9 @@ class Outlet:
         """The process at the other end of a link has died."""
         self._fanout.take_leave(number)
 
-    @property
-    def unsent(self) -> int:
-        """How many envelopes did not reach other processes, which took nothing for too long."""
-        return self._fanout.dropped
+    def counters(self) -> dict[str, int]:
+        """Returns what was sent to other processes (`Fanout.counters`)."""
+        return self._fanout.counters()
 
     def close(self) -> None:
         """Lets go of the memory that other processes read."""

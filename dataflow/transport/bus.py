@@ -60,8 +60,8 @@ def _interrupts_deferred() -> Iterator[None]:
 class Bus:
     """One process's place in the network. Thread-safe; close it (it is a context manager)."""
 
-    def __init__(self, config: NetworkConfig | None = None, counted: Counters | None = None) -> None:
-        """Opens the session; peers that are not up yet are connected to later. `counted`: where to count.
+    def __init__(self, config: NetworkConfig | None = None) -> None:
+        """Opens the session; peers that are not up yet are connected to later.
 
         Raises `BusError` when an endpoint cannot be listened on, `NetworkError` for settings Zenoh does not take.
         """
@@ -71,7 +71,7 @@ class Bus:
         except zenoh.ZError as error:
             raise BusError(f"cannot listen on {', '.join(self.config.listen) or 'nothing'}: {error}") from error
         self.id = str(self.session.zid())
-        self.counted = counted or Counters()
+        self.counted = Counters()
         self._lock = threading.Lock()
         self._tokens: list[Token] = []
         self._declared: dict[str, zenoh.Queryable[None]] = {}

@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 
-from dataflow.transport.codec import encode_head, parts_size
-from dataflow.transport.counters import Counters
+from dataflow.transport.codec import encode_head
 from dataflow.transport.envelope import Buffer, Envelope
 from dataflow.transport.links import Outgoing
 from dataflow.transport.pool import SharedPool
@@ -22,9 +21,7 @@ class Fanout:
     `pool_bytes`: its size; 0: messages travel whole.
     """
 
-    def __init__(
-        self, outgoing: Sequence[tuple[Sequence[str], Outgoing]], counted: Counters, *, pool_bytes: int = POOL_BYTES
-    ) -> None:
+    def __init__(self, outgoing: Sequence[tuple[Sequence[str], Outgoing]], *, pool_bytes: int = POOL_BYTES) -> None:
         self._links = [link for _, link in outgoing]
         self._keys = [keys for keys, _ in outgoing]
         takers: dict[str, list[tuple[Outgoing, int]]] = {}
@@ -33,7 +30,9 @@ class Fanout:
                 takers.setdefault(key, []).append((link, number))
         self.takers: Mapping[str, Sequence[tuple[Outgoing, int]]] = takers
         """By key, the links whose consumers take it, and the number of its channel there."""
-        self._counted = counted
+        self._sent = [0, 0]
+        self._shared = [0, 0]
+        self._full = 0
         self._pool_bytes = pool_bytes
         self._pool: SharedPool | None = None
 
@@ -48,13 +47,14 @@ class Fanout:
         takers = self.takers.get(key)
         if not takers:
             return 0
-        size = parts_size(parts)
+        size = sum(map(len, parts))
         if size >= THRESHOLD and envelope is not None and self._pool_bytes:
             self._lend(takers, parts, size, envelope, droppable=droppable)
         else:
             for link, channel in takers:
                 link.send(channel, parts, size, droppable=droppable)
-        self._counted.moved("sent", size)
+        self._sent[0] += 1
+        self._sent[1] += size
         return len(takers)
 
     def _lend(
@@ -76,11 +76,12 @@ class Fanout:
             return
         block = pool.write(parts, size, tuple(link.claim for link, _ in able))
         if block is None:
-            self._counted.add("shared_full")
+            self._full += 1
             for link, channel in able:
                 link.send(channel, parts, size, droppable=droppable)
             return
-        self._counted.moved("shared", size)
+        self._shared[0] += 1
+        self._shared[1] += size
         reference = pool.reference(encode_head(envelope), block, size)
         for link, channel in able:
             link.send(channel, [reference], len(reference), droppable=droppable, block=block)
@@ -102,10 +103,18 @@ class Fanout:
         """The process at the other end of a link has died."""
         self._links[number].take_leave()
 
-    @property
-    def dropped(self) -> int:
-        """How many envelopes did not reach their consumers, who took nothing for too long."""
-        return sum(link.dropped for link in self._links)
+    def counters(self) -> dict[str, int]:
+        """Counts envelopes and bytes that were sent, those of them that went through the pool, the large ones that
+        travelled whole because it had no room, and those that did not reach a consumer that took nothing for too long.
+        """
+        return {
+            "sent_messages": self._sent[0],
+            "sent_bytes": self._sent[1],
+            "shared_messages": self._shared[0],
+            "shared_bytes": self._shared[1],
+            "shared_full": self._full,
+            "unsent": sum(link.dropped for link in self._links),
+        }
 
     def close(self) -> None:
         """Gives the pool back, once consumers that were just sent their first reference have mapped it (bounded)."""

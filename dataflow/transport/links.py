@@ -28,7 +28,6 @@ from dataflow.transport.shared import (
 
 _FIRST, _LAST = 1 << 31, 1 << 30
 _CHANNEL = _LAST - 1
-_PIECE_OVERHEAD = 16
 _AT_ONCE = 1024
 
 
@@ -122,7 +121,7 @@ class Outgoing:
             return
         if block is not None and self._most is not None:
             self._lent.append((block.slot, block.generation, block.capacity))
-        if not self._waiting and self._ring.fits(size):
+        if not self._waiting and size <= self._ring.largest:
             if self._ring.put(channel | _FIRST | _LAST, parts):
                 return
             frames = [(channel | _FIRST | _LAST, parts)]
@@ -148,11 +147,11 @@ class Outgoing:
         return True
 
     def _frames(self, channel: int, parts: Sequence[Buffer], size: int) -> Iterator[tuple[int, Sequence[Buffer]]]:
-        if self._ring.fits(size):
+        if size <= self._ring.largest:
             yield channel | _FIRST | _LAST, parts
             return
         whole = memoryview(b"".join(parts))
-        most = self._ring.capacity // 4 - _PIECE_OVERHEAD
+        most = self._ring.largest
         for start in range(0, size, most):
             flags = (_FIRST if start == 0 else 0) | (_LAST if start + most >= size else 0)
             yield channel | flags, [whole[start : start + most]]
@@ -201,6 +200,10 @@ class Incoming:
         self._pieces: dict[int, list[bytes]] = {}
         self.messages = self.nbytes = self.unresolved = 0
         """What was taken so far, and how much of it lies in memory that could not be opened."""
+
+    def arrived(self) -> bool:
+        """Whether there is something to take."""
+        return self._ring.arrived()
 
     def sleep(self) -> bool:
         """Announces a wait; False when there is something to take instead."""

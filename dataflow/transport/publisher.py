@@ -55,7 +55,7 @@ class StreamPublisher:
                 "was closed, and what it misses is a gap in the numbers that it gets next",
                 file=sys.stderr,
             )
-        self._counted.moved("published", len(payload))
+        self._counted.published(len(payload))
 
     def close(self) -> None:
         undeclare(self._publisher)

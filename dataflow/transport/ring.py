@@ -68,10 +68,8 @@ class RingWriter(_End):
         super().__init__(descriptor)
         self._wake = wake
         self._head = self._words[_HEAD]
-
-    def fits(self, size: int) -> bool:
-        """Whether a frame of `size` bytes can pass at all, once there is room: it may take a quarter of the ring."""
-        return _room(size) <= self.capacity // 4
+        self.largest = self.capacity // 4 - _FRAME.size
+        """Bytes of the largest frame that can pass, once there is room."""
 
     def reader(self) -> int:
         """Returns which reader is at the other end, by number; 0: there was none yet."""
@@ -82,37 +80,36 @@ class RingWriter(_End):
 
         The reader then wakes the writer once it has taken something. Raises `RingError` for a frame that never fits.
         """
-        size = sum(len(part) for part in parts)
-        needed = _room(size)
-        if needed > self.capacity // 4:
+        size = sum(map(len, parts))
+        if size > self.largest:
             raise RingError(f"a frame of {size} bytes does not fit a ring of {self.capacity} bytes")
-        at = self._head & (self.capacity - 1)
+        needed, head, words, memory = _room(size), self._head, self._words, self._memory
+        at = head & (self.capacity - 1)
         skipped = self.capacity - at if at + needed > self.capacity else 0
-        if not self._has_room(skipped + needed):
+        if head - words[_TAIL] + skipped + needed > self.capacity and not self._has_room(skipped + needed):
             return False
         if skipped:
-            _FRAME.pack_into(self._memory, _HEADER + at, _SKIP, 0)
+            _FRAME.pack_into(memory, _HEADER + at, _SKIP, 0)
             at = 0
         start = _HEADER + at
-        _FRAME.pack_into(self._memory, start, size, channel)
+        _FRAME.pack_into(memory, start, size, channel)
         start += _FRAME.size
         for part in parts:
-            self._memory[start : start + len(part)] = part
-            start += len(part)
-        self._head += skipped + needed
-        self._words[_HEAD] = self._head
+            end = start + len(part)
+            memory[start:end] = part
+            start = end
+        self._head = words[_HEAD] = head + skipped + needed
         self._fence()
-        if self._words[_ASLEEP]:
-            self._words[_ASLEEP] = 0
+        if words[_ASLEEP]:
+            words[_ASLEEP] = 0
             os.eventfd_write(self._wake, 1)
         return True
 
     def _has_room(self, needed: int) -> bool:
-        if self._head - self._words[_TAIL] + needed <= self.capacity:
-            return True
+        """Has the reader wake this side, unless it has just taken enough."""
         self._words[_BLOCKED] = 1
         self._fence()
-        return bool(self._head - self._words[_TAIL] + needed <= self.capacity)  # the reader may just have taken
+        return bool(self._head - self._words[_TAIL] + needed <= self.capacity)
 
 
 class RingReader(_End):
@@ -125,6 +122,10 @@ class RingReader(_End):
         self._words[_TAIL] = self._tail
         self._words[_READERS] += 1
         self._words[_BLOCKED] = 0
+
+    def arrived(self) -> bool:
+        """Whether there is something to take."""
+        return bool(self._words[_HEAD] != self._tail)
 
     def take(self, limit: int) -> list[tuple[int, bytes]]:
         """Up to `limit` frames that are there, in order: (channel, content). Raises `RingError` for a broken ring."""

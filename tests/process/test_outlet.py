@@ -11,7 +11,7 @@ import pytest
 from dataflow.messages import FeatureVector
 from dataflow.process.outlet import QUICK, Outlet
 from dataflow.sync import Entry
-from dataflow.transport import Counters, Fanout, Incoming, Kind, Outgoing, PoolReader, decode, make_board, make_ring
+from dataflow.transport import Fanout, Incoming, Kind, Outgoing, PoolReader, decode, make_board, make_ring
 
 INFO, FAST = "test/left/constant", "test/left/fast"
 
@@ -30,7 +30,7 @@ class Linked:
         self.outlet = Outlet(
             None,  # type: ignore[arg-type]
             lambda stream: (),
-            fanout=Fanout([([INFO, FAST], link)], Counters()),
+            fanout=Fanout([([INFO, FAST], link)]),
             namespace="test",
             static=frozenset([INFO]),
             live=False,
@@ -96,8 +96,8 @@ def test_the_end_of_a_stream_reaches_a_consumer_that_missed_messages() -> None:
     linked.outlet.end(FAST, 200, "over")
     found = linked.taken()
     assert found[-2:] == [("fast", "FRONTIER", 200), ("fast", "END", 200)]
-    assert linked.outlet.unsent == 200 + 2 - len(found)
-    assert linked.outlet.unsent > 0
+    assert linked.outlet.counters()["unsent"] == 200 + 2 - len(found)
+    assert linked.outlet.counters()["unsent"] > 0
 
 
 def test_a_frontier_waits_for_the_message_of_a_quick_firing_and_is_sent_without_one(linked: Linked) -> None:

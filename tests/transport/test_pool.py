@@ -135,7 +135,7 @@ def test_counts_of_several_threads_are_complete() -> None:
     sys.setswitchinterval(1e-6)
     try:
         threads = [
-            threading.Thread(target=lambda: [counters.moved("sent", 3) for _ in range(5000)] and None) for _ in range(4)
+            threading.Thread(target=lambda: [counters.published(3) for _ in range(5000)] and None) for _ in range(4)
         ]
         for thread in threads:
             thread.start()
@@ -143,5 +143,5 @@ def test_counts_of_several_threads_are_complete() -> None:
             thread.join()
     finally:
         sys.setswitchinterval(interval)
-    assert counters.as_dict()["sent_messages"] == 20_000
-    assert counters.as_dict()["sent_bytes"] == 60_000
+    assert counters.as_dict()["published_messages"] == 20_000
+    assert counters.as_dict()["published_bytes"] == 60_000

@@ -15,7 +15,6 @@ from transport_envelopes import carrying
 from dataflow.messages import DepthImage
 from dataflow.messages.base import Message
 from dataflow.transport import (
-    Counters,
     DecodeError,
     Fanout,
     Incoming,
@@ -46,10 +45,9 @@ class Shared:
     """A producer with a pool of so many blocks, and the consumers of its stream."""
 
     def __init__(self, consumers: int = 1, blocks: int = 4, most: tuple[int, int] | None = None) -> None:
-        self.counted = Counters()
         self.descriptors = [(make_ring(), os.eventfd(0, os.EFD_NONBLOCK), make_board()) for _ in range(consumers)]
         self.outgoing = [Outgoing(*d, most) for d in self.descriptors]
-        self.fanout = Fanout([([DEPTH], link) for link in self.outgoing], self.counted, pool_bytes=blocks * BLOCK)
+        self.fanout = Fanout([([DEPTH], link) for link in self.outgoing], pool_bytes=blocks * BLOCK)
         self.consumers = [self.consumer(k) for k in range(consumers)]
 
     def consumer(self, number: int = 0) -> Incoming:
@@ -91,8 +89,8 @@ def test_a_block_is_not_used_again_while_any_view_of_it_lives(shared: Shared) ->
     for seq in range(1, 30):
         assert shared.passed(seq) == depth_image(seq)
     assert held.tolist() == [0.0, 0.0]
-    assert shared.counted.as_dict()["shared_messages"] == 30
-    assert shared.counted.as_dict()["shared_full"] == 0
+    assert shared.fanout.counters()["shared_messages"] == 30
+    assert shared.fanout.counters()["shared_full"] == 0
 
 
 def test_without_room_messages_travel_whole_and_are_counted(shared: Shared) -> None:
@@ -103,26 +101,26 @@ def test_without_room_messages_travel_whole_and_are_counted(shared: Shared) -> N
             shared.fanout.flush()
         held += taken
     assert held == [depth_image(i) for i in range(7)]
-    counts = shared.counted.as_dict()
+    counts = shared.fanout.counters()
     assert (counts["shared_messages"], counts["shared_full"]) == (4, 3)
     held.clear()
     taken.clear()
     assert shared.passed(7) == depth_image(7)
-    assert shared.counted.as_dict()["shared_messages"] == 5
+    assert shared.fanout.counters()["shared_messages"] == 5
 
 
 def test_a_pool_that_nobody_holds_is_cut_anew_for_another_size(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
     held.clear()
     assert shared.passed(9, 512) == depth_image(9, 512)  # 1 MB: fits only where all four were
-    assert shared.counted.as_dict()["shared_full"] == 0
+    assert shared.fanout.counters()["shared_full"] == 0
 
 
 def test_small_messages_travel_whole_in_the_same_order(shared: Shared) -> None:
     for seq in range(30):
         shared.send(seq, 256 if seq % 10 == 0 else 4)
     assert [m.stamp for m in shared.taken()] == list(range(30))
-    assert shared.counted.as_dict()["shared_messages"] == 3
+    assert shared.fanout.counters()["shared_messages"] == 3
 
 
 def test_a_consumer_that_releases_nothing_leaves_room_for_the_others() -> None:
@@ -131,7 +129,7 @@ def test_a_consumer_that_releases_nothing_leaves_room_for_the_others() -> None:
     for seq in range(50):
         shared.send(seq)
         assert shared.taken(0) == [depth_image(seq)]
-    counts = shared.counted.as_dict()
+    counts = shared.fanout.counters()
     assert (counts["shared_messages"], counts["shared_full"]) == (50, 0)
     held = [m.stamp for m in shared.taken(1)]
     assert held == list(range(len(held)))
@@ -144,7 +142,7 @@ def test_where_nothing_may_be_lost_all_of_the_pool_may_be_held() -> None:
     shared = Shared(consumers=2, blocks=8)
     for seq in range(8):
         shared.send(seq)
-    assert shared.counted.as_dict()["shared_full"] == 0
+    assert shared.fanout.counters()["shared_full"] == 0
     assert [m.stamp for m in shared.taken(1)] == list(range(8))
     shared.close()
 
@@ -154,7 +152,7 @@ def test_what_a_consumer_held_that_was_replaced_is_free(shared: Shared) -> None:
     shared.outgoing[0].take_leave()
     shared.consumers[0] = shared.consumer()
     assert [shared.passed(seq) == depth_image(seq) for seq in range(4, 8)] == [True] * 4
-    assert shared.counted.as_dict()["shared_full"] == 0
+    assert shared.fanout.counters()["shared_full"] == 0
     held.clear()
 
 
