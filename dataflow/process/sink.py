@@ -116,20 +116,26 @@ class SinkProcess:
 
     def run(self) -> None:
         assert self.sink is not None
+        now, changed = time.monotonic(), True
         while not self._left:
-            idle = False
-            try:
-                item = self.inbox.get(timeout=IDLE_WAIT)
-            except queue.Empty:
-                idle = True
-            else:
-                self._handle(item)
+            if self._take(max(0.0, self._report_due - now) if changed else IDLE_WAIT):
+                changed = True
             now = time.monotonic()
             if now >= self._flush_due:
                 self._flush_due = now + FLUSH_EVERY
                 self.sink.flush()
-            if idle or self.inbox.empty() or now >= self._report_due:
+            if changed and now >= self._report_due:
+                changed = False
                 self._report(now)
+
+    def _take(self, timeout: float) -> bool:
+        """Handles the next item; False when there is none in time."""
+        try:
+            item = self.inbox.get(timeout=timeout)
+        except queue.Empty:
+            return False
+        self._handle(item)
+        return True
 
     def _handle(self, item: tuple[Any, ...]) -> None:
         match item:
@@ -204,9 +210,9 @@ class SinkProcess:
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
         self._done = min(dynamic, default=FOREVER)
         done = dict(self._taken) if self.config.live else {self.config.label: self._done}
+        self._report_due = now + REPORT_EVERY
         if done != self._told:
             self._told = done
-            self._report_due = now + REPORT_EVERY
             self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
             self._ended = True
