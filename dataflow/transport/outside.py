@@ -70,5 +70,6 @@ class OutsidePublisher:
             try:
                 publisher.put(payload)
             except BusError as error:
-                print(f"nothing is published any more: {error}", file=sys.stderr)
+                if not self._closed:  # else the bus was closed over a subscriber that takes nothing
+                    print(f"nothing is published any more: {error}", file=sys.stderr)
                 return

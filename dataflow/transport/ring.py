@@ -9,12 +9,16 @@ last; so a writer that is killed leaves whole frames, and its successor goes on 
 the place of another skips what was meant for that one.
 
 Neither side waits here: `put` returns False when there is no room, `take` returns what is there.
+
+On x86-64 other cores see stores in the order in which they were made. Elsewhere fences see to it that a frame's content
+is seen before the `head` that includes it.
 """
 
 from __future__ import annotations
 
 import mmap
 import os
+import platform
 import struct
 import threading
 from collections.abc import Sequence
@@ -24,6 +28,7 @@ _HEADER = 4096
 _HEAD, _TAIL, _ASLEEP, _BLOCKED, _READERS = (64 * k // 8 for k in range(5))  # a cache line each
 _FRAME = struct.Struct("<II")
 _SKIP = 0xFFFFFFFF
+_REORDERS = platform.machine() not in ("x86_64", "AMD64")
 
 Bytes = bytes | bytearray | memoryview
 
@@ -98,6 +103,9 @@ class RingWriter(_End):
             end = start + len(part)
             memory[start:end] = part
             start = end
+        if _REORDERS:
+            self._fence()
+            self._fence()
         self._head = words[_HEAD] = head + skipped + needed
         self._fence()
         if words[_ASLEEP]:
@@ -130,6 +138,8 @@ class RingReader(_End):
     def take(self, limit: int) -> list[tuple[int, bytes]]:
         """Up to `limit` frames that are there, in order: (channel, content). Raises `RingError` for a broken ring."""
         head, tail = self._words[_HEAD], self._tail
+        if _REORDERS:
+            self._fence()
         taken: list[tuple[int, bytes]] = []
         while tail != head and len(taken) < limit:
             at = tail & (self.capacity - 1)
