@@ -292,8 +292,6 @@ def _config(graph: Graph, log: LogPlan | None, paranoid: bool) -> ProcessConfig:
         publish={},
         subscribe=[],
         listen=[],
-        connect=[],
-        secret="",
         replay=replay,
         paranoid=paranoid,
         snapshots=graph.record.snapshots,
