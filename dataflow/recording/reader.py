@@ -212,6 +212,12 @@ class Recording:
         yield from self._merge(static, None, None)
         yield from self._merge(moving, start, end)
 
+    def stamps(self, stream: str, start: int | None = None, end: int | None = None) -> Iterator[int]:
+        """The stamps of what `messages()` gives of one stream, in that order, from the index alone."""
+        found = self._stream(stream)
+        rows_of = self._rows([found], start, end, by_log_time=False)
+        return (row[4] if found.own else row[0] for _, row in rows_of)
+
     def index(self, stream: str, start: int | None = None, end: int | None = None) -> StreamIndex[Recorded]:
         """Random access to the messages of one stream with start ≤ stamp ≤ end (ns), in the order of `messages()`.
 
@@ -233,8 +239,11 @@ class Recording:
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
         for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
             raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
-            info = stream.info
-            yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
+            info, data = stream.info, bytes(raw.data)
+            record = RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, data)
+            del raw, data  # it holds its chunk in memory
+            yield record
+            del record
 
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
