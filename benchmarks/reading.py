@@ -1,4 +1,4 @@
-"""How fast recordings are read, against the bare mcap library on the same file.
+"""Measures how fast recordings are read, against the bare mcap library on the same file.
 
 OMP_NUM_THREADS=1 python benchmarks/reading.py recordings/demo.mcap
 """

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from dataflow.api.runs import RunResult
 
 FILE = "graph.yaml"
-"""What error messages call the text of a graph that was built here."""
+"""The name by which error messages call the text of a graph that was built here."""
 
 
 class Graph:

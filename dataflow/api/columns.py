@@ -71,7 +71,7 @@ def fixed_shape(field: Field) -> tuple[int, ...] | None:
 
 
 def is_narrow(field: Field) -> bool:
-    """Whether the field fits a table unasked: a scalar, or a vector of fixed length; no matrix, image or list."""
+    """Returns whether the field fits a table unasked: a scalar or a vector of fixed length."""
     if isinstance(field, ArrayField):
         shape = fixed_shape(field)
         return shape is not None and len(shape) == 1

@@ -26,7 +26,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def recording_html(recording: RecordedStreams) -> str:
-    """What a recording holds: a row for each stream that has messages; the empty ones are named below."""
+    """Lists what a recording holds: a row for each stream that has messages; the empty ones are named below."""
     prefix = f"{recording.namespace}/"
     streams = [recording[name] for name in recording]
     shown = [stream for stream in streams if len(stream)]
@@ -40,7 +40,7 @@ def recording_html(recording: RecordedStreams) -> str:
 
 
 def stream_html(stream: RecordedStream) -> str:
-    """What a stream holds: its fields with their type, unit and meaning."""
+    """Describes a stream: its fields with their type, unit and meaning."""
     from dataflow.messages.declaration import field_text
 
     kind, count, rate = _facts(stream)
@@ -82,7 +82,7 @@ def graph_html(graph: Graph) -> str:
 
 
 def run_html(report: RunReport) -> str:
-    """What came of a run: a row for each operator, and what metrics sinks report."""
+    """Sums up a run: a row for each operator, and what metrics sinks report."""
     rows = [
         (name, f"{c.firings:,}", f"{c.emitted:,}", f"{c.dropped:,}", f"{c.cpu_ns * 1e-9:.3f}")
         for name, c in report.operators.items()
@@ -99,7 +99,7 @@ def run_html(report: RunReport) -> str:
 
 
 def verify_html(report: VerifyReport) -> str:
-    """What a verification found: its verdict, and a row for each operator."""
+    """Sums up a verification: its verdict, and a row for each operator."""
     rows = [
         (v.operator, report.verdict(v), f"{v.verified:,} of {v.firings:,}", f"{v.outputs:,}", f"{v.differing:,}")
         for v in report.operators

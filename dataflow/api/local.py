@@ -280,7 +280,7 @@ def _losses(drops: Mapping[tuple[str, str], int]) -> tuple[tuple[str, str, int],
 
 
 def _config(graph: Graph, log: LogPlan | None, paranoid: bool) -> ProcessConfig:
-    """What a process of its own would be told."""
+    """Returns what a process of its own would be told."""
     replay = None
     if log is not None:
         span = {"start": log.start, "end": log.end}

@@ -42,7 +42,7 @@ def stream_named(word: str, names: Iterable[str], namespace: str = "") -> str:
 
 
 def _readings(word: str, namespace: str) -> Iterable[str]:
-    """What a word may mean, the likeliest first."""
+    """Yields what a word may mean, the likeliest first."""
     yield word
     if namespace:
         yield f"{namespace}/{word}"

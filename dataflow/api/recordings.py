@@ -144,7 +144,7 @@ class RecordedStreams(Mapping[str, RecordedStream]):
         return self._recording.messages(readable, self._first, self._last)
 
     def events(self) -> Iterator[Event]:
-        """What happened to the run: restarts, gaps, planned faults."""
+        """Reads the events of the run: restarts, gaps, planned faults."""
         return self._recording.events()
 
     def join(

@@ -26,20 +26,20 @@ from dataflow.supervision.report import RunReport
 from dataflow.verification.report import VerifyReport
 
 NOTEBOOK = "__main__:"
-"""How the import paths of operators begin that were defined in a notebook or script: no other process finds them."""
+"""The beginning of import paths of operators in a notebook or script: no other process finds them."""
 GraphLike = Graph | ResolvedGraph | str | Path
 
 
 @dataclass(frozen=True, slots=True)
 class RunResult:
-    """What came of a run: its report, and the recording if there is one."""
+    """The result of a run: its report, and the recording if there is one."""
 
     report: RunReport
     path: Path | None = None
 
     @property
     def summaries(self) -> Mapping[str, Mapping[str, Any]]:
-        """What metrics sinks report, by operator: {figure: value}."""
+        """The figures of metrics sinks, by operator: {figure: value}."""
         return self.report.summaries
 
     @property
@@ -68,13 +68,13 @@ class RunResult:
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """What a verification found; `report` has all of it."""
+    """The result of a verification; `report` has all of it."""
 
     report: VerifyReport
 
     @property
     def identical(self) -> bool:
-        """Whether every recorded firing was repeated with the same outputs, bit for bit."""
+        """True when every recorded firing was repeated with the same outputs, bit for bit."""
         return self.report.identical
 
     @property
@@ -212,7 +212,7 @@ def _defined_here(graph: ResolvedGraph) -> list[str]:
 
 
 def _metadata(graph: ResolvedGraph, mode: str) -> dict[str, dict[str, str]]:
-    """What a recording made here says of itself; the thread settings are those of this process."""
+    """Returns what a recording made here says of itself; the thread settings are those of this process."""
     facts = {
         "mode": mode,
         "started": str(time.time_ns()),

@@ -36,7 +36,7 @@ class RecordedStream(Sequence[Message]):
 
     @property
     def info(self) -> StreamInfo:
-        """What the recording knows of the stream without decoding it: schema, encoding, count, size, metadata."""
+        """The facts of the stream that need no decoding: schema, encoding, count, size, metadata."""
         return self._recording.streams[self.name]
 
     @property

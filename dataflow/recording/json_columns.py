@@ -35,7 +35,7 @@ def _column(field: Field, objects: Sequence[Any]) -> Values:
 
 
 def _is_plain(value: Any, name: str) -> bool:
-    """Whether the field of a message stands in plain JSON alone, or nowhere."""
+    """Returns whether the field of a message stands in plain JSON alone, or nowhere."""
     if type(value) is not dict:
         return False
     exact = value.get(EXACT)

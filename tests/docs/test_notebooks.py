@@ -46,7 +46,7 @@ def cells_of(notebook: Path) -> list[dict[str, Any]]:
 
 @pytest.fixture(scope="module")
 def shown() -> list[str]:
-    """What each code cell of the tour shows."""
+    """Runs the tour; returns what each code cell shows."""
     pytest.importorskip("pandas", reason="the extra [notebook] is not installed")
     command = [sys.executable, "-c", RUNNER, "recording.ipynb"]
     done = subprocess.run(command, cwd=FOLDER, env=ENVIRONMENT, capture_output=True, text=True, timeout=110)
