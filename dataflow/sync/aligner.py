@@ -288,14 +288,6 @@ class Aligner:
             self._decided = frontier
         return self._decided
 
-    @property
-    def next_undecided(self) -> int | None:
-        """The first stamp of a trigger or tick that is not decided; None if there is none yet."""
-        if self._finished:
-            return None
-        self._settle()
-        return self._undecided()
-
     def ended(self) -> bool:
         """Tells whether `poll` has returned the `finish` firing, and will return no other."""
         return self._finished
