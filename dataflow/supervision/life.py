@@ -53,8 +53,6 @@ class Step(Enum):
     GIVE_UP = "give up"
 
 
-"""Those that take part, or are about to."""
-
 _ENDS = {Step.LEAVE: Life.LEAVING, Step.LEAVE_FAILED: Life.FAILED, Step.KILL: Life.KILLED, Step.DIE: Life.GONE}
 
 TRANSITIONS: Mapping[Life, Mapping[Step, Life]] = {
