@@ -74,7 +74,7 @@ class LogFeed:
         self._step: list[Recorded] = []
         self._following: Recorded | None = None
         self.last = NEVER
-        self.firings = 0
+        self.firings = self.emitted = 0
         self.ended = False
         self.work = Work()
         self.static_digests: dict[str, StreamDigest] = {}
@@ -103,6 +103,7 @@ class LogFeed:
             self.static_digests.setdefault(item.stream, StreamDigest()).update(digest)
             entry = Entry(item.message.stamp, item.message, item.seq, item.incarnation, digest, item.stream)
             self.emitter.message(item.stream, entry)
+            self.emitted += 1
             emitted[self._nodes[item.stream]][item.stream] = Emission(item.seq, item.message.stamp, digest)
         for stream in sorted(self._static):
             self.emitter.end(stream, None, "static")
@@ -147,6 +148,7 @@ class LogFeed:
             by_node.setdefault(state.node, {})[item.stream] = Emission(item.seq, stamp, digest)
         self.last = stamp
         self.firings += 1
+        self.emitted += len(step)
         started = time.time_ns()
         for node, emitted in by_node.items():
             self._records[node].add("fire", stamp, started, outputs=tuple(emitted.get(s) for s in self._ports[node]))

@@ -24,7 +24,7 @@ def definitions(tree: ast.Module) -> Iterator[str]:
             handed_on = any(
                 isinstance(each, ast.Call) and ast.unparse(each.func) != "dataclass" for each in node.decorator_list
             )
-            if not node.name.startswith("__") and not handed_on:
+            if not re.fullmatch(r"_.*_", node.name) and not handed_on:  # Python and notebooks call those
                 yield node.name
     for node in tree.body:
         if isinstance(node, ast.Assign):
