@@ -199,12 +199,12 @@ class OperatorSpec:
 
     @cached_property
     def absent(self) -> Mapping[str, tuple[()] | None]:
-        """What `process()` is given on each input where that takes no part."""
+        """Returns what `process()` is given on each input where that takes no part."""
         return {name: () if port.kind == "batch" else None for name, port in self.inputs.items()}
 
     @cached_property
     def takes_context(self) -> bool:
-        """Whether `process()` has a parameter named `context`."""
+        """Tells whether `process()` has a parameter named `context`."""
         return "context" in self.process_takes
 
     @cached_property

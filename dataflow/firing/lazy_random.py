@@ -21,7 +21,7 @@ _REFERENCES = 4
 
 
 class _State:
-    """What is pending, and how often the generator was seeded after all."""
+    """Holds what is pending, and how often the generator was seeded after all."""
 
     seed: SupportsInt = 0
     settled = 0

@@ -1,4 +1,4 @@
-"""Which operators of a process have something to do: those that woke, and those whose time has come.
+"""Says which operators of a process have something to do: those that woke, and those whose time has come.
 
 A process asks nobody else, so that an operator which is given nothing costs nothing, however many there are.
 """

@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from dataflow.messages.base import Message, MessageError, import_type, message_type
 from dataflow.messages.declaration import Declaration
-from dataflow.operator import InputPort, Operator, OperatorSpec, OutputPort
+from dataflow.operator import InputPort, Operator, OperatorSpec
 
 QueuePolicy = Literal["newest", "oldest", "block"]
 StalePolicy = Literal["use", "drop"]
@@ -128,9 +128,6 @@ class Node:
 
     def input_port(self, name: str) -> InputPort:
         return self.spec.inputs[name]
-
-    def output_port(self, name: str) -> OutputPort:
-        return self.spec.outputs[name]
 
     def make(self) -> Operator:
         """A new operator object with this node's parameters."""

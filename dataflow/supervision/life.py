@@ -53,9 +53,6 @@ class Step(Enum):
     GIVE_UP = "give up"
 
 
-_ALIVE = (Life.STARTING, Life.JOINED, Life.READY, Life.PROBING, Life.RUNNING, Life.ENDED)
-"""Those that take part, or are about to."""
-
 _ENDS = {Step.LEAVE: Life.LEAVING, Step.LEAVE_FAILED: Life.FAILED, Step.KILL: Life.KILLED, Step.DIE: Life.GONE}
 
 TRANSITIONS: Mapping[Life, Mapping[Step, Life]] = {
@@ -73,7 +70,6 @@ TRANSITIONS: Mapping[Life, Mapping[Step, Life]] = {
     Life.AWAY: {Step.RESTART: Life.STARTING, Step.GIVE_UP: Life.GONE},
 }
 
-TAKES_PART = frozenset(_ALIVE)
 WORKS = frozenset({Life.RUNNING, Life.ENDED})
 ON_ITS_WAY = frozenset({Life.STARTING, Life.JOINED, Life.READY, Life.PROBING})
 HAS_PROCESS = frozenset(Life) - {Life.GONE, Life.AWAY}

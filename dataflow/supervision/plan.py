@@ -77,10 +77,6 @@ class ProcessPlan:
     streams: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def has_feed(self) -> bool:
-        return self.sink is None
-
 
 def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
     """Returns the processes of a run by label: those of operators in graph order, the recorder, the viewer file."""

@@ -308,14 +308,6 @@ class Aligner:
             return NEVER
         return self.output_frontier()
 
-    @property
-    def next_undecided(self) -> int | None:
-        """The first stamp of a trigger or tick that is not decided; None if there is none yet."""
-        if self._finished:
-            return None
-        self._settle()
-        return self._undecided()
-
     def ended(self) -> bool:
         """Tells whether `poll` has returned the `finish` firing, and will return no other."""
         return self._finished
@@ -336,7 +328,7 @@ class Aligner:
         return self._drop_log.late
 
     def has_drops(self) -> bool:
-        """Whether there is a drop that was not taken."""
+        """Tells whether there is a drop that was not taken."""
         return self._drop_log.pending
 
     def take_drops(self) -> list[Drop]:

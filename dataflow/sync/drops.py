@@ -56,7 +56,7 @@ class DropLog:
 
     @property
     def pending(self) -> bool:
-        """Whether there is a drop that was not taken."""
+        """Tells whether there is a drop that was not taken."""
         return bool(self._events or self._unlisted)
 
     def take(self) -> list[Drop]:

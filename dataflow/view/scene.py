@@ -13,7 +13,7 @@ import rerun as rr
 from dataflow.messages.geometry import split_matrix
 from dataflow.view import colors
 from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
-from dataflow.view.layout import COLOR, DEPTH, Layout, is_truth
+from dataflow.view.layout import Layout, is_truth
 
 Vector = npt.NDArray[np.float64]
 
@@ -264,10 +264,6 @@ class SceneState:
             return Outlook(up, middle - level * (0.97 * size) + up * (1.05 * size) + side * (0.4 * size), middle)
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
-
-    def image_streams(self) -> tuple[str, ...]:
-        """Every stream of images, colour and depth."""
-        return self.layout.of_type(*COLOR, *DEPTH)
 
 
 def frame_entity(frame: str) -> str:

@@ -209,10 +209,6 @@ class ViewerSink:
             self._tell("", "slow", "the viewer is too slow: some messages are not shown (the oldest are dropped)")
         return True
 
-    def is_static(self, stream: str) -> bool:
-        """Tells whether the stream's one message holds for all time."""
-        return stream in self._scene.layout.static
-
     def statistics(self) -> SinkStatistics:
         """Returns what became of the messages so far."""
         return SinkStatistics(self._counts["drawn"], self._counts["dropped"], self._counts["failed"])

@@ -1,4 +1,5 @@
-"""What is done to the robot and its world at given times: faults of sensors, lamps that are switched, kidnappings."""
+"""Holds what is done to the robot and its world at given times: faults of sensors, lamps that are switched,
+kidnappings."""
 
 from __future__ import annotations
 

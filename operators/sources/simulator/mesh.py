@@ -18,7 +18,7 @@ APART = 64.0
 
 
 class Scene(Protocol):
-    """What is used of Open3D's RaycastingScene; tensors are its own."""
+    """Holds what is used of Open3D's RaycastingScene; tensors are its own."""
 
     def add_triangles(self, vertices: Any, triangles: Any) -> int: ...
 

@@ -54,7 +54,7 @@ def camera_rays(T_world_camera: Array, optics: Optics) -> F32:
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a camera sees, without noise.
+    """View of a camera, without noise.
 
     `depth` (H, W) metres along z, infinite where nothing is hit; `cosine` (H, W) of the angle between ray and surface
     normal; `triangle` (H, W) index of what is hit; `instances` and `classes` (H, W), 0 and `VOID` where nothing is

@@ -1,4 +1,4 @@
-"""What all textures are painted with: smooth noise, rectangles, colours, rows of words."""
+"""Holds what all textures are painted with: smooth noise, rectangles, colours, rows of words."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Order:
-    """What is asked of a world.
+    """Holds what is asked of a world.
 
     `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, how many `people` are
     among them, whether the robot makes a `tour` that crosses itself and sees places from several sides instead of a

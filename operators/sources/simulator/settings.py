@@ -254,13 +254,13 @@ class Sensors:
         }
 
     def cast_rays(self) -> bool:
-        """Whether any that is on needs the renderer."""
+        """Tells whether any that is on needs the renderer."""
         seeing = (self.color_camera, self.depth_camera, self.stereo, self.lidar, self.radar, self.landmarks)
         return any(sensor.rate for sensor in seeing) or bool(self.gnss.rate and self.gnss.sky)
 
 
 class Motion(BaseModel):
-    """How the robot's body is shaken on its way."""
+    """Says how the robot's body is shaken on its way."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

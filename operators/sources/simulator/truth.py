@@ -143,7 +143,7 @@ def activities(world: World, t: float, first_stamp: int, stamp: int) -> Activity
 
 
 def events(now: Sequence[Change], stamp: int) -> Diagnostics:
-    """What begins (a warning) and what ends (ok) at one time."""
+    """Returns what begins (a warning) and what ends (ok) at one time."""
     return Diagnostics(
         stamp=stamp,
         names=tuple(change.name for change in now),
