@@ -133,7 +133,7 @@ def _inhabit(builder: Builder, rng: Rng, back: Wall, length: float, half: float)
     add_walker(builder, rng, np.array([back.place(0.9, s * reach)[:2, 3] for s in (-1.0, -0.3, 0.4, 1.0)]))
     y = half - 1.1
     add_walker(builder, rng, np.array([(3.0, -y), (length / 2, -y + 0.05), (length - 1.0, -y)]))
-    add_ball(builder, rng, np.array([2.5, y]), np.array([length - 2.5, y]), radius=rng.uniform(0.09, 0.15), seconds=6.0)
+    add_ball(builder, rng, np.array([2.5, y]), np.array([length - 2.5, y]), radius=rng.uniform(0.09, 0.15), seconds=9.0)
     angle = np.linspace(0, 2 * math.pi, 10, endpoint=False)
     way = np.stack([length - 1.1 + 0.3 * np.sin(angle), 2.6 * np.cos(angle)], axis=1)
     add_rover(builder, rng, way)
