@@ -64,11 +64,12 @@ Rng = np.random.Generator
 
 
 class SimulatedRobot(Source):
-    """A wheeled robot that drives a closed path through a drawn indoor world among people and things that move.
+    """A wheeled robot that drives a closed path through a drawn world among people and things that move.
 
-    Worlds: `office`, `corridor` (a ring that returns to its start) and `table_top`. The same seed and parameters give
-    the same bytes, whatever the machine's load, the number of threads or what else is switched on: every measurement
-    has random numbers of its own. Sensors other than the cameras are off until they are given a rate.
+    Worlds: `office`, `corridor` (a ring that returns to its start), `table_top`, and `yard`, half of it outdoors. The
+    same seed and parameters give the same bytes, whatever the machine's load, the number of threads or what else is
+    switched on: every measurement has random numbers of its own. Sensors other than the cameras are off until they are
+    given a rate.
 
     Stamps are exact: measurement k of a sensor is at first_stamp + phase + k / rate. A faulty clock (`delay`) shows
     what was so long before the stamp; truth that belongs to an image describes what the image shows.
@@ -108,7 +109,7 @@ class SimulatedRobot(Source):
     mesh: Out[Mesh] = Out(static=True, doc="the surface of all that stands still")
     events: Out[Diagnostics] = Out(doc="faults, kidnappings and lamps, when each begins and ends")
 
-    world: Literal["office", "corridor", "table_top"] = Param("office", doc="kind of world")
+    world: Literal["office", "corridor", "table_top", "yard"] = Param("office", doc="kind of world")
     seed: int = Param(0, ge=0, doc="of the world, its looks, its movers and all noise")
     duration: Duration = Param("30s", doc="length; stamps lie before first_stamp + duration")
     first_stamp: int = Param(0, ge=0, doc="stamp of the start", unit="ns")

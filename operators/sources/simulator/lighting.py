@@ -20,6 +20,7 @@ class Baked:
 
     world: World
     lamps: Array
+    sun: Array
     ambient: Array
     glow: Array
     shades: NDArray[np.bool_]
@@ -29,12 +30,12 @@ class Baked:
         cls, world: World, mesh: Mesh, lamps: list[int], occluded: Callable[[F32, float], NDArray[np.bool_]]
     ) -> Baked:
         """`lamps` are the indices of things whose glow is that of a lamp."""
-        direct, ambient = _bake(world, mesh.vertices, mesh.normals, occluded)
-        return cls(world, direct, ambient, mesh.glow, np.isin(mesh.thing_of_vertex, lamps))
+        lamps_light, sun, ambient = _bake(world, mesh.vertices, mesh.normals, occluded)
+        return cls(world, lamps_light, sun, ambient, mesh.glow, np.isin(mesh.thing_of_vertex, lamps))
 
     def at(self, level: float) -> F32:
         """The light (V,) where lamps shine with a share of their strength."""
-        received = level * self.lamps + dimmed(self.world, level) * self.ambient
+        received = level * self.lamps + self.sun + dimmed(self.world, level) * self.ambient
         glow = np.where(self.shades, self.glow * max(level, 0.3), self.glow)  # a dark shade is white cloth
         return np.where(self.glow > 0, glow, received).astype(np.float32)
 
@@ -66,11 +67,14 @@ class Floor:
         return light
 
 
-def direct(lights: tuple[Light, ...], points: Array, normals: Array) -> Array:
-    """Direct light (V,) on points with normals, without shadows."""
+def direct(lights: tuple[Light, ...], level: float, points: Array, normals: Array) -> Array:
+    """Direct light (V,) on points with normals, without shadows; lamps shine with a share `level` of their strength."""
     total = np.zeros(len(points))
     for light in lights:
-        total += _lamp(light, np.array(light.position), points, normals)
+        received = _lamp(light, np.array(light.position), points, normals)
+        if light.area is not None:
+            received *= ((points[:, :2] >= light.area[0]) & (points[:, :2] <= light.area[1])).all(axis=1)
+        total += level * received if light.switched else received
     return total
 
 
@@ -83,13 +87,14 @@ def _lamp(light: Light, position: Array, points: Array, normals: Array) -> Array
 
 def _bake(
     world: World, vertices: Array, normals: Array, occluded: Callable[[F32, float], NDArray[np.bool_]]
-) -> tuple[Array, Array]:
-    """Light (V,) of lamps on still vertices, with soft shadows, and ambient light where the surroundings are open."""
+) -> tuple[Array, Array, Array]:
+    """Light (V,) on still vertices: of lamps, with soft shadows, of the sun, and ambient where it is open around."""
     rng = np.random.default_rng(20)  # only where on a lamp and in the half sphere the few samples lie
     start = vertices + 4e-3 * normals
-    total = np.zeros(len(vertices))
+    lamps, sun = np.zeros(len(vertices)), np.zeros(len(vertices))
     samples = 4
     for light in world.lights:
+        total = lamps if light.switched else sun
         for _ in range(samples):
             spot = np.array(light.position) + rng.uniform(-1, 1, 3) * [light.radius, light.radius, 0.02]
             received = _lamp(light, spot, vertices, normals)
@@ -104,4 +109,4 @@ def _bake(
         toward = normals + 0.98 * direction  # cosine-weighted about the normal
         toward /= np.linalg.norm(toward, axis=1, keepdims=True)
         openness += ~occluded(np.concatenate([start, toward], axis=1).astype(np.float32), 0.8)
-    return total, world.ambient * (0.15 + 0.85 * openness / len(directions))
+    return lamps, sun, world.ambient * (0.15 + 0.85 * openness / len(directions))

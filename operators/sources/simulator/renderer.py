@@ -119,7 +119,7 @@ class Renderer:
         normals = np.einsum("vij,vj->vi", of[:, :3, :3], self._moving.normals)
         self._moved = vertices
         self._moving_scene = self._build(vertices, self._moving.triangles)
-        received = level * direct(self.world.lights, vertices, normals)
+        received = direct(self.world.lights, level, vertices, normals)
         received += dimmed(self.world, level) * self.world.ambient * (0.72 + 0.13 * normals[:, 2])
         light = np.where(self._moving.glow > 0, self._moving.glow, received).astype(np.float32)
         self._set_light(slice(self._first_moving, None), self._moving.triangles, light)

@@ -83,11 +83,17 @@ class Thing:
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp that shines in all directions; `strength` is its irradiance at 1 m, `radius` softens its shadows."""
+    """A lamp that shines in all directions; `strength` is its irradiance at 1 m, `radius` softens its shadows.
+
+    Movers throw and take no shadows: a lamp with an `area` (lowest and highest x and y) shines on those in it alone.
+    One that is not `switched`, the sun, shines whatever the lighting.
+    """
 
     position: tuple[float, float, float]
     strength: float
     radius: float = 0.25
+    area: tuple[tuple[float, float], tuple[float, float]] | None = None
+    switched: bool = True
 
 
 @dataclass(frozen=True)

@@ -85,6 +85,15 @@ def metal(rng: Rng) -> Pixels:
     return rgb(195 + 8 * noise(rng, 4, 200) + 4 * noise(rng, 16))
 
 
+def asphalt(rng: Rng) -> Pixels:
+    return rgb(grey(rng, 150, (6, 8), (60, 8), (200, 22)))
+
+
+def grass(rng: Rng) -> Pixels:
+    blades = grey(rng, 170, (8, 14), (100, 20), (250, 26))
+    return np.asarray(blades[..., None] * np.array([0.62, 0.9, 0.45], np.float32))
+
+
 PAINTERS: dict[str, Callable[[Rng], Pixels]] = {
     painter.__name__: painter
     for painter in (
@@ -98,5 +107,7 @@ PAINTERS: dict[str, Callable[[Rng], Pixels]] = {
         fabric,
         checked,
         metal,
+        asphalt,
+        grass,
     )
 }

@@ -8,9 +8,16 @@ from operators.sources.simulator.corridor import corridor
 from operators.sources.simulator.office import office
 from operators.sources.simulator.scene import Order, World
 from operators.sources.simulator.table_top import table_top
+from operators.sources.simulator.yard import yard
 
-_MAKERS: dict[str, Callable[[int, Order], World]] = {"office": office, "corridor": corridor, "table_top": table_top}
+_MAKERS: dict[str, Callable[[int, Order], World]] = {
+    "office": office,
+    "corridor": corridor,
+    "table_top": table_top,
+    "yard": yard,
+}
 NAMES = tuple(_MAKERS)
+INDOOR = ("office", "corridor", "table_top")
 
 
 def make_world(

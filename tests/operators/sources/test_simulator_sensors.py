@@ -462,6 +462,27 @@ def test_satellite_fixes_scatter_about_the_antenna() -> None:
     assert np.std([fix.altitude for fix in fixes]) == pytest.approx(1.0, rel=0.15)
 
 
+def test_satellites_are_lost_under_a_roof() -> None:
+    source = robot(world="yard", duration="82s", movers=False, gnss={"rate": 2, "sky": True, "drift": 0, "noise": 0.1})
+    fixes: list[Any] = stream(source, "fix")
+    assert len(fixes) > 60
+    stage, open_sky = source._stage, {}
+    for k in range(164):
+        antenna = (stage.T_world_base(k / 2) @ mounted(source.gnss.mount))[:3, 3]
+        up = np.concatenate([antenna, [0, 0, 20.0]])[None].astype(np.float32)
+        open_sky[k * 500_000_000] = not stage.at(k / 2).blocked(up)[0]
+    seen = {fix.stamp: fix for fix in fixes}
+    under = [stamp for stamp, free in open_sky.items() if not free]
+    assert len(under) > 40
+    assert sum(stamp in seen for stamp in under) < 0.2 * len(under)
+    assert all(stamp in seen for stamp, free in open_sky.items() if free)
+    assert all(fix.satellites >= 4 for fix in fixes)
+    few, many = (
+        [np.trace(fix.covariance) for fix in fixes if low <= fix.satellites < high] for low, high in ((4, 8), (11, 13))
+    )
+    assert min(few) > max(many)
+
+
 def test_a_mount_turns_about_fixed_axes() -> None:
     T = mounted((1.0, 2.0, 3.0, 0.0, math.pi / 2, 0.0)) @ BODY_TO_OPTICAL
     np.testing.assert_allclose(T[:3, 2], [0, 0, -1], atol=1e-12)  # pitch > 0 looks down
