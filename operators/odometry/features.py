@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
 Pixels = NDArray[np.float64]
+Pixels32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 LK_WINDOW = (15, 15)
@@ -56,3 +57,25 @@ def with_exposure_of(reference: Gray, gray: Gray) -> Gray:
         return gray
     table = np.clip(np.rint((np.arange(256) - mean) * gain + mean_wanted), 0, 255).astype(np.uint8)
     return np.asarray(cv2.LUT(gray, table), np.uint8)
+
+
+def track_both_ways(a: Gray, b: Gray, pixels: Pixels, guess: Pixels, back: float) -> tuple[Pixels, Mask]:
+    """Follows pixels (N, 2) from image a to b and back again; those that return within `back` pixels are found."""
+    if not len(pixels):
+        return np.zeros((0, 2)), np.zeros(0, np.bool_)
+    height, width = b.shape
+    start = np.asarray(pixels, np.float32)
+    inside = (guess > -10).all(axis=1) & (guess[:, 0] < width + 10) & (guess[:, 1] < height + 10)
+    ends, found = _lucas_kanade(a, b, start, np.where(inside[:, None], guess, pixels).astype(np.float32))
+    again, found_back = _lucas_kanade(b, a, ends, start)
+    good = found & found_back & (np.abs(again - start).max(axis=1) < back)
+    good &= (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
+    return ends.astype(np.float64), np.asarray(good, np.bool_)
+
+
+def _lucas_kanade(a: Gray, b: Gray, pixels: Pixels32, guess: Pixels32) -> tuple[Pixels32, Mask]:
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(
+        a, b, pixels, guess.copy(), winSize=LK_WINDOW, maxLevel=LK_LEVELS,
+        criteria=LK_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+    )  # fmt: skip
+    return np.asarray(ends, np.float32), np.asarray(found.ravel() > 0, np.bool_)

@@ -27,7 +27,7 @@ PIXEL_STRENGTH = 0.2
 # Drift that no residual of one frame shows: variances are this much larger than residuals say (calibrated against
 # truth, see the benchmark). Calibration, rolling shutters and unsynchronised images err alike in every residual, so no
 # count averages them out, but tracks then miss by more than they jitter; and what moves may do so unnoticed.
-SYSTEMATIC = 3.0
+SYSTEMATIC = 0.75
 JITTER = 0.3  # working pixels
 MOVING = 10.0  # of the share of the view that moves
 
