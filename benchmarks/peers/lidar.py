@@ -75,7 +75,7 @@ def evalio(name: str, data: Any, scans: list[Any], stamps: Any) -> tuple[list[An
     from evalio.types import SE3, Duration, ImuParams, LidarMeasurement, LidarParams, Point, Stamp
 
     pipeline = getattr(evalio.pipelines, name)()
-    params = dict(EVALIO[name])
+    params = {**pipeline.default_params(), **EVALIO[name]}
     if "deskew" in pipeline.default_params():
         params["deskew"] = scans[0][1] is not None
     if "voxel_size" in pipeline.default_params() and name == "KissICP":

@@ -52,7 +52,7 @@ class LidarOdometry(Operator):
     voxel: float = Param(2.0, gt=0.1, doc="side of the largest planes of the map", unit="m")
     levels: int = Param(3, ge=1, le=5, doc="sizes of planes, each half the one before")
     noise: float = Param(0.03, gt=0, doc="standard deviation of a range", unit="m")
-    correlation: float = Param(5.0, ge=1, doc="points whose errors are alike, for the covariance")
+    correlation: float = Param(10.0, ge=1, doc="points whose errors are alike, for the covariance")
     acceleration: float = Param(10.0, gt=0, doc="standard deviation from constant velocity", unit="m/s²")
     angular_acceleration: float = Param(15.0, gt=0, doc="the same of turning", unit="rad/s²")
     start_speed: float = Param(30.0, gt=0, doc="how fast it may move when first seen", unit="m/s")
