@@ -44,6 +44,7 @@ class Progress:
         self._dropped: dict[str, list[list[Any]]] = {}
         self._counted: dict[str, tuple[int, int]] = {}
         self._count_due = -COUNT_EVERY
+        self._uncounted = False
         self._done: dict[str, int] = {}
         self._firings = 0
         self._reported = -REPORT_EVERY
@@ -57,7 +58,8 @@ class Progress:
             return
         done = {r.node.name: r.done for r in self._runners.operators if self._done.get(r.node.name) != r.done}
         firings = self._made()
-        if not done and firings == self._firings:
+        counts_due = idle or now >= self._count_due
+        if not done and firings == self._firings and not (self._uncounted and counts_due):
             return
         if now < self._reported + (REPORT_IDLE if done else REPORT_EVERY):
             self._owed = True
@@ -66,7 +68,8 @@ class Progress:
         self._done.update(done)
         self._firings = firings
         changed: list[Runner] = []
-        if idle or now >= self._count_due:
+        self._uncounted = not counts_due
+        if counts_due:
             self._count_due = now + COUNT_EVERY
             for runner in self._runners.operators:
                 reached = runner.firings, runner.done
