@@ -49,7 +49,7 @@ class LiveRunner(OperatorRunner):
         paranoid: bool = False,
         operator: Operator | None = None,
         snapshots: int | None = None,
-        clock: Clock = time.monotonic,
+        clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         fault: Fault = lambda firing: None,
@@ -72,6 +72,7 @@ class LiveRunner(OperatorRunner):
         }
         self._log = DropLog()  # of what did not reach an aligner
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
+        clock = clock or time.monotonic
         self._event_clock = event_clock
         self._newest, self._shift = NEVER, 0
         self.patience = Patience(node.live.wait, clock, self._event_time)

@@ -298,6 +298,19 @@ class Message(_Declared):
         """Pickled by value and remade by the constructor, so that the arrays come back frozen."""
         return _remake, (type(self), dict(self.items()))
 
+    def _repr_html_(self) -> str:
+        """HTML for notebooks."""
+        from dataflow.messages.display import message_html
+
+        return message_html(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """A PNG file for notebooks, of messages that can be drawn."""
+        from dataflow.messages.display import image_file
+
+        found = image_file(self)
+        return found[1] if found is not None and found[0] == "png" else None
+
     def __repr__(self) -> str:
         words = [f"stamp={self.stamp}"]
         for f in self.FIELDS:

@@ -71,6 +71,7 @@ class OperatorProcess:
             self._deliver,
             static=self.static,
             live=config.live,
+            from_start=config.live and config.resume is None,
         )
         self.outlet = Outlet(
             channel,

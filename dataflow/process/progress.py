@@ -31,10 +31,10 @@ class Progress:
         runners: Runners,
         feeding: Feeding,
         live: LiveSources,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self._channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
-        self._clock = clock
+        self._clock = clock or time.monotonic
         self.counted: dict[str, list[int]] = {}
         """The counts that were last reported, of all operators."""
         self.waited: dict[str, list[list[Any]]] = {}
