@@ -243,9 +243,7 @@ def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunRepor
             undone = min((s for s, when in worked if when > now and s < stamp), default=stamp)
             ahead = sum(messages for when, s, messages in given if when < now and undone <= s < stamp)
             if ahead >= scenario.window + MOST_OF_A_STEP:
-                raise Violation(
-                    f"{label}: {ahead} messages ahead of stamp {undone}, with a window of {scenario.window}"
-                )
+                raise Violation(f"{label}: {ahead} messages ahead of stamp {undone}, with a window of {scenario.window}")
 
 
 NO_LOOK_AHEAD = ("chain", "diamond")

@@ -106,11 +106,7 @@ class Simulation:
             stack.callback(_restore_effort, *before)
             stack.callback(self.world.close)
             self._play()
-        self.outcome.seconds, self.outcome.turns, self.outcome.calls = (
-            self.world.now,
-            self.world.turns,
-            self.world.calls,
-        )
+        self.outcome.seconds, self.outcome.turns, self.outcome.calls = self.world.now, self.world.turns, self.world.calls
         self.outcome.lost = sum(link.lost for link in self.network.links)
         self.outcome.disk_full = self.disk.full
         return self.outcome

@@ -175,18 +175,11 @@ def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happenin
     kind, target = r.choice(kinds), r.choice(labels) if r.random() < 0.9 else "@recorder"
     match kind:
         case "freeze":
-            return Happening(
-                at,
-                kind,
-                target,
-                {"span": r.choice((round(0.3 * r.random(), 4), round(2 * r.random(), 4), 6.0, FOREVER))},
-            )
+            return Happening(at, kind, target, {"span": r.choice((round(0.3 * r.random(), 4), round(2 * r.random(), 4), 6.0, FOREVER))})
         case "kill_at_call":
             return Happening(0.0, kind, target, {"call": r.randint(1, 1200), "life": r.choice((1, 1, 1, 2))})
         case "cut":
-            return Happening(
-                at, kind, target, {"other": r.choice([*labels, "@recorder"]), "span": round(0.3 * r.random(), 4)}
-            )
+            return Happening(at, kind, target, {"other": r.choice([*labels, "@recorder"]), "span": round(0.3 * r.random(), 4)})
         case "stop":
             return Happening(at, kind)
         case _:
