@@ -15,8 +15,8 @@ from dataflow.firing.protocol import Runner
 class Ready:
     """The runners of one process, in graph order."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self._clock = clock
+    def __init__(self, clock: Callable[[], float] | None = None) -> None:
+        self._clock = clock or time.monotonic
         self._woken: list[Runner] = []
         self._runners: list[Runner] = []
         self._due: dict[int, float] = {}

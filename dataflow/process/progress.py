@@ -44,6 +44,7 @@ class Progress:
         self._dropped: dict[str, list[list[Any]]] = {}
         self._counted: dict[str, tuple[int, int]] = {}
         self._count_due = -COUNT_EVERY
+        self._uncounted = False
         self._done: dict[str, int] = {}
         self._firings = 0
         self._reported = -REPORT_EVERY
@@ -58,13 +59,15 @@ class Progress:
         self._owed = False
         done = {r.node.name: r.done for r in self._runners.operators if self._done.get(r.node.name) != r.done}
         firings = self._made()
-        if not done and firings == self._firings:
+        counts_due = idle or now >= self._count_due
+        if not done and firings == self._firings and not (self._uncounted and counts_due):
             return
         self._reported = now
         self._done.update(done)
         self._firings = firings
         changed: list[Runner] = []
-        if idle or now >= self._count_due:
+        self._uncounted = not counts_due
+        if counts_due:
             self._count_due = now + COUNT_EVERY
             for runner in self._runners.operators:
                 reached = runner.firings, runner.done

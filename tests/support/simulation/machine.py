@@ -72,7 +72,7 @@ class Time:
     def perf_counter_ns(self) -> int:
         return round(self._world.now * 1e9)
 
-    thread_time_ns = perf_counter_ns
+    monotonic_ns = thread_time_ns = perf_counter_ns
 
     def sleep(self, seconds: float) -> None:
         self._world.call()
