@@ -37,6 +37,8 @@ class LiveRunner(OperatorRunner):
     new incarnation. `on_failure` is told of every failure that is outlived.
     """
 
+    keeps_time = True
+
     def __init__(
         self,
         node: Node,
@@ -114,6 +116,9 @@ class LiveRunner(OperatorRunner):
         theirs, others = super().take_drops()
         return [*mine, *theirs], more + Counter(others)
 
+    def has_drops(self) -> bool:
+        return self._log.pending or super().has_drops()
+
     # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:
@@ -144,6 +149,7 @@ class LiveRunner(OperatorRunner):
         self._arrive(stream, Arrival("end", NEVER if final_stamp is None else final_stamp, None, reason))
 
     def _arrive(self, stream: str, arrival: Arrival) -> None:
+        self.wake()
         if stream in self.queue.triggers:
             self.queue.put(stream, arrival)
         else:
@@ -158,6 +164,7 @@ class LiveRunner(OperatorRunner):
                 return False
             self._start_again()
         if super().step():
+            self.wake()
             return True
         while not self.ended:
             taken = self.queue.take()
@@ -166,6 +173,7 @@ class LiveRunner(OperatorRunner):
             elif not self._give_up():
                 return False
             if super().step():
+                self.wake()
                 return True
         return False
 
