@@ -142,7 +142,7 @@ def scenario_of(seed: int) -> Scenario:
         preempt=r.choice((0.0, 0.02, 0.2)),
         room=r.choice((6_000, 12_000)) if r.random() < 0.05 else None,
         slow_disk=r.choice((0.01, 0.2)) if r.random() < 0.1 else 0.0,
-        socket_room=r.choice((278, 12)),
+        socket_room=r.choice((278, 4)),
     )
     plain = Scenario(
         seed=seed,
