@@ -69,6 +69,9 @@ class Time:
     def time_ns(self) -> int:
         return round((EPOCH + self._world.clock()) * 1e9)
 
+    def monotonic_ns(self) -> int:
+        return round(self._world.clock() * 1e9)
+
     def perf_counter_ns(self) -> int:
         return round(self._world.now * 1e9)
 
@@ -297,7 +300,7 @@ class Socket:
     fileno = detach
 
     def send(self, data: memoryview | bytes) -> int:
-        self._world.call()
+        self._world.effect()
         while True:
             if self.outgoing.read_out:
                 raise BrokenPipeError("the other end is closed")

@@ -2,8 +2,8 @@
 
 A link keeps its order; links know nothing of each other. A process that is frozen takes nothing: its links fill, and
 whoever writes to one that is full waits for so long and no longer; then the link is broken, and what is on it and what
-is sent until it stands again is lost, but for the newest of each stream, its frontiers and its end. A partition
-breaks links, too. Only live runs outlive that.
+is sent until it stands again is lost, but for the newest of each stream, its frontiers and its end, and static
+messages. A partition breaks links, too. Only live runs outlive that.
 """
 
 from __future__ import annotations
@@ -125,7 +125,8 @@ class Publisher:
 
     def put(self, envelope: Envelope) -> int:
         payload = encode(envelope)
-        self._bus.send(self._stream, payload, kept=envelope.kind is not Kind.MESSAGE)
+        once = envelope.kind is not Kind.MESSAGE or envelope.stamp == 0  # static messages are of stamp 0 here
+        self._bus.send(self._stream, payload, kept=once)
         return len(payload)
 
     def put_bytes(self, payload: bytes) -> int:
@@ -166,7 +167,7 @@ class Bus:
     def send(self, key: str, payload: bytes, *, kept: bool = False) -> None:
         world = self.network.world
         for bus in self._takers(key):
-            world.call()
+            world.effect()
             self.network.link(self.process, bus).send(key, payload, self.config.blocked, kept=kept)
             self.counted.moved("sent", len(payload))
 

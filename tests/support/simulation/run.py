@@ -15,7 +15,7 @@ from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import _metadata
 from dataflow.supervision.supervisor import Supervisor
-from simulation import bindings, machine, network, operators
+from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
 from simulation.world import Process, Violation, World
@@ -29,9 +29,9 @@ MEGABYTES = 50_000_000
 class Happening:
     """What happens to a run from outside, `at` so many seconds after its sources were released.
 
-    `kill`, `freeze` (for `span` s), `kill_at_call` (at its `call`-th call to the operating system, of the `life`-th
-    process with that label) happen to the process `target`; `cut` breaks the link from it to the process `other`
-    for `span` s; `stop` asks the supervisor for an orderly end.
+    `kill`, `freeze` (for `span` s) and `kill_before` (before the `effect`-th thing that it does and others can see, of
+    the `life`-th process with that label) happen to the process `target`; `cut` breaks the link from it to the process
+    `other` for `span` s; `stop` asks for an orderly end.
     """
 
     at: float
@@ -157,6 +157,7 @@ class Simulation:
             (f"{process}.live_sources", "threading"): threads,
             (f"{process}.operator_process", "Bus"): self.network.join,
             (f"{process}.operator_process", "TapServer"): network.NoTaps,
+            (f"{process}.runners", "BlackBox"): memory.black_box(world),
             (f"{process}.operator_process", "limit_threads"): _nothing,
             (f"{process}.sink", "Bus"): self.network.join,
             (f"{supervision}.supervisor", "os"): system,
@@ -184,8 +185,8 @@ class Simulation:
         life = self._lives[process.label] = self._lives.get(process.label, 0) + 1
         for happening in self._happenings:
             fields = happening.fields
-            if happening.kind == "kill_at_call" and happening.target == process.label and fields["life"] == life:
-                process.dies_at = fields["call"]
+            if happening.kind == "kill_before" and happening.target == process.label and fields["life"] == life:
+                process.dies_at = fields["effect"]
         end = process.on_end
 
         def ended(code: int) -> None:
