@@ -24,10 +24,8 @@ class InjectedFault(RuntimeError):
 class OperatorFaults:
     """Faults of one operator: a firing that fails, hangs or begins late, memory that is not given back."""
 
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
-    ) -> None:
-        self._clock, self._sleep = clock, sleep
+    def __init__(self, clock: Callable[[], float] | None = None, sleep: Callable[[float], None] | None = None) -> None:
+        self._clock, self._sleep = clock or time.monotonic, sleep or time.sleep
         self._fail = False
         self._pause, self._until = 0.0, 0.0
         self._leaked: list[bytearray] = []

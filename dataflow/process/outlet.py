@@ -31,8 +31,6 @@ from dataflow.transport.codec import parts_size
 BATCH_RECORDS = 64
 BATCH_SECONDS = 0.25
 PUSH_WITHIN = 2.0
-QUICK = 2_000_000
-"""Nanoseconds for which a consumer may wait for a frontier that a message is about to imply."""
 
 
 class Consumer(Protocol):
@@ -90,9 +88,6 @@ class Outlet:
         """What was said on static streams: a consumer that was started again gets it again."""
         self._held: list[tuple[str, Envelope | bytes, bool]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
-        self._promised: dict[str, int] = {}  # stream → a frontier that waits for the message of its firing
-        self._since: dict[str, int] = {}  # stream → when its frontier was taken, in this firing
-        self._took: dict[str, int] = {}  # stream → how long its last firing took, from frontier to message (ns)
         self._logs: dict[str, list[FiringRecord]] = {}
         self._flushed = time.monotonic()
 
@@ -183,16 +178,16 @@ class Outlet:
     def message(self, stream: str, entry: Entry) -> None:
         for consumer in self._consumers(stream):
             consumer.push(stream, entry)
-        message: Message = entry.value
-        now = time.time_ns()
-        envelope = Envelope(Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=now)
-        if (since := self._since.pop(stream, None)) is not None:
-            self._took[stream] = now - since
-            self._promised.pop(stream, None)
-        network = self._network
+        network, static = self._network, stream in self._static
+        tapped = network is not None and network.taps.active
         begun = entry.incarnation != self._next.get(stream, (0, 0))[0]
         self._next[stream] = entry.incarnation, entry.seq + 1
-        static = stream in self._static
+        if not (static or tapped or stream in self._fanout.takers or self._listened(stream)):
+            return  # nobody takes it outside this process
+        message: Message = entry.value
+        envelope = Envelope(
+            Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
+        )
         if static:
             self._once[stream] = [envelope]
             if network is not None:
@@ -200,36 +195,15 @@ class Outlet:
         self._send(stream, envelope, droppable=not static)
         if begun:  # by this a taker knows that the new incarnation is the stream's own
             self._send(stream, self._envelope(Kind.FRONTIER, stream, entry.stamp))
-        if network is not None and network.taps.active:
+        if network is not None and tapped:
             network.taps.offer(stream, envelope)
 
     def frontier(self, stream: str, frontier: int) -> None:
-        """Takes a frontier that comes before a firing, or without one.
-
-        If the last firing was quick, it waits for `promise`: the firing's message implies it.
-        """
         for consumer in self._consumers(stream):
             consumer.advance(stream, frontier)
-        self._since[stream] = time.time_ns()
-        if self._took.get(stream, QUICK) < QUICK:
-            self._promised[stream] = frontier
-        else:
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
-
-    def promise(self) -> None:
-        """Sends the frontiers that no message has followed: to be called after each firing."""
-        if not self._since:
-            return
-        now = time.time_ns()
-        for stream, since in self._since.items():
-            self._took[stream] = now - since
-        self._since.clear()
-        promised, self._promised = self._promised, {}
-        for stream, frontier in promised.items():
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
+        self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self.promise()
         for consumer in self._consumers(stream):
             consumer.end(stream, final_stamp, reason)
         if stream in self._static:

@@ -34,6 +34,8 @@ class Barrier:
             status.first = first if status.first is None else min(first, status.first)
         if steps is not None:
             status.steps = max(steps, status.steps or 0)
+        if self.run.release is None:  # others may be sending probes already, so it may see one before it is told to
+            process.unseen = self.run.takes(process)
 
     def tick(self) -> bool:
         """Goes on as far as possible; True when every edge is proven."""
@@ -61,7 +63,6 @@ class Barrier:
         if process.life is not Life.READY:
             return
         process.take(Step.PROBE, run.steady)
-        process.unseen = run.takes(process)
         if process.attempt:
             expect_probes(run, process)
         run.send(process, "probe")

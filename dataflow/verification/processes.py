@@ -44,6 +44,10 @@ class Call:
     operators: tuple[str, ...] = ()
 
 
+Workers = Callable[..., list[Any]]
+"""Answers calls as `call_workers` does, with its options."""
+
+
 def call_workers(
     calls: Sequence[Call],
     *,

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dataflow.messages import FeatureVector
-from dataflow.process.outlet import QUICK, Outlet
+from dataflow.process.outlet import Outlet
 from dataflow.sync import Entry
 from dataflow.transport import Fanout, Incoming, Kind, Outgoing, PoolReader, decode, make_board, make_ring
 
@@ -98,36 +98,3 @@ def test_the_end_of_a_stream_reaches_a_consumer_that_missed_messages() -> None:
     assert found[-2:] == [("fast", "FRONTIER", 200), ("fast", "END", 200)]
     assert linked.outlet.counters()["unsent"] == 200 + 2 - len(found)
     assert linked.outlet.counters()["unsent"] > 0
-
-
-def test_a_frontier_waits_for_the_message_of_a_quick_firing_and_is_sent_without_one(linked: Linked) -> None:
-    outlet = linked.outlet
-    outlet.release()
-    outlet.frontier(FAST, 9)  # nothing is known of its firings yet
-    outlet.message(FAST, entry(FAST, 10, 0))
-    outlet.promise()
-    assert linked.taken() == [("fast", "FRONTIER", 0), ("fast", "MESSAGE", 0)]
-    outlet.frontier(FAST, 19)
-    assert linked.taken() == []
-    outlet.message(FAST, entry(FAST, 20, 1))
-    outlet.promise()
-    assert linked.taken() == [("fast", "MESSAGE", 1)]
-    outlet.frontier(FAST, 29)
-    outlet.promise()  # the firing has emitted nothing
-    assert linked.taken() == [("fast", "FRONTIER", 2)]
-
-
-def test_a_frontier_does_not_wait_for_an_operator_that_was_slow_the_last_time(
-    linked: Linked, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    now = [0]
-    monkeypatch.setattr("time.time_ns", lambda: now[0])
-    outlet = linked.outlet
-    outlet.release()
-    for seq, took in enumerate((QUICK // 2, QUICK, QUICK // 2)):
-        outlet.frontier(FAST, 10 * seq + 9)
-        now[0] += took
-        outlet.message(FAST, entry(FAST, 10 * seq + 10, seq))
-        outlet.promise()
-    kinds = [kind for _, kind, _ in linked.taken()]
-    assert kinds == ["FRONTIER", "MESSAGE", "MESSAGE", "FRONTIER", "MESSAGE"]

@@ -17,7 +17,7 @@ from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
 from dataflow.supervision import heartbeats
 from dataflow.supervision.report import RunFailed, RunReport
-from dataflow.supervision.run import run
+from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
 
 AGAIN = "restart: {max: 5, backoff: 20ms}"
@@ -357,6 +357,24 @@ def test_a_clock_that_jumps_back_is_a_new_incarnation_and_operators_are_told(pat
     (event,) = ran.events("clock_jump")
     assert event.startswith("the clock of 'left' jumped back to ")
     assert ran.is_repeated()
+
+
+@pytest.mark.parametrize("placement", ["one_process", "process_each"])
+def test_a_run_whose_clock_jumped_back_is_replayed_with_what_comes_twice_as_late(path: Path, placement: str) -> None:
+    graph = robot(
+        "right: {use: runtime_operators:Counter, params: {count: 100}}",
+        "both: {use: faulty_operators:Fallback, inputs: {x: left/fast, other: right/fast}}",
+    )
+    Ran(graph, path, {"kind": "jump", "operator": "left", "by": "300ms", "at": "500ms"}, placement="one_process")
+    with Recording(path) as recording:
+        stamps = [r.stamp for r in recording.messages(["test/left/fast"])]
+
+    replayed = replay(path, placement=placement)
+
+    late = sum(stamp <= max(stamps[:k], default=0) for k, stamp in enumerate(stamps))
+    assert late > 10
+    assert replayed.drops["both"] == (("x", "late", late),)
+    assert replayed.digests() == replay(path, placement="one_process").digests()
 
 
 def test_a_clock_that_jumps_ahead_goes_on_there(path: Path) -> None:

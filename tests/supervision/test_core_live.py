@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 
 import pytest
-from plays import LEFT, Play, killed, sent, spawned
+from plays import LEFT, STEP, Play, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
 from dataflow.records.firing import Emission, FiringRecord
@@ -70,6 +70,21 @@ def test_a_process_that_is_killed_while_starting_is_restarted_by_its_policy() ->
     assert spawned(told) == ["smooth"]
     ((_, config),) = sent(told, "operators")
     assert "resume" not in config  # nobody had heard of the one before
+    assert play.core.status.phase == "running"
+
+
+def test_one_restarted_while_starting_may_see_a_probe_as_soon_as_it_is_ready() -> None:
+    play = robot()
+    play.tell(Begin())
+    play.deaf.add("smooth")
+    play.wait(STEP)
+    play.dies("smooth", -9)
+    while not spawned(play.wait(STEP)):  # the others are probing when its successor is ready
+        pass
+
+    play.tell(*(Said("smooth", "seen", {"stream": stream}) for stream in play.processes["smooth"].subscribe))
+    play.wait(1.0)
+
     assert play.core.status.phase == "running"
 
 
