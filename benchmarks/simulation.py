@@ -4,7 +4,7 @@ usage: python benchmarks/simulation.py [--seeds 1000] [--from 0] [--jobs 2] [--j
        python benchmarks/simulation.py --mutants [--seeds 2000]
 
 Every seed: a small graph, recorded, in one process or one each, live or not, on a machine that is slow or quick, under
-kills, freezes, broken links, faults, stops and a disk that is slow or full; then its recording is verified, and
+kills, freezes, faults, stops and a disk that is slow or full; then its recording is verified, and
 replayed. All of it runs in one thread on simulated time: supervisor, processes, aligners, flow control, recorder and
 verification are those that ship. What must hold: tests/support/simulation/check.py. A seed that breaks a promise is
 shrunk, and its plan is printed; exit code 1.

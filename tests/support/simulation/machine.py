@@ -8,7 +8,6 @@ the code that ships is replaced, but for the network, the nursery and what a run
 from __future__ import annotations
 
 import os
-import queue
 import select
 import selectors
 import signal
@@ -75,7 +74,7 @@ class Time:
     def perf_counter_ns(self) -> int:
         return round(self._world.now * 1e9)
 
-    monotonic_ns = thread_time_ns = perf_counter_ns
+    thread_time_ns = perf_counter_ns
 
     def sleep(self, seconds: float) -> None:
         self._world.call()
@@ -165,50 +164,6 @@ class Threading:
         self.Lock = lambda: Lock(world)
         self.Event = lambda: Event(world)
         self.Thread = lambda **fields: Thread(world, **fields)
-
-
-class SimpleQueue:
-    """`queue.SimpleQueue`."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._items: deque[Any] = deque()
-        self._waiters = Waiters(world)
-
-    def put(self, item: Any) -> None:
-        self._world.call()
-        self._items.append(item)
-        self._waiters.notify()
-
-    def get(self, timeout: float) -> Any:
-        self._world.call()
-        until = self._world.now + timeout
-        while not self._items:
-            if self._world.now >= until:
-                raise queue.Empty
-            self._waiters.wait(until - self._world.now)
-        return self._items.popleft()
-
-    def get_nowait(self) -> Any:
-        self._world.call()
-        if not self._items:
-            raise queue.Empty
-        return self._items.popleft()
-
-    def empty(self) -> bool:
-        return not self._items
-
-    def qsize(self) -> int:
-        return len(self._items)
-
-
-class Queue:
-    """The module `queue`."""
-
-    Empty = queue.Empty
-
-    def __init__(self, world: World) -> None:
-        self.SimpleQueue = lambda: SimpleQueue(world)
 
 
 class Pipe:
@@ -371,6 +326,20 @@ class WriteEnd:
         self.waiters = (pipe.changed,)
 
 
+class EventFd:
+    """A counter that can be waited for."""
+
+    def __init__(self, world: World) -> None:
+        self.count = 0
+        self.writable = False
+        self.changed = Waiters(world)
+        self.waiters = (self.changed,)
+
+    @property
+    def readable(self) -> bool:
+        return self.count > 0
+
+
 class System:
     """Descriptors, and the module `os`: what is not here is the real one."""
 
@@ -430,6 +399,23 @@ class System:
         elif isinstance(thing, WriteEnd):
             thing.pipe.end_writing()
 
+    def eventfd(self, value: int, flags: int) -> int:
+        return self.open(EventFd(self.world))
+
+    def eventfd_write(self, descriptor: int, number: int) -> None:
+        self.world.effect()
+        thing: EventFd = self.things[descriptor]
+        thing.count += number
+        self.world.after(self.world.latency(), thing.changed.notify)
+
+    def eventfd_read(self, descriptor: int) -> int:
+        self.world.call()
+        thing: EventFd = self.things[descriptor]
+        if not thing.count:
+            raise BlockingIOError
+        number, thing.count = thing.count, 0
+        return number
+
     def _exit(self, code: int) -> None:
         task = self.world.task
         assert task is not None
@@ -488,15 +474,24 @@ class Selectors:
 
 
 class Select:
-    """The module `select`, for handles of processes."""
+    """The module `select`, for handles of processes, and for one eventfd."""
 
     def __init__(self, system: System) -> None:
         self._system = system
 
     def select(self, reading: list[Any], writing: list[Any], odd: list[Any], timeout: float | None) -> Any:
+        if len(reading) == 1 and isinstance(thing := self._system.things.get(reading[0]), EventFd):
+            self._await(thing, timeout)
         if any(isinstance(each, int) and each >= FIRST for each in reading):
             return [each for each in reading if self._system.things[each].readable], [], []
         return select.select(reading, writing, odd, timeout)
+
+    def _await(self, thing: EventFd, timeout: float | None) -> None:
+        world = self._system.world
+        world.call()
+        until = None if timeout is None else world.now + timeout
+        while not thing.readable and (until is None or world.now < until):
+            thing.changed.wait(None if until is None else until - world.now)
 
 
 class Signals:

@@ -30,8 +30,7 @@ class Happening:
     """What happens to a run from outside, `at` so many seconds after its sources were released.
 
     `kill`, `freeze` (for `span` s) and `kill_before` (before the `effect`-th thing that it does and others can see, of
-    the `life`-th process with that label) happen to the process `target`; `cut` breaks the link from it to the process
-    `other` for `span` s; `stop` asks for an orderly end.
+    the `life`-th process with that label) happen to the process `target`; `stop` asks for an orderly end.
     """
 
     at: float
@@ -71,7 +70,7 @@ class Outcome:
     killed: set[str] = field(default_factory=set)
     """Processes that died before their time, whoever killed them."""
     lost: int = 0
-    """Messages that links have lost."""
+    """Envelopes that did not reach a process, since it took nothing for too long."""
     disk_full: bool = False
 
 
@@ -86,7 +85,6 @@ class Simulation:
     def __init__(self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str) -> None:
         self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
         self.system = machine.System(self.world, socket_room=machine_.socket_room)
-        self.network = network.Network(self.world)
         self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
         self.outcome = Outcome()
         self._plan, self._happenings, self._mode = plan, happenings, mode
@@ -107,7 +105,8 @@ class Simulation:
             self._play()
         world = self.world
         self.outcome.seconds, self.outcome.turns, self.outcome.calls = world.now, world.turns, world.calls
-        self.outcome.lost = sum(link.lost for link in self.network.links)
+        if self.outcome.report is not None:
+            self.outcome.lost = sum(moved.get("unsent", 0) for moved in self.outcome.report.transport.values())
         self.outcome.disk_full = self.disk.full
         return self.outcome
 
@@ -147,7 +146,6 @@ class Simulation:
         facts = {"threads": {}}
         return {
             **dict.fromkeys(bindings.clocks(), time),
-            (f"{process}.main", "queue"): machine.Queue(world),
             (f"{process}.main", "threading"): threads,
             (f"{process}.main", "os"): system,
             (f"{process}.channel", "socket"): machine.Sockets(system),
@@ -155,11 +153,12 @@ class Simulation:
             (f"{process}.watchdog", "threading"): threads,
             (f"{process}.watchdog", "psutil"): SimpleNamespace(Process=_Resident, Error=OSError),
             (f"{process}.live_sources", "threading"): threads,
-            (f"{process}.operator_process", "Bus"): self.network.join,
+            (f"{process}.inbox", "os"): system,
+            (f"{process}.inbox", "select"): machine.Select(system),
+            (f"{process}.operator_process", "Bus"): network.Bus,
             (f"{process}.operator_process", "TapServer"): network.NoTaps,
             (f"{process}.runners", "BlackBox"): memory.black_box(world),
             (f"{process}.operator_process", "limit_threads"): _nothing,
-            (f"{process}.sink", "Bus"): self.network.join,
             (f"{supervision}.supervisor", "os"): system,
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
             (f"{supervision}.supervisor", "Nursery"): lambda environment: Nursery(system, self._named, self._born),
@@ -170,6 +169,10 @@ class Simulation:
             (f"{supervision}.nursery", "os"): system,
             (f"{supervision}.nursery", "select"): machine.Select(system),
             (f"{supervision}.nursery", "signal"): machine.Signals(system),
+            (f"{supervision}.rings", "os"): system,
+            (f"{supervision}.rings", "make_ring"): network.small_ring,
+            ("dataflow.transport.ring", "os"): system,
+            ("dataflow.process.handed", "BACKLOG"): (1, 1),
             (f"{supervision}.run", "machine_facts"): lambda environment: facts,
             ("dataflow.recording.container", "os"): self.disk,
             ("dataflow.firing.source", "Tripwire"): _NoTripwire,
@@ -203,8 +206,6 @@ class Simulation:
             case "stop":
                 assert self._supervisor is not None
                 self._supervisor.stop()
-            case "cut":
-                self.network.partition(happening.target, fields["other"], fields["span"])
             case "kill" if process is not None:
                 world.kill(process)
             case "freeze" if process is not None:
