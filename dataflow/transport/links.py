@@ -10,6 +10,7 @@ what is said once (ends of streams, static messages) is kept.
 from __future__ import annotations
 
 import mmap
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,7 @@ from dataflow.transport.shared import (
 _FIRST, _LAST = 1 << 31, 1 << 30
 _CHANNEL = _LAST - 1
 _AT_ONCE = 1024
+STILL = 0.3
 
 
 class LinkClaim:
@@ -72,6 +74,7 @@ class Outgoing:
         self._waiting: deque[_Waiting] = deque()
         self._bytes = 0
         self._lent: deque[tuple[int, int, int]] = deque()  # slot, generation and bytes of blocks that it may hold
+        self._taken, self._took_at = self._ring.taken(), time.monotonic()
         self.claim = LinkClaim(self._cells)
         self.away = False
         """The consumer has died: what is sent now is for nobody."""
@@ -96,9 +99,12 @@ class Outgoing:
         return not self.away
 
     def may_borrow(self, size: int, free: Callable[[], int]) -> bool:
-        """Whether the consumer may be lent another block: where messages may be dropped, it may hold as much of the
-        pool as is free, so that one that releases nothing leaves room for the others."""
-        if self._most is None:
+        """Whether the consumer may be lent another block.
+
+        Where messages may be dropped, one that has taken nothing for `STILL` seconds may hold as much of the pool as is
+        free, so that one that is stopped leaves room for the others.
+        """
+        if self._most is None or self._takes():
             return True
         while self._lent and self.claim.released(*self._lent[0][:2]):
             self._lent.popleft()
@@ -106,6 +112,13 @@ class Outgoing:
             return True
         self._lent = deque(lent for lent in self._lent if not self.claim.released(*lent[:2]))
         return sum(held for _, _, held in self._lent) + size <= free()
+
+    def _takes(self) -> bool:
+        """Whether the consumer has taken something of late, or all that there is."""
+        taken, now = self._ring.taken(), time.monotonic()
+        if taken != self._taken or taken == self._ring.written:
+            self._taken, self._took_at = taken, now
+        return now - self._took_at < STILL
 
     def refuse(self) -> None:
         """Drops a message that is not sent at all."""

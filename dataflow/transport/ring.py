@@ -80,6 +80,15 @@ class RingWriter(_End):
         """Returns which reader is at the other end, by number; 0: there was none yet."""
         return int(self._words[_READERS])
 
+    @property
+    def written(self) -> int:
+        """How many bytes have ever been written."""
+        return self._head
+
+    def taken(self) -> int:
+        """Returns how many bytes the reader has ever taken."""
+        return int(self._words[_TAIL])
+
     def put(self, channel: int, parts: Sequence[Bytes]) -> bool:
         """Writes one frame, on a numbered channel of this ring; False, and nothing, when there is no room for it now.
 
