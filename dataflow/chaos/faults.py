@@ -25,9 +25,9 @@ class OperatorFaults:
     """Faults of one operator: a firing that fails, hangs or begins late, memory that is not given back."""
 
     def __init__(
-        self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
+        self, clock: Callable[[], float] | None = None, sleep: Callable[[float], None] | None = None
     ) -> None:
-        self._clock, self._sleep = clock, sleep
+        self._clock, self._sleep = clock or time.monotonic, sleep or time.sleep
         self._fail = False
         self._pause, self._until = 0.0, 0.0
         self._leaked: list[bytearray] = []

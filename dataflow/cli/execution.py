@@ -391,7 +391,7 @@ def _placement(graph: Graph, one_process: bool, process_each: bool, place: list[
     if one_process + process_each + bool(place) > 1:
         raise fail("--one-process, --process-each and --place exclude each other")
     if not place:
-        return "one_host" if one_process else "host_each" if process_each else "graph"
+        return "one_process" if one_process else "process_each" if process_each else "graph"
     placement = {}
     for word in place:
         operator, separator, process = word.partition("=")

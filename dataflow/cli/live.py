@@ -51,8 +51,6 @@ Streams = Annotated[
 
 GRAPH_VARIABLE = "DATAFLOW_GRAPH"
 """Environment variable: the running graph that is meant where `--graph` is not given."""
-SHOWN_ELEMENTS = 16
-"""Arrays and lists up to this length are printed whole."""
 HISTORY = 2000
 """Messages of a stream over which its rates are taken, at most."""
 
@@ -191,45 +189,14 @@ def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> 
         line = {"stream": stream, "type": message.SCHEMA, **values}
         print_json_line(line)
         return
+    from dataflow.messages.display import field_text
     from dataflow.sync.stamps import format_stamp
 
     out.print(Text.assemble((stream, "bold"), f"  {format_stamp(message.stamp)}  ", (message.SCHEMA, "dim")))
     fields = [(name, value) for name, value in message.items() if name != "stamp" and value is not None]
     width = max((len(name) for name, _ in fields), default=0)
     for name, value in fields:
-        out.print(Text.assemble(f"  {name:<{width}}  ", _text(value, full)), soft_wrap=True)
-
-
-def _text(value: Any, full: bool) -> str:
-    """A field for people: six digits, long arrays by their shape and range, long lists by their beginning."""
-    import numpy as np
-
-    if isinstance(value, np.ndarray):
-        if full or value.size <= SHOWN_ELEMENTS:
-            limit = value.size + 1 if full else SHOWN_ELEMENTS
-            text = np.array2string(value, precision=6, suppress_small=True, threshold=limit, separator=", ")
-            return " ".join(text.split())
-        shape = " × ".join(map(str, value.shape))
-        return f"{value.dtype} {shape}{_range(value)}"
-    if isinstance(value, tuple):
-        shown = value if full or len(value) <= SHOWN_ELEMENTS else value[:5]
-        more = f", … {len(value)} in all" if len(shown) < len(value) else ""
-        return ", ".join(map(str, shown)) + more if value else "none"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, str):
-        return value if full or len(value) <= 200 else f"{value[:200]}… {len(value):,} characters in all"
-    return str(value)
-
-
-def _range(value: Any) -> str:
-    """The smallest and the largest finite element, in words."""
-    import numpy as np
-
-    if value.dtype.kind not in "iuf" or not value.size:
-        return ""
-    finite = value[np.isfinite(value)] if value.dtype.kind == "f" else value
-    return f"  from {finite.min():.4g} to {finite.max():.4g}" if finite.size else "  nothing finite"
+        out.print(Text.assemble(f"  {name:<{width}}  ", field_text(value, whole=full)), soft_wrap=True)
 
 
 @dataclass(slots=True)

@@ -40,7 +40,7 @@ def set_(
       dataflow param set detector.score_threshold 0.5
       dataflow param set front/cloud.stride 4 --graph two_cameras
     """
-    from dataflow.client.processes import NoAnswer, Refused, hosts_of
+    from dataflow.client.processes import NoAnswer, Refused, processes_of
 
     _check(timeout)
     with friendly_errors():
@@ -49,9 +49,9 @@ def set_(
         if not name:
             raise fail(f"{parameter!r} names no parameter: write {operator}.NAME")
         wanted = _value(value)
-        with hosts_of(found) as hosts:
+        with processes_of(found) as processes:
             try:
-                taken = hosts.set_parameter(operator, name, wanted, timeout)
+                taken = processes.set_parameter(operator, name, wanted, timeout)
             except (Refused, NoAnswer) as error:
                 raise fail(str(error), code=DIFFERENT) from None
     if json:
@@ -185,15 +185,15 @@ def _asked(
     word: str | None, name: str | None, wait: float, timeout: float
 ) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
     """The operators that were asked, the parameter (or none), and what they answered."""
-    from dataflow.client.processes import hosts_of
+    from dataflow.client.processes import processes_of
 
     _check(timeout)
     found = running_graph(name, wait)
     graph = _graph(found)
     operator, parameter = ("", "") if word is None else _split(word, graph)
     operators = [operator] if operator else list(graph.nodes)
-    with hosts_of(found) as hosts:
-        return operators, parameter, hosts.parameters(operators, timeout)
+    with processes_of(found) as processes:
+        return operators, parameter, processes.parameters(operators, timeout)
 
 
 def _say_who_is_missing(operators: list[str], values: dict[str, Any], timeout: float) -> None:

@@ -114,7 +114,7 @@ class RunDisplay:
             rate = self._rates.of(name, counts.firings or counts.emitted, now)
             table.add_row(
                 Text(name),
-                Text(status.host_of.get(name, "")),
+                Text(status.process_of.get(name, "")),
                 count(counts.firings) if counts.firings else "",
                 "" if rate is None else f"{rate:.1f}",
                 count(counts.emitted) if counts.emitted else "",

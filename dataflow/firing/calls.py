@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.firing.failure import RAISED, InputMutated, OperatorFailure
-from dataflow.firing.seeding import VERSION, change_seed, firing_seed, seed_generators
+from dataflow.firing.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
 from dataflow.firing.shared_generators import AT_WORK
 from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.firing.threads import limit_threads_again
@@ -30,6 +30,7 @@ class Calls:
 
     def __init__(self, node: Node, operator: Operator, seed: int, *, version: int = VERSION) -> None:
         self.node, self.operator, self.seed, self.version = node, operator, seed, version
+        self._seeded_by = f"{seed}/{node.name}/"
 
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
@@ -54,9 +55,14 @@ class Calls:
     def process(self, firing: Firing) -> dict[str, Message]:
         """What `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
         AT_WORK.fires = True
-        with AT_WORK:
-            self._seed(firing_seed(self.seed, self.node.name, firing.stamp))
+        AT_WORK.begun += 1
+        try:
+            seed = FiringSeed(self._seeded_by, firing.stamp)
+            seed_generators(seed)
+            self.operator.seed_rng(seed)
             return outputs_of(self.operator, _call(self.operator, firing))
+        finally:
+            AT_WORK.ended += 1
 
     def reset(self, input: str, place: Place) -> None:
         """`on_reset()`. Raises what the operator raises."""
@@ -156,11 +162,12 @@ def entries_of(given: InputValue) -> Sequence[Entry]:
 def _call(operator: Operator, firing: Firing) -> Outputs:
     if firing.kind == "finish":
         return operator.finish()
-    arguments: dict[str, Any] = {
-        name: _value_of(firing.inputs.get(name, () if port.kind == "batch" else None))
-        for name, port in operator.spec.inputs.items()
-    }
-    if "context" in operator.spec.process_takes:
+    arguments: dict[str, Any] = {}
+    given = firing.inputs
+    for name, absent in operator.spec.absent.items():
+        value = given.get(name, absent)
+        arguments[name] = value.value if value.__class__ is Entry else _value_of(value)
+    if operator.spec.takes_context:
         arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
     return operator.process(**arguments)
 

@@ -1,4 +1,4 @@
-"""How often what failed is started again, and when: the restart policy of one operator or host."""
+"""How often what failed is started again, and when: the restart policy of one operator or process."""
 
 from __future__ import annotations
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
@@ -19,7 +20,19 @@ from dataflow.operator import InputPort, Operator, OperatorSpec, OutputPort
 
 QueuePolicy = Literal["newest", "oldest", "block"]
 StalePolicy = Literal["use", "drop"]
-Placement = Literal["graph", "one_host", "host_each"]
+Placement = Literal["graph", "one_process", "process_each"]
+
+FORMER_PLACEMENTS = {"one_host": "one_process", "host_each": "process_each"}
+"""Placements by their names of the version before, which still work in this one."""
+
+
+def current_placement(placement: Any) -> Any:
+    """Returns a placement by the name it has now, with a DeprecationWarning where it is called by its former one."""
+    if not isinstance(placement, str) or placement not in FORMER_PLACEMENTS:
+        return placement
+    now = FORMER_PLACEMENTS[placement]
+    warnings.warn(f"placement {placement!r} is now {now!r}", DeprecationWarning, stacklevel=3)
+    return now
 
 
 class OperatorImportError(ImportError):
@@ -109,8 +122,8 @@ class Node:
         return self.operator.spec
 
     @property
-    def host(self) -> str:
-        """Label of the process it runs in unless the placement is overridden: its `process:` label, or its own name."""
+    def process_label(self) -> str:
+        """The process it runs in unless the placement is overridden: its `process:` label, or its own name."""
         return self.process or self.name
 
     def input_port(self, name: str) -> InputPort:
@@ -318,27 +331,28 @@ class Graph:
         """The operators without outputs."""
         return tuple(node for node in self.nodes.values() if not node.outputs)
 
-    def hosts(self, placement: Placement | Mapping[str, str] = "graph") -> dict[str, tuple[str, ...]]:
+    def processes(self, placement: Placement | Mapping[str, str] = "graph") -> dict[str, tuple[str, ...]]:
         """Process label → the nodes it runs, both in graph order.
 
         `placement`: as the graph's `process:` labels say, all in one process, one process each, or an explicit mapping
         from node name to label (nodes left out keep the graph's label). Raises ValueError for an unknown node or word.
         """
-        if isinstance(placement, str) and placement not in ("graph", "one_host", "host_each"):
-            raise ValueError(f"placement {placement!r}: expected graph, one_host, host_each or a mapping")
+        placement = current_placement(placement)
+        if isinstance(placement, str) and placement not in ("graph", "one_process", "process_each"):
+            raise ValueError(f"placement {placement!r}: expected graph, one_process, process_each or a mapping")
         if not isinstance(placement, str) and (unknown := sorted(placement.keys() - self.nodes.keys())):
             raise ValueError(f"placement names no operator of the graph: {', '.join(unknown)}")
         grouped: dict[str, list[str]] = {}
         for node in self.nodes.values():
             match placement:
-                case "one_host":
+                case "one_process":
                     label = "all"
-                case "host_each":
+                case "process_each":
                     label = node.name
                 case "graph":
-                    label = node.host
+                    label = node.process_label
                 case _:
-                    label = placement.get(node.name, node.host)
+                    label = placement.get(node.name, node.process_label)
             grouped.setdefault(label, []).append(node.name)
         return {label: tuple(names) for label, names in grouped.items()}
 

@@ -113,6 +113,16 @@ def array(
     return ArrayField("", dtypes, shapes, doc, unit, optional or default is None)
 
 
+def canonical_stamp(schema: str, stamp: Any) -> int:
+    """Returns a stamp as an int. Raises `MessageError` for what is none."""
+    if isinstance(stamp, (bool, float, str)) or not hasattr(stamp, "__index__"):
+        raise MessageError(f"{schema}.stamp must be an integer (nanoseconds since the epoch), got {stamp!r}")
+    value = int(stamp)
+    if not INT64_MIN < value < INT64_MAX:
+        raise MessageError(f"{schema}.stamp {value} is outside the 64-bit range of nanoseconds")
+    return value
+
+
 def scalar_value(schema: str, spec: ScalarField, value: Any) -> Scalar | None:
     if value is MISSING:
         if spec.required:

@@ -37,9 +37,12 @@ class Inlet:
         *,
         static: Collection[str],
         live: bool,
+        from_start: bool = False,
         complaints: Complaints | None = None,
     ) -> None:
+        """`from_start`: this process takes its streams from their first message on, so one that is missing was lost."""
         self.label, self.live = label, live
+        self._first = (0, 0) if from_start else None
         self.received = 0
         """Envelopes that counted, for the proof of quiescence."""
         self.malformed = self.misplaced = 0
@@ -88,7 +91,7 @@ class Inlet:
         return {stream for stream in streams if stream in self._static} - self._seen
 
     def _order(self, stream: str) -> StreamOrder:
-        return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder())
+        return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder(self._first))
 
     def _take_static(self, stream: str, envelope: Envelope) -> None:
         """Takes the one message of a static stream, if it has one, and its end; both come again after a restart.

@@ -45,7 +45,7 @@ def _make(
     inbox: queue.SimpleQueue[tuple[Any, ...]],
     handed: Sequence[int],
 ) -> Any:
-    """Makes the process that the supervisor asks for: "host" runs operators, "sink" takes whole streams."""
+    """Makes the process that the supervisor asks for: "operators" runs operators, "sink" takes whole streams."""
     if kind == "sink":
         from dataflow.process.sink import SinkConfig, SinkProcess
 

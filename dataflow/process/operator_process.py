@@ -70,6 +70,7 @@ class OperatorProcess:
             self._deliver,
             static=self.static,
             live=config.live,
+            from_start=config.live and config.resume is None,
         )
         self.outlet = Outlet(
             channel,
@@ -218,8 +219,8 @@ class OperatorProcess:
     def _wait_time(self) -> float:
         if self._probing:
             return PROBE_EVERY
-        patient = (runner.next_due() for runner in self.runners.operators)
-        due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), *patient]
+        patient = self.runners.ready.next_due()
+        due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), patient]
         return max(0.0, min(seconds for seconds in due if seconds is not None))
 
     def _next_due(self) -> float | None:
@@ -284,13 +285,10 @@ class OperatorProcess:
         return worked
 
     def _step_all(self) -> bool:
-        """One step of every operator, last ones first, so that what is under way is done before more is begun."""
+        """One step of every operator that has something to do."""
         if self.config.live and not self._released:
             return False  # a restarted process is sent messages before it is told what time it is
-        worked = False
-        for runner in reversed(self.runners.operators):
-            worked = runner.step() or worked
-        return worked
+        return self.runners.ready.step()
 
     def _admit(self) -> bool:
         return self._released and not self._stopping and self.feeding.admit()
@@ -366,5 +364,6 @@ class OperatorProcess:
         self._probing, self._released = False, True
         self.outlet.release()
         self.pace.begin(first, at)
+        self.runners.ready.wake_all()
         self.live.start()
         self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)

@@ -111,19 +111,21 @@ class Outlet:
     def message(self, stream: str, entry: Entry) -> None:
         for consumer in self._consumers(stream):
             consumer.push(stream, entry)
+        links = self._links
+        if links is None or not (stream in links.publishers or links.taps.active or stream in self._static):
+            return  # nobody takes it outside this process
         message: Message = entry.value
         envelope = Envelope(
             Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
         )
-        links = self._links
-        if links is not None and stream in self._static:
+        if stream in self._static:
             links.bus.declare_static(stream, encode(envelope))
         begun = entry.incarnation != self._next.get(stream, (0, 0))[0]
         self._next[stream] = entry.incarnation, entry.seq + 1
         self._send(stream, envelope)
         if begun and stream in self._publishers:  # by this a taker knows that the new incarnation is the stream's own
             self._send(stream, self._envelope(Kind.FRONTIER, stream, entry.stamp))
-        if links is not None and links.taps.active:
+        if links.taps.active:
             links.taps.offer(stream, envelope)
 
     def frontier(self, stream: str, frontier: int) -> None:

@@ -63,7 +63,7 @@ class Requests:
         """
         with query:
             status: dict[str, Any] = {
-                "host": self._config.label,
+                "process": self._config.label,
                 "counts": self._progress.counted,
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,

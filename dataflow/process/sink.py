@@ -93,7 +93,9 @@ class SinkProcess:
         """Keys on which an operator's last firing records have not come yet."""
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
-        self.inlet = Inlet(config.label, channel, self._deliver, static=static, live=config.live)
+        self.inlet = Inlet(
+            config.label, channel, self._deliver, static=static, live=config.live, from_start=config.live
+        )
         self.batches = 0
         """Batches of firing records that were taken."""
         self.written = 0

@@ -37,11 +37,15 @@ class Verdict:
 
 
 class StreamOrder:
-    """Follows one stream that is not static. A pure state machine: envelopes in, verdicts out."""
+    """Follows one stream that is not static. A pure state machine: envelopes in, verdicts out.
 
-    def __init__(self) -> None:
+    `first` is the place that the stream begins with; None for a taker that may come late: until the first message it
+    believes any place.
+    """
+
+    def __init__(self, first: Place | None = None) -> None:
         self.incarnation = 0
-        self._next: Place | None = None  # None until the first message: a taker may come late
+        self._next = first
         self._promised = NEVER
         self._ended = False
         self._announced = False

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,12 +16,14 @@ from mcap.records import Channel
 from dataflow.messages.base import Message, MessageError, message_types, registered_type
 from dataflow.messages.declaration import Declaration, GenericMessage, known_type
 from dataflow.messages.digest import StreamDigest
+from dataflow.recording.access import StreamIndex
 from dataflow.recording.codecs import SchemaText, codec_for, declaration_digest, recorded_declaration
 from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foreign import foreign_decoder
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
+from dataflow.recording.json_columns import Values
 from dataflow.recording.layout import Kind
 from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 
@@ -37,6 +39,7 @@ class Recorded:
 
     @property
     def stamp(self) -> int:
+        """The timestamp of the message, nanoseconds since the epoch."""
         return self.message.stamp
 
 
@@ -209,6 +212,26 @@ class Recording:
         yield from self._merge(static, None, None)
         yield from self._merge(moving, start, end)
 
+    def stamps(self, stream: str, start: int | None = None, end: int | None = None) -> Iterator[int]:
+        """The stamps of what `messages()` gives of one stream, in that order, from the index alone."""
+        found = self._stream(stream)
+        rows_of = self._rows([found], start, end, by_log_time=False)
+        return (row[4] if found.own else row[0] for _, row in rows_of)
+
+    def index(self, stream: str, start: int | None = None, end: int | None = None) -> StreamIndex[Recorded]:
+        """Random access to the messages of one stream with start ≤ stamp ≤ end (ns), in the order of `messages()`.
+
+        Nothing is decoded before it is asked for, foreign streams aside, whose stamps lie within their messages. Valid
+        until the recording is closed. Raises `RecordingError` as `messages()` does.
+        """
+        (found,) = self._choose([stream])
+        return StreamIndex(
+            rows(self._tracks(found, False), start, end),
+            read=lambda row: self._recorded(found, row),
+            columns=lambda rows, names: self._columns(found, rows, names),
+            stamped_by_log_time=found.own,
+        )
+
     def raw(
         self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
     ) -> Iterator[RawRecord]:
@@ -216,8 +239,11 @@ class Recording:
         chosen = [self._stream(name) for name in (self._streams if streams is None else streams)]
         for stream, (_, owner, chunk, offset, time, _, _, _) in self._rows(chosen, start, end, by_log_time=True):
             raw = self._file.read(stream.channels[owner].record.id, chunk, offset, time)
-            info = stream.info
-            yield RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, bytes(raw.data))
+            info, data = stream.info, bytes(raw.data)
+            record = RawRecord(info.name, info.schema, info.encoding, raw.log_time, raw.sequence, data)
+            del raw, data  # it holds its chunk in memory
+            yield record
+            del record
 
     def firings(self, operator: str | None = None) -> Iterator[tuple[str, bytes]]:
         """(operator, payload) of every batch of firing records, of one operator or of all, in file order.
@@ -268,6 +294,7 @@ class Recording:
         return found
 
     def close(self) -> None:
+        """Closes the file. Idempotent."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -408,19 +435,43 @@ class Recording:
 
     def _merge(self, streams: list[_Stream], start: int | None, end: int | None) -> Iterator[Recorded]:
         for stream, row in self._rows(streams, start, end, by_log_time=False):
-            _, owner, chunk, offset, time, companion_chunk, companion_offset, rank = row
-            channel = stream.channels[owner]
-            name = stream.info.name
-            raw = self._file.read(channel.record.id, chunk, offset, time)
-            extra = None
-            if companion_chunk != NOWHERE and channel.companion is not None:
-                companion = self._file.read(channel.companion[0], companion_chunk, companion_offset, time)
-                if companion.sequence != raw.sequence:
-                    raise self._unreadable(name, raw, f"its companion is numbered {companion.sequence}")
-                extra = companion.data
-            message = self._decode(name, channel, raw, extra)
-            seq = channel.base + raw.sequence if stream.own else rank
-            yield Recorded(name, message, seq, channel.incarnation)
+            yield self._recorded(stream, row)
+
+    def _recorded(self, stream: _Stream, row: Row) -> Recorded:
+        channel, raw, extra = self._stored(stream, row)
+        message = self._decode(stream.info.name, channel, raw, extra)
+        seq = channel.base + raw.sequence if stream.own else row[7]
+        return Recorded(stream.info.name, message, seq, channel.incarnation)
+
+    def _columns(self, stream: _Stream, rows: Sequence[Row], names: Collection[str]) -> dict[str, Values]:
+        """The named fields of some messages."""
+        message_type = stream.info.message_type
+        if not stream.own or message_type is None:
+            messages = [self._recorded(stream, row).message for row in rows]
+            return {name: [getattr(message, name) for message in messages] for name in names}
+        codec = codec_for(message_type)
+        stored = [self._stored(stream, row) for row in rows]
+        try:
+            return codec.columns([(raw.data, extra) for _, raw, extra in stored], names)
+        except RecordingError:
+            for _, raw, extra in stored:  # one of them is to blame
+                try:
+                    codec.fields(raw.data, extra, names)
+                except RecordingError as error:
+                    raise self._unreadable(stream.info.name, raw, str(error)) from error
+            raise
+
+    def _stored(self, stream: _Stream, row: Row) -> tuple[_Channel, RawMessage, memoryview | None]:
+        """The data of a message and of its companion, and the channel that holds it."""
+        _, owner, chunk, offset, time, companion_chunk, companion_offset, _ = row
+        channel = stream.channels[owner]
+        raw = self._file.read(channel.record.id, chunk, offset, time)
+        if companion_chunk == NOWHERE or channel.companion is None:
+            return channel, raw, None
+        companion = self._file.read(channel.companion[0], companion_chunk, companion_offset, time)
+        if companion.sequence != raw.sequence:
+            raise self._unreadable(stream.info.name, raw, f"its companion is numbered {companion.sequence}")
+        return channel, raw, companion.data
 
     def _rows(
         self, streams: list[_Stream], start: int | None, end: int | None, *, by_log_time: bool

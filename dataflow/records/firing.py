@@ -31,7 +31,7 @@ class FiringRecordError(ValueError):
     """A batch of firing records that cannot be written or read: says what is wrong with it."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Emission:
     """What came out of one port: its place in the stream (or `WITHHELD`), its stamp and its digest (16 bytes)."""
 
@@ -40,9 +40,10 @@ class Emission:
     digest: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FiringRecord:
-    """One call of an operator.
+    """One call of an operator. Nobody changes a record; it is not frozen since that would make it cost four times as
+    much, and one is made for every firing.
 
     `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those

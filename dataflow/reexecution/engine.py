@@ -141,7 +141,6 @@ class Recomputation:
             finals=final_stamps(recording, feeding.streams),
             start=None if begin is None else _first_stamp(log, graph, self.runners.values()),
             end=end,
-            promises=False,
         )
         self._threads = graph.threads
 

@@ -57,7 +57,7 @@ class LosslessCover(Cover):
             return
         self._covered = covered
         for process in run.processes.values():
-            if process.report is None and (process.host.has_log or run.sources(process)):
+            if process.report is None and (process.plan.has_log or run.sources(process)):
                 run.send(process, "covered", replaces=True, frontier=covered)
 
 
@@ -71,7 +71,7 @@ class LiveCover(Cover):
 
     def __init__(self, run: RunState) -> None:
         super().__init__(run)
-        self.flow = LiveFlow(run.graph, [host.nodes for host in run.hosts.values()])
+        self.flow = LiveFlow(run.graph, [process.nodes for process in run.processes.values()])
         self._told: dict[str, tuple[int, int]] = {}
         self._excused: dict[str, int] = {}  # operator → the stamp up to which it owes nothing
 

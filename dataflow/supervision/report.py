@@ -50,7 +50,7 @@ class Status:
     """By operator, how many messages were dropped by (input, reason); a source's input is ""."""
     waits: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
     """By operator and (input, "timeout" or "late"): waits that were given up, and messages that came late."""
-    host_of: dict[str, str] = field(default_factory=dict)
+    process_of: dict[str, str] = field(default_factory=dict)
     first: int | None = None
     steps: int | None = None
     notes: list[str] = field(default_factory=list)
@@ -95,7 +95,7 @@ class RunReport:
 
 
 class RunFailed(RuntimeError):
-    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words.
+    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the process's last words.
 
     `interrupted`: it was asked to end.
     """

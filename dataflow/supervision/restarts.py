@@ -133,7 +133,7 @@ class LiveRestarts(RestartPolicy):
             run.kill(process, f"was not ready again within {run.plan.start_timeout:g} s")
 
     def _unproven(self, process: Supervised) -> set[str]:
-        made = set(process.host.publish)
+        made = set(process.plan.publish)
         others = (p for p in self.run.processes.values() if p is not process and p.reachable)
         return {stream for other in others for stream in other.unseen & made}
 
@@ -144,7 +144,7 @@ class LiveRestarts(RestartPolicy):
         if unproven:
             run.note(f"{process.describe()} goes on without: {', '.join(sorted(unproven))}")
         run.send(process, "go", first=run.release.first, at=run.release.at.wall)
-        taken = set(process.host.subscribe)
+        taken = set(process.plan.subscribe)
         for reason in sorted(set(self._ended_streams.values())):
             over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
             run.send(process, "ended_elsewhere", streams=over, reason=reason)

@@ -64,7 +64,7 @@ def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunRepor
 
 
 def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
-    placed = {node: label for label, nodes in plan.graph.hosts(plan.placement).items() for node in nodes}
+    placed = {node: label for label, nodes in plan.graph.processes(plan.placement).items() for node in nodes}
     run_facts = {
         "mode": mode,
         "started": str(time.time_ns()),
@@ -72,7 +72,7 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         "seed": str(plan.graph.seed),
         seeding.FACT: str(seeding.VERSION),
         "threads": str(plan.graph.threads),
-        **{f"host of {node}": label for node, label in placed.items()},
+        **{f"process of {node}": label for node, label in placed.items()},
     }
     facts = machine_facts(environment(plan.graph.threads))
     return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}

@@ -68,7 +68,7 @@ class StallWatch(Part):
         if due <= self.run.plan.stall_timeout:
             return ""
         rate = 1.0 if self.run.plan.rate is None else self.run.plan.rate
-        return f"; the next message of host {label!r} is due in {how_long(due)} at rate {rate:g}"
+        return f"; the next message of process {label!r} is due in {how_long(due)} at rate {rate:g}"
 
 
 class LiveStallWatch(StallWatch):
@@ -105,5 +105,5 @@ class LiveStallWatch(StallWatch):
                 words = self.run.last_words()
                 self.run.kill(process)
                 raise RunFailed(f"{process.describe()} gave no sign of life for {silence:.0f} s", words)
-            if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # hosts give one by themselves
+            if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # operators' processes give one
                 self.run.send(process, "poll", replaces=True, round=NO_ROUND)

@@ -21,7 +21,7 @@ from dataflow.supervision import commands, events
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
-from dataflow.supervision.plan import RunPlan, host_plans
+from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.words import Words
 from dataflow.transport import new_secret, registry, reserve_endpoints
@@ -44,10 +44,10 @@ class Supervisor:
 
     def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
         self.plan = plan
-        self._hosts = host_plans(plan)
-        self._reserved = reserve_endpoints(len(self._hosts))
-        self._endpoints = dict(zip(self._hosts, self._reserved.endpoints, strict=True))
-        self.core = core_of(plan, self._hosts, configurations(plan, self._hosts, self._endpoints, new_secret()))
+        self._processes = process_plans(plan)
+        self._reserved = reserve_endpoints(len(self._processes))
+        self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
+        self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints, new_secret()))
         self._on_output = on_output or _print
         self._children: dict[str, Child] = {}
         self._boxes: dict[str, int] = {}
@@ -180,7 +180,7 @@ class Supervisor:
             return
         try:
             nodes = self.plan.graph.nodes
-            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._hosts[label].nodes})
+            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._processes[label].nodes})
         finally:
             os.close(box)
         self._feed(events.Remained(label, remains))
@@ -270,7 +270,7 @@ class Supervisor:
 
     def _make_box(self, label: str) -> tuple[int, ...]:
         """Makes what a process writes its firing records to, where another one may take its place."""
-        if not self.plan.live or self._hosts[label].sink is not None:
+        if not self.plan.live or self._processes[label].sink is not None:
             return ()
         self._boxes[label] = make_black_box()
         return (self._boxes[label],)

@@ -15,7 +15,7 @@ from dataflow.sync.entries import (
     Waiting,
 )
 from dataflow.sync.recorded import RecordedAligner
-from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, messages_of, refs_of
+from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, input_refs, messages_of, refs_of
 from dataflow.sync.spec import AlignSpec, BatchSpec, SampledSpec, TriggerSpec
 from dataflow.sync.stamps import FOREVER, NEVER, format_duration, format_stamp, parse_duration, trail
 
@@ -47,6 +47,7 @@ __all__ = [
     "Waiting",
     "format_duration",
     "format_stamp",
+    "input_refs",
     "messages_of",
     "parse_duration",
     "refs_of",

@@ -54,6 +54,11 @@ class DropLog:
             oldest = self._events.popleft()
             self._unlisted[oldest.input, oldest.reason] += 1
 
+    @property
+    def pending(self) -> bool:
+        """Whether there is a drop that was not taken."""
+        return bool(self._events or self._unlisted)
+
     def take(self) -> list[Drop]:
         """The drops since this was last asked, but for those that were too many."""
         events = list(self._events)

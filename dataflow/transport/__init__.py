@@ -1,4 +1,4 @@
-"""Envelope codec and the Zenoh bus between hosts."""
+"""Envelope codec and the Zenoh bus between processes."""
 
 from dataflow.transport.bus import Bus, Token
 from dataflow.transport.codec import decode, decode_head, encode, encode_parts

@@ -104,7 +104,7 @@ class Bus:
     def publisher(self, stream: str, *, consumers: int = 0) -> StreamPublisher:
         """Declares a publisher of the key `stream`: reliable, blocking, in order.
 
-        `consumers` is the number of subscriptions to the stream (`subscribe` calls) in all other hosts, if known: when
+        `consumers` is the number of subscriptions to the stream (`subscribe` calls) in other processes, if known: when
         all of them are on this machine, large messages go through shared memory. 0: nothing is shared.
         """
         publisher = self.session.declare_publisher(

@@ -52,7 +52,7 @@ class Limits:
 DEFAULT_LIMITS: Final = Limits()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Head:
     """What every envelope says before its content: enough for rates, lag and routing."""
 
@@ -66,9 +66,9 @@ class Head:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Envelope:
-    """One thing that happens on a stream.
+    """One thing that happens on a stream. Nobody changes it (it is not frozen: one is made for every message).
 
     `stamp` is the message's stamp, the frontier, or the final stamp (ns since the epoch), by `kind`. `wall` is the wall
     time of the publication (ns), for showing lag only.

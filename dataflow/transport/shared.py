@@ -1,4 +1,4 @@
-"""Shared memory between hosts of one machine: a large envelope is written once, and every consumer reads it in place.
+"""Shared memory between processes of one machine: a large envelope is written once, each consumer reads it in place.
 
 The memory is anonymous (memfd), so nothing is left behind however a process ends. A publisher owns a pool of blocks;
 what travels on the stream is a reference to one. A consumer maps the pool read-only, and notes on a *board*, memory of

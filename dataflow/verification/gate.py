@@ -11,15 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from dataflow.graph import GraphError
 from dataflow.graph.model import Graph
-from dataflow.messages import MessageError
-from dataflow.operator import ParameterError
-from dataflow.recording import Recording, RecordingError
+from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
-from dataflow.records.firing import FiringRecordError
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
+from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.report import StandIn, VerifyReport
 
 FORMAT = 1
@@ -235,7 +232,7 @@ def check(
         if failure.interrupted:
             raise
         return could_not(str(failure), failure.details, internal=failure.internal)
-    except (RecordingError, ReplayError, FiringRecordError, GraphError, MessageError, ParameterError, OSError) as error:
+    except WRONG_INPUT as error:
         return could_not(str(error).strip())
     except (
         Exception

@@ -44,6 +44,10 @@ class Call:
     operators: tuple[str, ...] = ()
 
 
+Workers = Callable[..., list[Any]]
+"""Answers calls as `call_workers` does, with its options."""
+
+
 def call_workers(
     calls: Sequence[Call],
     *,
@@ -89,7 +93,7 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
             status.phase = "running"
         for name in worker.call.operators:
             c = worker.board.counts(name)
-            status.host_of[name] = f"worker {worker.number}"
+            status.process_of[name] = f"worker {worker.number}"
             status.operators[name] = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
     return status
 

@@ -22,7 +22,7 @@ class Background:
     """A run on a thread of its own, that commands can attach to, until it is told to stop."""
 
     def __init__(self, graph: Graph) -> None:
-        self.supervisor = Supervisor(RunPlan(graph, placement="one_host", window=(8, 1 << 20)))
+        self.supervisor = Supervisor(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
         self.thread = threading.Thread(target=self.supervisor.run)
         self.thread.start()
 

@@ -1,4 +1,4 @@
-"""Faults outside the operators: a full disk, a viewer that dies, a link between two hosts that breaks."""
+"""Faults outside the operators: a full disk, a viewer that dies, a link between two processes that breaks."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_p
 
 def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
     graph = load_graph(graph_file(tmp_path, count=250), live=True)
-    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="host_each")
+    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="process_each")
     find_running("outside", wait=30)
     viewer = subprocess.Popen(
         [sys.executable, "-m", "dataflow.cli.main", "echo", "--json"],
@@ -137,14 +137,14 @@ def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
 
     assert report.summaries["sum"]["count"] == 250
     assert not report.restarts
-    assert verify(tmp_path / "run.mcap", placement="one_host").identical
+    assert verify(tmp_path / "run.mcap", jobs=1).identical
 
 
 # A link that is lost
 
 
 class Link:
-    """A wire between two hosts, for a test to cut: a proxy in front of `endpoint`, a Unix socket."""
+    """A wire between two processes, for a test to cut: a proxy in front of `endpoint`, a Unix socket."""
 
     def __init__(self, endpoint: str) -> None:
         self._to = endpoint.removeprefix("unixsock-stream/")
@@ -221,8 +221,8 @@ def links() -> Iterator[list[Link]]:
 
 
 def run_with_a_cut(label: str, graph: Graph, path: Path, links: list[Link]) -> RunReport:
-    """A live run, a host each, in which every link to the process `label` is cut for half a second."""
-    supervisor = Supervisor(RunPlan(graph, live=True, placement="host_each", record=path))
+    """A live run, a process each, in which every link to the process `label` is cut for half a second."""
+    supervisor = Supervisor(RunPlan(graph, live=True, placement="process_each", record=path))
     _, config = supervisor.core.run.configs[label]
     links.extend(Link(endpoint) for endpoint in config["connect"])
     config["connect"] = [link.endpoint for link in links]
@@ -262,7 +262,7 @@ def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor
     assert [(gap["stream"], gap["taker"]) for gap in gaps] == [("test/left/fast", "smooth")]
     (gap,) = gaps
     assert 0 < gap["following"] - gap["first"] < 299  # it came back
-    verified = verify(path, graph=graph, placement="one_host")
+    verified = verify(path, graph=graph, jobs=1)
     assert verified.identical, verified.as_json()
 
 
@@ -278,7 +278,7 @@ def test_a_recorder_that_was_cut_off_has_every_firing_record_and_its_gaps_are_sa
         for operator in graph.nodes:
             indices = sorted(record.index for record in recorded_firings(recording, operator))
             assert indices == list(range(len(indices))), operator
-    verified = verify(path, graph=graph, placement="one_host")
+    verified = verify(path, graph=graph, jobs=1)
     assert not verified.identical
     assert not any(v.lost_records or v.unaccounted or v.unfinished for v in verified.operators)
     assert all(v.verdict == "unverifiable" and v.unverifiable for v in verified.operators)

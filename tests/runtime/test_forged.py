@@ -43,7 +43,7 @@ def test_forged_ends_frontiers_and_messages_change_nothing(tmp_path: Path, live:
         "sum: {use: runtime_operators:Sum, inputs: {x: smooth/mean}}",
         count=100,
     )
-    undisturbed = run(graph, placement="one_host")
+    undisturbed = run(graph, placement="one_process")
     path = tmp_path / "run.mcap"
     running = Background(graph, record=path, live=live)
     found = find_running("chain", wait=30)
@@ -61,4 +61,4 @@ def test_forged_ends_frontiers_and_messages_change_nothing(tmp_path: Path, live:
     assert sum(counts["foreign"] for counts in report.transport.values()) == 2 * len(forged(KEYS[0]))
     assert report.summaries == undisturbed.summaries
     assert report.streams == undisturbed.streams or live
-    assert verify(path, placement="one_host").identical
+    assert verify(path, jobs=1).identical

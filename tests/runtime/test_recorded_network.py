@@ -33,7 +33,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Any:
     path = tmp_path_factory.mktemp("network") / "run.mcap"
     with reserve_endpoints(2) as reserved:
         listen, connect = reserved.endpoints
-        run(load_text(GRAPH.format(listen=listen, connect=connect)), record=path, placement="one_host")
+        run(load_text(GRAPH.format(listen=listen, connect=connect)), record=path, placement="one_process")
         yield path, listen, connect
 
 
@@ -66,7 +66,7 @@ def test_a_replay_leaves_the_recorded_network_alone(
     recorded: tuple[Path, str, str], spawned: list[Mapping[str, Any]]
 ) -> None:
     path, listen, connect = recorded
-    replay(path, placement="one_host")
+    replay(path, placement="one_process")
     assert spawned
     assert obeyed(spawned, listen, connect) == set()
     with Recording(path) as recording:

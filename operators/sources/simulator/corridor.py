@@ -17,15 +17,14 @@ from operators.sources.simulator.furnishing import (
     raise_wall,
 )
 from operators.sources.simulator.inhabitants import add_ball, add_rover, add_walker
-from operators.sources.simulator.scene import Builder, Light, World
+from operators.sources.simulator.scene import Builder, Light, Order, World
 from operators.sources.simulator.shapes import Array
-from operators.sources.simulator.trajectory import Trajectory
 
 LANE = 1.0
 """Metres between the block and the robot's path; those who come towards it keep to the outer wall."""
 
 
-def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
+def corridor(seed: int, order: Order) -> World:
     """A ring of about thirty metres, drawn from the seed."""
     rng = np.random.default_rng([seed, 2])
     block_x, block_y, width = rng.uniform(3.0, 4.2), rng.uniform(2.0, 3.0), rng.uniform(2.75, 3.0)
@@ -35,7 +34,7 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     lay_floor(builder, (-x, -y), (x, y), height, style)
     outer = _ring(x, y, height, inside=True)
     inner = _ring(block_x, block_y, height, inside=False)
-    roles = [str(role) for role in rng.permutation(["walker", "walker", "ball", "rover"])] if movers else [""] * 4
+    roles = [str(role) for role in rng.permutation(["walker", "walker", "ball", "rover"])] if order.movers else [""] * 4
     for wall, role in zip(outer, roles, strict=True):
         if role:
             _inhabit(builder, rng, wall, role, wall.length / 2 - 1.9)
@@ -68,7 +67,7 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         tuple(builder.things),
         lights,
         0.5,
-        Trajectory(_lane(block_x, block_y), speed=speed, hold=hold),
+        order.drive(_lane(block_x, block_y)),
         landmarks,
         (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0),
         tuple(builder.placements),

@@ -326,11 +326,19 @@ class Rolling:
         return _mix(act.along, x)
 
 
+STANDING = 0.05
+"""A robot that is slower than this, m/s, counts as standing."""
+
+
 class Driving:
-    """A robot that drives a closed path."""
+    """A robot that drives a closed path; in its narrow bends it all but stands."""
 
     def __init__(self, path: Trajectory, phase: float = 0.0) -> None:
         self._path, self._phase = path, phase
+        times = np.linspace(0, path.period, 4000, endpoint=False)
+        drives = path.at(times).speed() >= STANDING
+        turns = np.flatnonzero(drives != np.roll(drives, 1))
+        self._turns = [(float(times[k]), "driving" if drives[k] else "resting") for k in turns]
 
     def frame(self, t: float) -> Array:
         return np.asarray(self._path.at([t + self._phase]).T_world_base()[0])
@@ -339,7 +347,11 @@ class Driving:
         return self.frame(t)[None]
 
     def doing(self, thing: int, t: float) -> Doing:
-        return Doing(thing, "driving", 0.0, "drive a loop")
+        if not self._turns:
+            return Doing(thing, "driving", 0.0, "drive a loop")
+        u = (t + self._phase) % self._path.period
+        begin, activity = self._turns[bisect_right(self._turns, (u, "~")) - 1]
+        return Doing(thing, activity, t - (u - begin) % self._path.period, "drive a loop")
 
 
 class Carried:

@@ -21,9 +21,8 @@ from operators.sources.simulator.furnishing import (
 )
 from operators.sources.simulator.inhabitants import add_ball, add_desk_worker, add_rover, add_walker
 from operators.sources.simulator.lanes import WALKER
-from operators.sources.simulator.scene import Builder, Light, World
+from operators.sources.simulator.scene import Builder, Light, Order, World
 from operators.sources.simulator.shapes import Array, pose
-from operators.sources.simulator.trajectory import Trajectory
 
 REACH = 2.45
 """Metres between the walls and the robot's path: furniture, then room for those who walk, roll or drive there."""
@@ -32,7 +31,7 @@ OUT = 1.8
 """Metres between a wall and the middle of its lane."""
 
 
-def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
+def office(seed: int, order: Order) -> World:
     """A world of about nine by eight metres, drawn from the seed."""
     rng = np.random.default_rng([seed, 1])
     half_x, half_y, height = rng.uniform(4.3, 5.0), rng.uniform(3.7, 4.2), rng.uniform(2.5, 2.9)
@@ -42,7 +41,7 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
     accent = int(rng.integers(4))
     door_wall = int(rng.integers(4))
-    roles = [str(role) for role in rng.permutation(["worker", "walker", "ball", "rover"])] if movers else [""] * 4
+    roles = [str(role) for role in rng.permutation(["worker", "walker", "ball", "rover"])] if order.movers else [""] * 4
     if roles[door_wall] == "worker":
         door_wall = (door_wall + 1) % 4
     turn = int(rng.choice([-1, 1]))
@@ -67,7 +66,7 @@ def office(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         decorate(builder, rng, wall, windows=k in (0, 2), taken=taken)
 
     a, b = half_x - REACH, half_y - REACH
-    path = Trajectory(_loop(rng, a, b), speed=speed, hold=hold)
+    path = order.drive(_loop(rng, a, b))
     _island(builder, rng, min(a, b) - 0.42)
     lights = tuple(
         Light((sx * half_x * 0.5, sy * half_y * 0.5, height - 0.1), rng.uniform(1.7, 2.2))

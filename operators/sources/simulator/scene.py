@@ -118,6 +118,24 @@ class Placement:
     holds: Callable[[float], bool] | None = None
 
 
+@dataclass(frozen=True)
+class Order:
+    """What is asked of a world.
+
+    `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, and `jumps`: times (s)
+    and shares of the round by which the robot is carried ahead.
+    """
+
+    speed: float
+    hold: float
+    movers: bool
+    jumps: tuple[tuple[float, float], ...] = ()
+
+    def drive(self, waypoints: Array, *, at_most: float = 1.0) -> Trajectory:
+        """The robot's path through waypoints (N, 2), nowhere faster than `at_most` (m/s)."""
+        return Trajectory(waypoints, speed=min(self.speed, at_most), hold=self.hold, jumps=self.jumps)
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """A world and all that will happen in it.
@@ -137,6 +155,10 @@ class World:
     scripts: tuple[Callable[[float], Doing], ...] = ()
     floor_id: int = 0
     lanes: tuple[Lane, ...] = ()
+    daylight: float = 0.3
+    """Share of the ambient light that does not come from lamps."""
+    sky: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour where nothing is hit, RGB, 0 to 255."""
 
     def relations(self, t: float) -> list[Relation]:
         """The relations of placement and contact that hold at a time."""

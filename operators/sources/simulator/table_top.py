@@ -20,12 +20,11 @@ from operators.sources.simulator.furnishing import (
     small_items,
 )
 from operators.sources.simulator.inhabitants import add_ball, add_drinker, add_walker, arm_room
-from operators.sources.simulator.scene import Builder, Light, World
+from operators.sources.simulator.scene import Builder, Light, Order, World
 from operators.sources.simulator.shapes import Array, pose
-from operators.sources.simulator.trajectory import Trajectory
 
 
-def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
+def table_top(seed: int, order: Order) -> World:
     """A room of about seven metres with one table, drawn from the seed."""
     rng = np.random.default_rng([seed, 3])
     half_x, half_y, height = rng.uniform(3.4, 3.8), rng.uniform(3.4, 3.8), rng.uniform(2.4, 2.7)
@@ -34,7 +33,7 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
     walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
     walked, door_wall = (int(k) for k in rng.permutation(4)[:2])
-    if movers:
+    if order.movers:
         ways = [walls[walked].place(0.88, s * (walls[walked].length / 2 - 1.3)) for s in (-1.0, -0.3, 0.4, 1.0)]
         add_walker(builder, rng, np.array([T[:2, 3] for T in ways]))
     for k, wall in enumerate(walls):
@@ -47,7 +46,7 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
             taken, free = [(-0.6, 0.6)], [(-half, -0.65), (0.65, half)]
         line_wall(builder, rng, wall, free, depth=0.55)
         decorate(builder, rng, wall, windows=k % 2 == 0, taken=taken)
-    _lay_table(builder, rng, movers)
+    _lay_table(builder, rng, order.movers)
     lights = tuple(
         Light((0.9 * math.cos(a), 0.9 * math.sin(a), height - 0.1), rng.uniform(1.4, 1.9))
         for a in rng.uniform(0, 6) + np.array([0, 2.1, 4.2])
@@ -64,7 +63,7 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         tuple(builder.things),
         lights,
         0.62,
-        Trajectory(_circle(rng), speed=min(speed, 0.6), hold=hold),
+        order.drive(_circle(rng), at_most=0.6),
         landmarks,
         (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2),
         tuple(builder.placements),

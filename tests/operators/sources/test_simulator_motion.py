@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from operators.sources.simulator import corridor, office, table_top
+from operators.sources.simulator.drive import Drive
 from operators.sources.simulator.inertial import true_reading
-from operators.sources.simulator.movers import Person
+from operators.sources.simulator.movers import STANDING, Driving, Person
 from operators.sources.simulator.native import open3d
 from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.settings import Inertial
@@ -69,7 +70,7 @@ def test_speed_and_turning_stay_within_limits(name: str) -> None:
 
 def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> None:
     path, imu = world("office", 0).path, Inertial(mount=(0.2, -0.1, 0.4, 0.0, 0.0, 0.5))
-    lever = np.array([0.2, -0.1])
+    drive, lever = Drive(path), np.array([0.2, -0.1])
     dt, steps = 0.005, 2000
     start = path.at([0.0])
     R0 = start.T_world_base()[0][:2, :2]
@@ -77,7 +78,7 @@ def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> 
     p = start.position[0] + R0 @ lever
     v = start.velocity[0] + R0 @ (float(start.yaw_rate[0]) * np.array([-lever[1], lever[0]]))
     for k in range(steps):
-        omega, force = true_reading(path, imu, (k + 0.5) * dt)
+        omega, force = true_reading(drive, imu, (k + 0.5) * dt)
         assert force[2] == pytest.approx(9.80665)
         middle = yaw + omega[2] * dt / 2
         a = np.array(
@@ -204,6 +205,22 @@ def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
                 assert np.linalg.norm(poses - last, axis=1).max() < 5.0 * 0.12, (thing.label, t)
             last = poses
         assert min(thing.vertices(t)[:, 2].min() for t in times[::25]) > -0.01
+
+
+@pytest.mark.parametrize("name", ["office", "corridor"])
+def test_a_robot_is_said_to_drive_while_it_moves_and_to_rest_while_it_stands(name: str) -> None:
+    robot = next(thing for thing in world(name, 0).things if isinstance(thing.mover, Driving))
+    seen = set()
+    for t in np.arange(0.02, 150, 0.37):
+        ends = [robot.mover.frame(t + dt)[:2, 3] for dt in (-0.01, 0.01)]
+        speed = np.linalg.norm(ends[1] - ends[0]) / 0.02
+        doing = robot.mover.doing(robot.id, t)
+        if abs(speed - STANDING) > 0.005:
+            assert doing.activity == ("driving" if speed > STANDING else "resting"), t
+        before, after = (robot.mover.doing(robot.id, doing.since + dt).activity for dt in (-0.1, 0.1))
+        assert (before, after) == ({"driving": "resting", "resting": "driving"}[doing.activity], doing.activity)
+        seen.add(doing.activity)
+    assert seen == {"driving", "resting"}
 
 
 def test_bones_keep_their_lengths() -> None:

@@ -18,12 +18,13 @@ from operators.sources.simulator.classes import ACTIVITIES, THINGS
 from operators.sources.simulator.furnishing import FLOOR
 from operators.sources.simulator.furniture import rover
 from operators.sources.simulator.movers import Carried, Person
+from operators.sources.simulator.optics import Optics
 from operators.sources.simulator.relations import PLACEMENT, SPATIAL
-from operators.sources.simulator.renderer import Optics, Renderer
+from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Builder, Light, Still, World
 from operators.sources.simulator.shapes import Material, bounds, box, pose
 from operators.sources.simulator.trajectory import Trajectory
-from operators.sources.simulator.truth import masks
+from operators.sources.simulator.truth import masks, velocity
 from operators.sources.simulator.worlds import NAMES, make_world
 
 WORLDS = ("office", "table_top")
@@ -70,6 +71,21 @@ def test_masks_and_boxes_in_the_image_count_the_same_pixels(steps: list[dict[str
             assert len(rows) == count
             assert corners.tolist() == [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
             assert set(mask.classes[rows, columns]) == {class_id}
+
+
+def test_boxes_move_as_fast_as_their_middles_do(robot: SimulatedRobot) -> None:
+    """Against the way of the middles over 20 ms: limbs that swing move a person's box too."""
+    world, apart, moving = robot._stage.world, [], 0
+    for thing in world.objects():
+        if thing.still:
+            continue
+        for t in np.arange(0.1, 12, 0.61):
+            ends = [thing.box(t + dt)[0][:3, 3] for dt in (-0.01, 0.01)]
+            apart.append(np.linalg.norm(velocity(thing, t) - (ends[1] - ends[0]) / 0.02))
+            moving += bool(np.linalg.norm(ends[1] - ends[0]) > 0.002)
+    assert moving > 10
+    assert np.median(apart) < 0.01
+    assert np.percentile(apart, 95) < 0.1
 
 
 def test_boxes_in_space_enclose_the_boxes_in_the_image(robot: SimulatedRobot, steps: list[dict[str, Any]]) -> None:
