@@ -28,10 +28,10 @@ PIXEL_STRENGTH = 0.2
 # truth, see the benchmark). Calibration, rolling shutters and unsynchronised images err alike in every residual, so no
 # count averages them out, but tracks then miss by more than they jitter; and what moves may do so unnoticed.
 SYSTEMATIC = 0.75
-JITTER = 0.3  # working pixels
+JITTER = 0.33  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
 MOVING = 10.0  # of the share of the view that moves
 
-STAGES = ((4, 0.15, 3), (2, 0.06, 4))  # stride over patches, gate in metres, iterations
+STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,7 +81,7 @@ class Fit:
 
     @property
     def covariance(self) -> Matrix:
-        misfit = max(1.0, self.noise.pixel / JITTER) ** 2 + MOVING * self.movers.share
+        misfit = max(1.0, self.noise.pixel / JITTER) ** 4 + MOVING * self.movers.share
         return SYSTEMATIC * misfit * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
 
     @property

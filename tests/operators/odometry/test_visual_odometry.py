@@ -24,7 +24,7 @@ from operators.odometry import VisualOdometry
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
-from operators.odometry.tracking import MEASURED, Status, TrackResult
+from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
 SIZE = (320, 240)
 K_COLOR = np.array([[262.0, 0.0, 159.5], [0.0, 262.0, 119.5], [0.0, 0.0, 1.0]])
@@ -229,9 +229,14 @@ def test_covariance_covers_the_error_and_grows_with_the_way() -> None:
         assert np.linalg.eigvalsh(r.covariance)[0] > 0
 
 
-def test_covariance_grows_with_the_way_once_the_noise_is_known() -> None:
-    results = follow(sequence(25, 3.0)[0], rate=10.0)
-    assert np.trace(results[-1].covariance) > np.trace(results[12].covariance)
+def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() -> None:
+    odometry = RgbdOdometry(camera())
+    for i, frame in enumerate(sequence(25, 3.0)[0]):
+        result, keyframes = odometry.track(*frame, i * 100_000_000), odometry.snapshot().keyframes
+        if i > 0 and not result.keyframe:
+            newest = keyframes[-1]
+            carried = moved_covariance(newest.covariance, newest.T_world_camera, result.T_world_camera)
+            assert np.linalg.eigvalsh(result.covariance - carried)[0] > 0
 
 
 # -- failures ------------------------------------------------------------------------------------------------
