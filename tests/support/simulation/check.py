@@ -12,7 +12,7 @@ import functools
 import importlib
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -131,20 +131,19 @@ def _explained(report: VerifyReport) -> str:
 def verified(path: Path) -> VerifyReport:
     """Verifies in this process: the workers' functions are called, one after the other."""
     bindings = {
-        ("dataflow.verification.verify", "call_workers"): _call_here,
         ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
         ("dataflow.reexecution.recorded_run", "load_bundle"): _load_bundle,
     }
     importlib.import_module("dataflow.verification.verify")
     with bound(bindings):
-        return verify(path, jobs=1)
+        return verify(path, jobs=1, workers=_call_here)
 
 
 _load_bundle = functools.lru_cache(maxsize=1024)(load_bundle)
 """The graph in a recording; the same ones come again and again."""
 
 
-def _call_here(calls: list[Call], **options: Any) -> list[Any]:
+def _call_here(calls: Sequence[Call], **options: Any) -> list[Any]:
     answers = []
     for call in calls:
         module, _, name = call.function.partition(":")

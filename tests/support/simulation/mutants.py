@@ -13,7 +13,7 @@ from dataflow.firing.ports import OutputPorts
 from dataflow.firing.runner import OperatorRunner
 from dataflow.process.channel import ChannelClosed, QueuedChannel
 from dataflow.process.inlet import Inlet
-from dataflow.sync import FOREVER, Entry
+from dataflow.sync import FOREVER
 
 
 class Mutant:
@@ -55,16 +55,19 @@ class CreditLost(Mutant):
 
 
 class EarlyAcknowledgement(Mutant):
-    """An operator counts a message as done when it arrives."""
+    """A source takes a step for done as soon as the one before it is."""
 
     said = "an acknowledgement comes too early"
 
     def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
-        def push(self: OperatorRunner, stream: str, entry: Entry) -> None:
-            self.aligner.push(stream, entry)
-            self.done = max(self.done, entry.stamp)
+        right = Window.cover
 
-        return {(OperatorRunner, "push"): push}
+        def cover(self: Window, frontier: int) -> None:
+            right(self, frontier)
+            if self._outstanding:
+                right(self, self._outstanding[0][0])
+
+        return {(Window, "cover"): cover}
 
 
 class LateRecord(Mutant):
