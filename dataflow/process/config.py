@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,12 +23,15 @@ class ProcessConfig:
     """What the supervisor tells an operator process to be. Travels as plain values.
 
     `publish` maps the local streams that other processes take (firing records included) to how many take them;
-    `subscribe` are the remote ones taken here. `secret` is the run's: only messages that were sealed with it count.
+    `subscribe` are the remote ones taken here. `listen` are the endpoints at which programs from outside reach it.
     `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`:
     whether a recorder takes the firing records. `live`: sources do not wait for the graph, and operators not for their
     inputs. `resume` is given to a process that takes the place of one that died: for each operator, where it had got
     to (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the
-    operators' states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
+    operators' states of that moment. `rings_out` and `rings_in`: for each link to and from another process the keys of
+    its channels, after whether messages may be dropped for a consumer that takes nothing; their descriptors were handed
+    down in this order.
+    `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
     label: str
@@ -37,8 +40,6 @@ class ProcessConfig:
     publish: dict[str, int]
     subscribe: list[str]
     listen: list[str]
-    connect: list[str]
-    secret: str
     replay: dict[str, Any] | None = None
     window: tuple[int, int] = (256, 64 << 20)
     rate: float | None = None
@@ -48,6 +49,8 @@ class ProcessConfig:
     resume: dict[str, Any] | None = None
     snapshots: int | None = None
     warm: dict[str, Any] | None = None
+    rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
+    rings_in: Sequence[Sequence[str]] = ()
 
     def resumed(self, operator: str) -> Resumed:
         """Where an operator had got to in the process before this one."""

@@ -15,8 +15,8 @@ from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.runners import Runners
 
-REPORT_EVERY = 0.004
-REPORT_IDLE = 0.002
+REPORT_EVERY = 0.02
+REPORT_IDLE = 0.01
 """Seconds between two reports of a process that has nothing more to do: others may be waiting for this one."""
 
 
@@ -48,15 +48,13 @@ class Progress:
     def report(self, *, idle: bool) -> None:
         """Sends what has changed, if it is time to."""
         now = self._clock()
-        self._owed = False
-        if not idle and now < self._reported + REPORT_EVERY:
+        if now < self._reported + (REPORT_IDLE if idle else REPORT_EVERY):
+            self._owed = self._owed or idle
             return
+        self._owed = False
         done = {r.node.name: r.done for r in self._runners.operators if self._done.get(r.node.name) != r.done}
         firings = self._made()
         if not done and firings == self._firings:
-            return
-        if now < self._reported + (REPORT_IDLE if done else REPORT_EVERY):
-            self._owed = True
             return
         self._reported = now
         self._done.update(done)

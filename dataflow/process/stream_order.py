@@ -55,6 +55,23 @@ class StreamOrder:
         """Notes that the stream's process was restarted: a higher incarnation is to come."""
         self._announced = True
 
+    def goes_on(self, envelope: Envelope) -> bool:
+        """Takes a message that simply goes on: at the place that is due, above what was promised, with nothing held.
+
+        False, and nothing is taken note of, for anything else: that is for `take`.
+        """
+        if (
+            envelope.kind is not Kind.MESSAGE
+            or self._held
+            or self._ended
+            or (envelope.incarnation, envelope.seq) != self._next
+            or envelope.incarnation != self.incarnation
+            or not self._promised < envelope.stamp < FOREVER
+        ):
+            return False
+        self._next, self._promised = (envelope.incarnation, envelope.seq + 1), envelope.stamp
+        return True
+
     def take(self, envelope: Envelope) -> Verdict:
         """Returns what may be believed after this envelope."""
         if envelope.kind not in (Kind.MESSAGE, Kind.FRONTIER, Kind.END) or envelope.stamp >= FOREVER:

@@ -6,32 +6,45 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.supervision.plan import ProcessPlan, RunPlan
+from dataflow.supervision.rings import pairs_of
 
 Config = tuple[str, dict[str, Any]]
 """Kind of process ("operators" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
 
 
 def configurations(
-    plan: RunPlan, processes: Mapping[str, ProcessPlan], endpoints: Mapping[str, str], secret: str
+    plan: RunPlan, processes: Mapping[str, ProcessPlan], endpoints: Mapping[str, str]
 ) -> dict[str, Config]:
     """Returns every process's configuration by label.
 
-    `endpoints` are those on which the processes listen, `secret` what the run's messages are sealed with.
+    `endpoints` are those on which the processes listen.
     """
     first = next(iter(processes))
     configs: dict[str, Config] = {}
     for label, process in processes.items():
-        common = _common(plan, process, endpoints) | {"secret": secret}
+        common = _common(plan, process, processes)
         if process.sink is None:
             configs[label] = _operators(plan, process, common, endpoints, label == first)
+            pairs = pairs_of(plan.graph, processes)
+            configs[label][1]["rings_out"] = [
+                (plan.live and processes[taker].sink is None, list(keys))
+                for (maker, taker), keys in pairs.items()
+                if maker == label
+            ]
         else:
             configs[label] = _sink(plan, process, common)
     return configs
 
 
-def _common(plan: RunPlan, process: ProcessPlan, endpoints: Mapping[str, str]) -> dict[str, Any]:
-    connect = [endpoints[up] for up in process.upstream]
-    return {"label": process.label, "graph": plan.graph.to_json(), "connect": connect, "live": plan.live}
+def _common(plan: RunPlan, process: ProcessPlan, processes: Mapping[str, ProcessPlan]) -> dict[str, Any]:
+    pairs = pairs_of(plan.graph, processes)
+    rings_in = [list(keys) for (_, consumer), keys in pairs.items() if consumer == process.label]
+    common = {
+        "label": process.label,
+        "graph": plan.graph.to_json(),
+        "live": plan.live,
+    }
+    return common | {"rings_in": rings_in}
 
 
 def _sink(plan: RunPlan, process: ProcessPlan, common: Mapping[str, Any]) -> Config:

@@ -31,6 +31,8 @@ LEAVE_WITHIN = 12.0
 DIE_WITHIN = 1.0
 MOST_DESCRIPTORS = 253
 """As many as one message on a Unix socket carries."""
+MORE, SPAWN = b"+", b"s"
+"""A request: descriptors, of which more follow, and the last ones for a process that is to be started."""
 PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
 
 _PR_SET_CHILD_SUBREAPER = 36
@@ -68,19 +70,24 @@ def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited:
 def serve(connection: socket.socket) -> None:
     """Forks on request and reports ends, until the supervisor closes the connection."""
     children: dict[int, int] = {}  # pidfd → pid
+    descriptors: list[int] = []
     while True:
         readable, _, _ = select.select([connection.fileno(), *children], [], [])
         for pidfd in readable:
             if pidfd != connection.fileno():
                 _ended(connection, children, pidfd)
         if connection.fileno() in readable:
-            request, descriptors, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
+            request, given, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
             if not request:
                 break
+            descriptors += given
+            if request == MORE:
+                continue
             descriptor, words, *handed = descriptors
             pid = _fork_process(descriptor, words, handed, [connection.fileno(), *children])
-            for given in descriptors:
-                os.close(given)
+            for each in descriptors:
+                os.close(each)
+            descriptors = []
             pidfd = os.pidfd_open(pid)
             children[pidfd] = pid
             _tell(connection, "spawned", pid, None, [pidfd])

@@ -72,7 +72,6 @@ class ProcessPlan:
     nodes: tuple[str, ...]
     publish: Mapping[str, int]
     subscribe: tuple[str, ...]
-    upstream: tuple[str, ...]
     has_log: bool = False
     sink: str | None = None
     streams: tuple[str, ...] = ()
@@ -137,16 +136,10 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
             tuple(node for node in nodes if node not in replaced),
             publish,
             subscribe,
-            tuple(sorted({made_in[s] for s in subscribe})),
             has_log=bool(replaced & set(nodes)),
         )
     for label, (kind, taken, chosen) in sinks.items():
-        upstream = {made_in[s] for s in taken}
-        if kind == "record":
-            upstream |= set(processes)
-        plans[label] = ProcessPlan(
-            label, (), {}, (), tuple(sorted(upstream)), sink=kind, streams=tuple(sorted(taken)), options=chosen
-        )
+        plans[label] = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
     return plans
 
 

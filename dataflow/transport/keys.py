@@ -29,11 +29,6 @@ def statics_key(namespace: str, bus: str) -> str:
     return runtime_key(namespace, "statics", bus)
 
 
-def shared_key(stream: str, machine: str, pid: str, descriptor: str, bus: str) -> str:
-    """The liveliness token of a consumer of `stream` that can read shared memory."""
-    return "/".join((stream, RUNTIME, "shm", machine, pid, descriptor, bus))
-
-
 def tap_key(namespace: str, tap: str, stream: str) -> str:
     """Where the copies of `stream` for one tap travel."""
     return runtime_key(namespace, "tap", tap, stream.removeprefix(f"{namespace}/"))

@@ -57,7 +57,7 @@ def obeyed(configs: list[Mapping[str, Any]], *endpoints: str) -> set[str]:
     used: set[str] = set()
     for config in configs:
         network = config["graph"]["network"]
-        used |= {*config.get("listen", ()), *config["connect"], *network["listen"], *network["connect"]}
+        used |= {*config.get("listen", ()), *network["listen"], *network["connect"]}
         used |= {"scouting"} if network["scouting"] else set()
     return used & {*endpoints, "scouting"}
 

@@ -38,7 +38,7 @@ class Play:
         self.plan = RunPlan(graph, live=live, **{"placement": "process_each"} | options)
         self.processes = process_plans(self.plan)
         endpoints = {label: f"tcp/127.0.0.1:{7000 + k}" for k, label in enumerate(self.processes)}
-        self.core = core_of(self.plan, self.processes, configurations(self.plan, self.processes, endpoints, "secret"))
+        self.core = core_of(self.plan, self.processes, configurations(self.plan, self.processes, endpoints))
         self.now = 100.0
         self.commands: list[Command] = []
         self.over: Over | None = None
