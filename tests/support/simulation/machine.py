@@ -427,6 +427,22 @@ class System:
         elif isinstance(thing, WriteEnd):
             thing.pipe.end_writing()
 
+    def eventfd(self, initial: int, flags: int = 0) -> int:
+        return EventFd(self).descriptor
+
+    def eventfd_write(self, descriptor: int, value: int) -> None:
+        self.world.call()
+        if (thing := self.things.get(descriptor)) is not None:
+            thing.count += value
+            thing.changed.notify()
+
+    def eventfd_read(self, descriptor: int) -> int:
+        thing = self.things[descriptor]
+        if not thing.count:
+            raise BlockingIOError
+        count, thing.count = thing.count, 0
+        return int(count)
+
     def _exit(self, code: int) -> None:
         task = self.world.task
         assert task is not None
@@ -485,15 +501,23 @@ class Selectors:
 
 
 class Select:
-    """The module `select`, for handles of processes."""
+    """The module `select`, for handles of processes and the one descriptor that an inbox waits for."""
 
     def __init__(self, system: System) -> None:
         self._system = system
 
     def select(self, reading: list[Any], writing: list[Any], odd: list[Any], timeout: float | None) -> Any:
         if any(isinstance(each, int) and each >= FIRST for each in reading):
-            return [each for each in reading if self._system.things[each].readable], [], []
+            return self._wait([self._system.things[each] for each in reading], timeout), [], []
         return select.select(reading, writing, odd, timeout)
+
+    def _wait(self, things: list[Any], timeout: float | None) -> list[Any]:
+        world = self._system.world
+        world.call()
+        until = None if timeout is None else world.now + timeout
+        while not (ready := [thing for thing in things if thing.readable]) and (until is None or world.now < until):
+            things[0].changed.wait(None if until is None else until - world.now)
+        return ready
 
 
 class Signals:
@@ -508,6 +532,21 @@ class Signals:
         world, process = self._system.world, self._system.things[descriptor].process
         does = {signal.SIGKILL: world.kill, signal.SIGSTOP: world.freeze, signal.SIGCONT: world.thaw}[number]
         world.after(world.latency(), lambda: None if process.dead else does(process))
+
+
+class EventFd:
+    """A counter that processes wait for (eventfd)."""
+
+    def __init__(self, system: System) -> None:
+        self.count = 0
+        self.writable = True
+        self.changed = Waiters(system.world)
+        self.waiters = (self.changed,)
+        self.descriptor = system.open(self)
+
+    @property
+    def readable(self) -> bool:
+        return self.count > 0
 
 
 class Handle:

@@ -15,7 +15,8 @@ from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import _metadata
 from dataflow.supervision.supervisor import Supervisor
-from simulation import bindings, machine, network, operators
+from dataflow.transport import make_ring
+from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
 from simulation.world import Process, Violation, World
@@ -30,8 +31,7 @@ class Happening:
     """What happens to a run from outside, `at` so many seconds after its sources were released.
 
     `kill`, `freeze` (for `span` s), `kill_at_call` (at its `call`-th call to the operating system, of the `life`-th
-    process with that label) happen to the process `target`; `cut` breaks the link from it to the process `other`
-    for `span` s; `stop` asks the supervisor for an orderly end.
+    process with that label) happen to the process `target`; `stop` asks the supervisor for an orderly end.
     """
 
     at: float
@@ -55,6 +55,7 @@ class Machine:
     slow_disk: float = 0.0
     socket_room: int = 278
     """Messages that fit into a socket pair: 278 on a real machine, with Linux's defaults."""
+    ring_bytes: int = 1 << 20
 
 
 @dataclass(slots=True)
@@ -70,8 +71,6 @@ class Outcome:
     words: list[str] = field(default_factory=list)
     killed: set[str] = field(default_factory=set)
     """Processes that died before their time, whoever killed them."""
-    lost: int = 0
-    """Messages that links have lost."""
     disk_full: bool = False
 
 
@@ -86,7 +85,7 @@ class Simulation:
     def __init__(self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str) -> None:
         self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
         self.system = machine.System(self.world, socket_room=machine_.socket_room)
-        self.network = network.Network(self.world)
+        self._ring_bytes = machine_.ring_bytes
         self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
         self.outcome = Outcome()
         self._plan, self._happenings, self._mode = plan, happenings, mode
@@ -107,7 +106,6 @@ class Simulation:
             self._play()
         world = self.world
         self.outcome.seconds, self.outcome.turns, self.outcome.calls = world.now, world.turns, world.calls
-        self.outcome.lost = sum(link.lost for link in self.network.links)
         self.outcome.disk_full = self.disk.full
         return self.outcome
 
@@ -147,7 +145,6 @@ class Simulation:
         facts = {"threads": {}}
         return {
             **dict.fromkeys(bindings.clocks(), time),
-            (f"{process}.main", "queue"): machine.Queue(world),
             (f"{process}.main", "threading"): threads,
             (f"{process}.main", "os"): system,
             (f"{process}.channel", "socket"): machine.Sockets(system),
@@ -155,10 +152,17 @@ class Simulation:
             (f"{process}.watchdog", "threading"): threads,
             (f"{process}.watchdog", "psutil"): SimpleNamespace(Process=_Resident, Error=OSError),
             (f"{process}.live_sources", "threading"): threads,
-            (f"{process}.operator_process", "Bus"): self.network.join,
-            (f"{process}.operator_process", "TapServer"): network.NoTaps,
+            (f"{process}.inbox", "os"): system,
+            (f"{process}.inbox", "select"): machine.Select(system),
+            (f"{process}.operator_process", "Bus"): network.Bus,
+            (f"{process}.operator_process", "TapServer"): network.Nobody,
+            (f"{process}.operator_process", "OutsidePublisher"): network.Nobody,
+            (f"{process}.runners", "BlackBox"): memory.black_box(world),
+            ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
+            ("dataflow.transport.ring", "os"): system,
+            (f"{supervision}.rings", "os"): system,
+            (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
-            (f"{process}.sink", "Bus"): self.network.join,
             (f"{supervision}.supervisor", "os"): system,
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
             (f"{supervision}.supervisor", "Nursery"): lambda environment: Nursery(system, self._named, self._born),
@@ -202,8 +206,6 @@ class Simulation:
             case "stop":
                 assert self._supervisor is not None
                 self._supervisor.stop()
-            case "cut":
-                self.network.partition(happening.target, fields["other"], fields["span"])
             case "kill" if process is not None:
                 world.kill(process)
             case "freeze" if process is not None:
