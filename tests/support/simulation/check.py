@@ -227,7 +227,7 @@ def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunRepor
     with Recording(path) as recording:
         log = FiringLog.read(recording)
     worked = [
-        (record.stamp, record.wall_start)
+        (record.stamp, record.wall_start + record.duration)
         for name, node in graph.nodes.items()
         for record in log.of(name)
         if not node.source and record.kind in ("fire", "tick")

@@ -27,7 +27,7 @@ class Disk:
         return getattr(os, name)
 
     def open(self, path: Path, flags: int, mode: int) -> int:
-        self._world.call()
+        self._world.effect()
         descriptor = os.open(path, flags, mode)
         task = self._world.task
         if task is not None:
@@ -38,7 +38,7 @@ class Disk:
     def write(self, descriptor: int, data: memoryview) -> int:
         """May take only a part, may take long, and may find no room."""
         world = self._world
-        world.call()
+        world.effect()
         if self._slow:
             world.wait(world.random.random() * self._slow)
         count = len(data)

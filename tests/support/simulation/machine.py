@@ -297,7 +297,7 @@ class Socket:
     fileno = detach
 
     def send(self, data: memoryview | bytes) -> int:
-        self._world.call()
+        self._world.effect()
         while True:
             if self.outgoing.read_out:
                 raise BrokenPipeError("the other end is closed")
@@ -431,7 +431,7 @@ class System:
         return EventFd(self).descriptor
 
     def eventfd_write(self, descriptor: int, value: int) -> None:
-        self.world.call()
+        self.world.effect()
         if (thing := self.things.get(descriptor)) is not None:
             thing.count += value
             thing.changed.notify()

@@ -16,7 +16,7 @@ def ring_writer(world: World) -> type[RingWriter]:
 
     class Writer(RingWriter):
         def put(self, channel: int, parts: Sequence[Bytes]) -> bool:
-            world.call()
+            world.effect()
             return super().put(channel, parts)
 
     return Writer
@@ -27,8 +27,8 @@ def black_box(world: World) -> type[BlackBox]:
 
     class Box(BlackBox):
         def add(self, record: FiringRecord) -> None:
-            world.call()
+            world.effect()
             super().add(record)
-            world.call()
+            world.effect()
 
     return Box

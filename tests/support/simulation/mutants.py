@@ -39,7 +39,7 @@ class Mutant:
 
 
 class CreditLost(Mutant):
-    """A window does not get back the room of every fourth step that is covered."""
+    """A source does not hear of every fifth step that is done."""
 
     said = "a credit is lost"
 
@@ -47,11 +47,9 @@ class CreditLost(Mutant):
         right = Window.cover
 
         def cover(self: Window, frontier: int) -> None:
-            before = len(self._outstanding)
-            right(self, frontier)
-            covered = getattr(self, "covered", 0) + before - len(self._outstanding)
-            self.covered = covered % 4  # type: ignore[attr-defined]
-            self.count += covered // 4
+            self.heard = getattr(self, "heard", 0) + 1  # type: ignore[attr-defined]
+            if self.heard % 5:
+                right(self, frontier)
 
         return {(Window, "cover"): cover}
 

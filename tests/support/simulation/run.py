@@ -30,8 +30,8 @@ MEGABYTES = 50_000_000
 class Happening:
     """What happens to a run from outside, `at` so many seconds after its sources were released.
 
-    `kill`, `freeze` (for `span` s), `kill_at_call` (at its `call`-th call to the operating system, of the `life`-th
-    process with that label) happen to the process `target`; `stop` asks the supervisor for an orderly end.
+    `kill`, `freeze` (for `span` s) and `kill_before` (before the `effect`-th thing that it does and others can see, of
+    the `life`-th process with that label) happen to the process `target`; `stop` asks for an orderly end.
     """
 
     at: float
@@ -188,8 +188,8 @@ class Simulation:
         life = self._lives[process.label] = self._lives.get(process.label, 0) + 1
         for happening in self._happenings:
             fields = happening.fields
-            if happening.kind == "kill_at_call" and happening.target == process.label and fields["life"] == life:
-                process.dies_at = fields["call"]
+            if happening.kind == "kill_before" and happening.target == process.label and fields["life"] == life:
+                process.dies_at = fields["effect"]
         end = process.on_end
 
         def ended(code: int) -> None:

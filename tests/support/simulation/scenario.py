@@ -176,14 +176,14 @@ def _with_events(plain: Scenario, r: random.Random) -> Scenario:
 
 
 def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happening:
-    at = round(r.random() * 0.4, 4)
-    kinds = ("freeze", "freeze", "kill_at_call", "kill", "stop")
+    at = round(r.random() * 0.4, 4) if r.random() < 0.75 else 0.0
+    kinds = ("freeze", "freeze", "kill_before", "kill", "stop")
     kind, target = r.choice(kinds), r.choice(labels) if r.random() < 0.9 else "@recorder"
     match kind:
         case "freeze":
             return Happening(at, kind, target, {"span": r.choice((0.05, 0.2, 1.0, 2.0, 6.0, FOREVER))})
-        case "kill_at_call":
-            return Happening(0.0, kind, target, {"call": r.randint(1, 1200), "life": r.choice((1, 1, 1, 2))})
+        case "kill_before":
+            return Happening(0.0, kind, target, {"effect": r.randint(1, 150), "life": r.choice((1, 1, 1, 2))})
         case "stop":
             return Happening(at, kind)
         case _:

@@ -40,9 +40,10 @@ class Process:
         self.thawed: list[Callable[[], None]] = []
         self.dead = False
         self.frozen = False
-        self.calls = 0
+        self.effects = 0
+        """Calls that others can see: what it has sent, written, or put where it outlives it."""
         self.dies_at: int | None = None
-        """The call to the operating system at which it is killed."""
+        """The one of those before which it is killed."""
         self.on_line: Callable[[str], None] = lambda text: None
         """Takes what it prints."""
         self.on_end: Callable[[int], None] = lambda code: None
@@ -142,17 +143,25 @@ class World:
         if process.dead:
             raise Killed
         self.calls += 1
-        process.calls += 1
         task.calls += 1
-        if process.calls == process.dies_at:
-            self.kill(process)
-            raise Killed
         if task.calls > MOST_CALLS:
             self.violation = Violation(f"{process.label}: its task {task.name!r} spins")
             self.kill(process)
             raise Killed
         if self._chance() < self._preempt:
             self._park(task, self.latency())
+
+    def effect(self) -> None:
+        """To be called before a task does what others can see: here its process may be killed."""
+        task = self.task
+        if task is None:
+            return
+        self.call()
+        process = task.process
+        process.effects += 1
+        if process.effects == process.dies_at:
+            self.kill(process)
+            raise Killed
 
     def clock(self) -> float:
         """The time, as a task reads it."""
