@@ -161,10 +161,10 @@ def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
     assert result.outcome.seconds < 60.0
 
 
-@pytest.mark.parametrize("first", range(0, 200, 50))
+@pytest.mark.parametrize("first", range(0, 200, 25))
 def test_seeds(first: int, memory: Path) -> None:
     """No hang, no loss without a count, recordings that verify, replays that are equal."""
-    for seed in range(first, first + 50):
+    for seed in range(first, first + 25):
         scenario = scenario_of(seed)
         try:
             check(scenario, memory, replay=seed % 4 == 0)

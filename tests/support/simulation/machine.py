@@ -69,6 +69,9 @@ class Time:
     def time_ns(self) -> int:
         return round((EPOCH + self._world.clock()) * 1e9)
 
+    def monotonic_ns(self) -> int:
+        return round(self._world.clock() * 1e9)
+
     def perf_counter_ns(self) -> int:
         return round(self._world.now * 1e9)
 
