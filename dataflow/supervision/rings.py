@@ -17,9 +17,12 @@ Pairs = Mapping[tuple[str, str], tuple[str, ...]]
 
 
 def pairs_of(graph: Graph, processes: Mapping[str, ProcessPlan]) -> dict[tuple[str, str], tuple[str, ...]]:
-    """Returns which processes are linked."""
+    """Returns which processes are linked: the recorder and the like first.
+
+    A process sends in this order. What it was killed over after that is recorded, whoever else has taken it.
+    """
     found = {}
-    for consumer, process in processes.items():
+    for consumer, process in sorted(processes.items(), key=lambda each: each[1].sink is None):
         taken = taken_keys(graph, process)
         for producer, maker in processes.items():
             if producer != consumer and (keys := taken.intersection(maker.publish)):

@@ -12,7 +12,7 @@ from typing import Any
 
 import dataflow
 
-ENGINE = ("chaos", "feeds", "firing", "process", "records", "recording", "reexecution", "supervision")
+ENGINE = ("chaos", "feeds", "firing", "process", "records", "recording", "reexecution", "supervision", "transport")
 
 Bindings = dict[tuple[str, str], Any]
 """(module, name) → what it stands for."""

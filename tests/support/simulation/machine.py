@@ -8,6 +8,7 @@ the code that ships is replaced, but for the network, the nursery and what a run
 from __future__ import annotations
 
 import os
+import queue
 import select
 import selectors
 import signal
@@ -164,6 +165,50 @@ class Threading:
         self.Lock = lambda: Lock(world)
         self.Event = lambda: Event(world)
         self.Thread = lambda **fields: Thread(world, **fields)
+
+
+class SimpleQueue:
+    """`queue.SimpleQueue`."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._items: deque[Any] = deque()
+        self._waiters = Waiters(world)
+
+    def put(self, item: Any) -> None:
+        self._world.call()
+        self._items.append(item)
+        self._waiters.notify()
+
+    def get(self, timeout: float) -> Any:
+        self._world.call()
+        until = self._world.now + timeout
+        while not self._items:
+            if self._world.now >= until:
+                raise queue.Empty
+            self._waiters.wait(until - self._world.now)
+        return self._items.popleft()
+
+    def get_nowait(self) -> Any:
+        self._world.call()
+        if not self._items:
+            raise queue.Empty
+        return self._items.popleft()
+
+    def empty(self) -> bool:
+        return not self._items
+
+    def qsize(self) -> int:
+        return len(self._items)
+
+
+class Queue:
+    """The module `queue`."""
+
+    Empty = queue.Empty
+
+    def __init__(self, world: World) -> None:
+        self.SimpleQueue = lambda: SimpleQueue(world)
 
 
 class Pipe:
@@ -326,20 +371,6 @@ class WriteEnd:
         self.waiters = (pipe.changed,)
 
 
-class EventFd:
-    """A counter that can be waited for."""
-
-    def __init__(self, world: World) -> None:
-        self.count = 0
-        self.writable = False
-        self.changed = Waiters(world)
-        self.waiters = (self.changed,)
-
-    @property
-    def readable(self) -> bool:
-        return self.count > 0
-
-
 class System:
     """Descriptors, and the module `os`: what is not here is the real one."""
 
@@ -399,22 +430,21 @@ class System:
         elif isinstance(thing, WriteEnd):
             thing.pipe.end_writing()
 
-    def eventfd(self, value: int, flags: int) -> int:
-        return self.open(EventFd(self.world))
+    def eventfd(self, initial: int, flags: int = 0) -> int:
+        return EventFd(self).descriptor
 
-    def eventfd_write(self, descriptor: int, number: int) -> None:
+    def eventfd_write(self, descriptor: int, value: int) -> None:
         self.world.effect()
-        thing: EventFd = self.things[descriptor]
-        thing.count += number
-        self.world.after(self.world.latency(), thing.changed.notify)
+        if (thing := self.things.get(descriptor)) is not None:
+            thing.count += value
+            thing.changed.notify()
 
     def eventfd_read(self, descriptor: int) -> int:
-        self.world.call()
-        thing: EventFd = self.things[descriptor]
+        thing = self.things[descriptor]
         if not thing.count:
             raise BlockingIOError
-        number, thing.count = thing.count, 0
-        return number
+        count, thing.count = thing.count, 0
+        return int(count)
 
     def _exit(self, code: int) -> None:
         task = self.world.task
@@ -474,24 +504,23 @@ class Selectors:
 
 
 class Select:
-    """The module `select`, for handles of processes, and for one eventfd."""
+    """The module `select`, for handles of processes and the one descriptor that an inbox waits for."""
 
     def __init__(self, system: System) -> None:
         self._system = system
 
     def select(self, reading: list[Any], writing: list[Any], odd: list[Any], timeout: float | None) -> Any:
-        if len(reading) == 1 and isinstance(thing := self._system.things.get(reading[0]), EventFd):
-            self._await(thing, timeout)
         if any(isinstance(each, int) and each >= FIRST for each in reading):
-            return [each for each in reading if self._system.things[each].readable], [], []
+            return self._wait([self._system.things[each] for each in reading], timeout), [], []
         return select.select(reading, writing, odd, timeout)
 
-    def _await(self, thing: EventFd, timeout: float | None) -> None:
+    def _wait(self, things: list[Any], timeout: float | None) -> list[Any]:
         world = self._system.world
         world.call()
         until = None if timeout is None else world.now + timeout
-        while not thing.readable and (until is None or world.now < until):
-            thing.changed.wait(None if until is None else until - world.now)
+        while not (ready := [thing for thing in things if thing.readable]) and (until is None or world.now < until):
+            things[0].changed.wait(None if until is None else until - world.now)
+        return ready
 
 
 class Signals:
@@ -506,6 +535,21 @@ class Signals:
         world, process = self._system.world, self._system.things[descriptor].process
         does = {signal.SIGKILL: world.kill, signal.SIGSTOP: world.freeze, signal.SIGCONT: world.thaw}[number]
         world.after(world.latency(), lambda: None if process.dead else does(process))
+
+
+class EventFd:
+    """A counter that processes wait for (eventfd)."""
+
+    def __init__(self, system: System) -> None:
+        self.count = 0
+        self.writable = True
+        self.changed = Waiters(system.world)
+        self.waiters = (self.changed,)
+        self.descriptor = system.open(self)
+
+    @property
+    def readable(self) -> bool:
+        return self.count > 0
 
 
 class Handle:

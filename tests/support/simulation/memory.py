@@ -3,9 +3,23 @@ after."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from dataflow.records.black_box import BlackBox
 from dataflow.records.firing import FiringRecord
+from dataflow.transport.ring import Bytes, RingWriter
 from simulation.world import World
+
+
+def ring_writer(world: World) -> type[RingWriter]:
+    """The writing end of a ring, in this world."""
+
+    class Writer(RingWriter):
+        def put(self, channel: int, parts: Sequence[Bytes]) -> bool:
+            world.effect()
+            return super().put(channel, parts)
+
+    return Writer
 
 
 def black_box(world: World) -> type[BlackBox]:

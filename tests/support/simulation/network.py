@@ -1,53 +1,29 @@
-"""What is outside a simulated run: nobody. Its processes speak through rings, which are real; nobody subscribes.
-
-The memory of rings is shared by the processes of the world as it is by real ones; only the eventfds that wake their
-readers are the simulated machine's. Rings are small, so that a process that is frozen for long misses messages.
-"""
+"""What leaves a simulated machine: nothing. Nobody subscribes from outside, asks, or watches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any
 
-from dataflow.transport import Counters, NetworkConfig, make_ring
-
-RING_BYTES = 1 << 13
-
-
-def small_ring() -> int:
-    """Makes a ring for a few dozen messages."""
-    return make_ring(RING_BYTES)
-
-
-class Publisher:
-    """A publisher to which nobody listens."""
-
-    matched = False
-
-
-class Session:
-    """What a bus shows of its session."""
-
-    def put(self, key: str, payload: bytes) -> None:
-        """Nobody listens."""
+from dataflow.transport.counters import Counters
 
 
 class Bus:
     """The operations of `dataflow.transport.Bus` that a process uses."""
 
-    def __init__(self, config: NetworkConfig) -> None:
-        self.config = config
+    def __init__(self, config: Any) -> None:
         self.counted = Counters()
-        self.session = Session()
+        self.session = SimpleNamespace(put=lambda key, payload: None)
 
-    def publisher(self, stream: str) -> Publisher:
-        return Publisher()
+    def publisher(self, stream: str) -> Any:
+        return SimpleNamespace(matched=False)
 
     def declare_static(self, stream: str, envelope: bytes) -> None:
         """Nobody asks for it."""
 
     def serve(self, key: str, answer: Callable[[Any], object]) -> None:
-        """Nobody asks here."""
+        """Nobody asks."""
 
     def counters(self) -> dict[str, int]:
         return self.counted.as_dict()
@@ -56,12 +32,12 @@ class Bus:
         """There is nothing to close."""
 
 
-class NoTaps:
-    """Nobody watches."""
+class Nobody:
+    """In place of the taps and of the publisher to the outside."""
 
     active = False
 
-    def __init__(self, *_: Any) -> None:
+    def __init__(self, *_: Any, **__: Any) -> None:
         pass
 
     def close(self) -> None:

@@ -15,6 +15,7 @@ from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunFailed, RunReport
 from dataflow.supervision.run import _metadata
 from dataflow.supervision.supervisor import Supervisor
+from dataflow.transport import make_ring
 from simulation import bindings, machine, memory, network, operators
 from simulation.disk import Disk
 from simulation.processes import SUPERVISOR, Nursery
@@ -54,6 +55,7 @@ class Machine:
     slow_disk: float = 0.0
     socket_room: int = 278
     """Messages that fit into a socket pair: 278 on a real machine, with Linux's defaults."""
+    ring_bytes: int = 1 << 20
 
 
 @dataclass(slots=True)
@@ -69,8 +71,6 @@ class Outcome:
     words: list[str] = field(default_factory=list)
     killed: set[str] = field(default_factory=set)
     """Processes that died before their time, whoever killed them."""
-    lost: int = 0
-    """Envelopes that did not reach a process, since it took nothing for too long."""
     disk_full: bool = False
 
 
@@ -85,6 +85,7 @@ class Simulation:
     def __init__(self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str) -> None:
         self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
         self.system = machine.System(self.world, socket_room=machine_.socket_room)
+        self._ring_bytes = machine_.ring_bytes
         self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
         self.outcome = Outcome()
         self._plan, self._happenings, self._mode = plan, happenings, mode
@@ -105,8 +106,6 @@ class Simulation:
             self._play()
         world = self.world
         self.outcome.seconds, self.outcome.turns, self.outcome.calls = world.now, world.turns, world.calls
-        if self.outcome.report is not None:
-            self.outcome.lost = sum(moved.get("unsent", 0) for moved in self.outcome.report.transport.values())
         self.outcome.disk_full = self.disk.full
         return self.outcome
 
@@ -156,8 +155,13 @@ class Simulation:
             (f"{process}.inbox", "os"): system,
             (f"{process}.inbox", "select"): machine.Select(system),
             (f"{process}.operator_process", "Bus"): network.Bus,
-            (f"{process}.operator_process", "TapServer"): network.NoTaps,
+            (f"{process}.operator_process", "TapServer"): network.Nobody,
+            (f"{process}.operator_process", "OutsidePublisher"): network.Nobody,
             (f"{process}.runners", "BlackBox"): memory.black_box(world),
+            ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
+            ("dataflow.transport.ring", "os"): system,
+            (f"{supervision}.rings", "os"): system,
+            (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
             (f"{supervision}.supervisor", "os"): system,
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
@@ -169,9 +173,6 @@ class Simulation:
             (f"{supervision}.nursery", "os"): system,
             (f"{supervision}.nursery", "select"): machine.Select(system),
             (f"{supervision}.nursery", "signal"): machine.Signals(system),
-            (f"{supervision}.rings", "os"): system,
-            (f"{supervision}.rings", "make_ring"): network.small_ring,
-            ("dataflow.transport.ring", "os"): system,
             ("dataflow.process.handed", "BACKLOG"): (1, 1),
             (f"{supervision}.run", "machine_facts"): lambda environment: facts,
             ("dataflow.recording.container", "os"): self.disk,

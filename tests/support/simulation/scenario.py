@@ -102,7 +102,8 @@ class Scenario:
             f"  machine: seed {machine.seed}, pace {machine.pace:g}, gives way {machine.preempt:g}"
             + ("" if machine.room is None else f", disk of {machine.room} bytes")
             + (f", writes take up to {machine.slow_disk:g} s" if machine.slow_disk else "")
-            + (f", sockets hold {machine.socket_room} messages" if machine.socket_room != 278 else ""),
+            + (f", sockets hold {machine.socket_room} messages" if machine.socket_room != 278 else "")
+            + (f", rings of {machine.ring_bytes} bytes" if machine.ring_bytes != 1 << 20 else ""),
         ]
         lines += [f"  {happening}" for happening in self.happenings]
         lines += [f"  {f.at:.4f} s after the release {f.kind} {f.operator} {dict(f.fields)}" for f in self.faults]
@@ -142,7 +143,8 @@ def scenario_of(seed: int) -> Scenario:
         preempt=r.choice((0.0, 0.02, 0.2)),
         room=r.choice((6_000, 12_000)) if r.random() < 0.05 else None,
         slow_disk=r.choice((0.01, 0.2)) if r.random() < 0.1 else 0.0,
-        socket_room=r.choice((278, 4)),
+        socket_room=r.choice((278, 12)),
+        ring_bytes=r.choice((1 << 20, 4096)),
     )
     plain = Scenario(
         seed=seed,
@@ -175,8 +177,8 @@ def _with_events(plain: Scenario, r: random.Random) -> Scenario:
 
 def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happening:
     at = round(r.random() * 0.4, 4) if r.random() < 0.75 else 0.0
-    kind = r.choice(("freeze", "freeze", "kill_before", "kill", "stop"))
-    target = r.choice(labels) if r.random() < 0.9 else "@recorder"
+    kinds = ("freeze", "freeze", "kill_before", "kill", "stop")
+    kind, target = r.choice(kinds), r.choice(labels) if r.random() < 0.9 else "@recorder"
     match kind:
         case "freeze":
             return Happening(at, kind, target, {"span": r.choice((0.05, 0.2, 1.0, 2.0, 6.0, FOREVER))})

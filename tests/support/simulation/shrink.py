@@ -60,7 +60,7 @@ def _smaller(scenario: Scenario) -> Iterator[Scenario]:
     for k in range(len(scenario.faults)):
         yield replace(scenario, faults=scenario.faults[:k] + scenario.faults[k + 1 :])
     machine, plain = scenario.machine, Machine(scenario.machine.seed)
-    for name in ("room", "slow_disk", "socket_room", "pace", "preempt"):
+    for name in ("room", "slow_disk", "socket_room", "ring_bytes", "pace", "preempt"):
         if getattr(machine, name) != getattr(plain, name):
             yield replace(scenario, machine=replace(machine, **{name: getattr(plain, name)}))
     if scenario.policy:
