@@ -2,11 +2,12 @@
 
 usage: python benchmarks/chaos.py [--runs 50] [--first 1] [--duration 10s]
 
-Every run: graphs/chaos/robot.yaml live with cameras at 20 Hz, in one host or a host each by turns, with the faults of
-benchmarks/chaos_plan.yaml, another seed each. In one host operators fail instead of being killed: that would kill the
-simulator too, which takes seconds to build its world again. Then `verify` of its recording, placed the other way.
+Every run: graphs/chaos/robot.yaml live with cameras at 20 Hz, in one process or a process each by turns, with the
+faults of benchmarks/chaos_plan.yaml, another seed each. In one process operators fail instead of being killed: that
+would kill the simulator too, which takes seconds to build its world again. Then `verify` of its recording, in several
+worker processes where it ran in one, and in one where it ran in several.
 
-Drops are those in the firing records; `limit` is the speed that the slowest operator's (in one host: all operators')
+Drops are those in the firing records; `limit` is the speed that the slowest operator's (in one process: all operators')
 own work allows. Prints a row per run and a summary; exit code 1 unless all are identical.
 """
 
@@ -41,12 +42,12 @@ def one(seed: int, placement: str, duration: str, folder: Path) -> tuple[bool, i
     graph = load_graph(GRAPH, settings=[f"duration={duration}", *SETTINGS], live=True)
     path = folder / f"{seed}.mcap"
     content = YAML(typ="safe").load(PLAN.read_text())
-    if placement == "one_host":
+    if placement == "one_process":
         content["faults"] = [{**f, "kind": "raise"} if f["kind"] == "kill" else f for f in content["faults"]]
     faults = plan_of(content, graph, seed=seed)
     report = run(graph, live=True, placement=placement, record=path, overwrite=True, faults=faults)
-    other = "host_each" if placement == "one_host" else "one_host"
-    verified = verify(path, placement=other)
+    together = placement == "one_process"
+    verified = verify(path, jobs=None if together else 1)
     with Recording(path) as recording:
         drops = sum(len(r.drops) for name in graph.nodes for r in recorded_firings(recording, name))
     path.unlink()
@@ -54,7 +55,7 @@ def one(seed: int, placement: str, duration: str, folder: Path) -> tuple[bool, i
     planned = sum(note.startswith("planned fault") for note in report.notes)
     restarts = sum(report.restarts.values())
     work = [c.cpu_ns * 1e-9 for name, c in verified.work.items()]
-    slowest = max(work) if other == "host_each" else sum(work)
+    slowest = max(work) if together else sum(work)
     factor, limit = verified.span / verified.wall, verified.span / slowest
     verdict = "identical" if verified.identical else "DIFFERENT"
     print(
@@ -78,7 +79,7 @@ def main() -> int:
     print(COLUMNS)
     with tempfile.TemporaryDirectory() as folder:
         results = [
-            one(seed, "one_host" if seed % 2 else "host_each", arguments.duration, Path(folder))
+            one(seed, "one_process" if seed % 2 else "process_each", arguments.duration, Path(folder))
             for seed in range(arguments.first, arguments.first + arguments.runs)
         ]
     identical = sum(same for same, *_ in results)

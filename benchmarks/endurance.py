@@ -126,7 +126,9 @@ def main() -> int:
         for row in rows:
             early, late, growth = row["at 60 s, MB"], row["at the end, MB"], row["growth"]
             print(f"{row['process']:18} {early:6.1f} MB {late:8.1f} MB {growth:8.1%}")
-        print(f"\nrestarts: {restarts}; verify: {'identical' if identical else 'NOT IDENTICAL'}; grown: {grown or 'none'}")
+        print(
+            f"\nrestarts: {restarts}; verify: {'identical' if identical else 'NOT IDENTICAL'}; grown: {grown or 'none'}"
+        )
     return 1 if grown or not identical else 0
 
 

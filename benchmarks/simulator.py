@@ -1,18 +1,25 @@
 """Times the simulated robot: whole set-ups against real time, and each sensor by itself.
 
 python benchmarks/simulator.py
+python benchmarks/simulator.py --against TREE    beside another checkout, the two in turns
 """
 
 from __future__ import annotations
 
 import argparse
+import os
+import subprocess
+import sys
 import time
+from pathlib import Path
 from typing import Any
 
 import cv2
 
 from operators.sources import SimulatedRobot
 
+HERE = Path(__file__).resolve().parents[1]
+WORLDS = ("office", "corridor", "table_top")
 VGA = {"width": 640, "height": 480}
 SMALL = {"width": 320, "height": 240}
 NOTHING: dict[str, Any] = {
@@ -50,6 +57,7 @@ SENSORS: dict[str, dict[str, Any]] = {
     "radar": {"radar": {"rate": 10}},
     "landmark sightings": {"landmarks": {"rate": 10}},
     "IMU": {"inertial": {"rate": 100}},
+    "magnetometer": {"magnetometer": {"rate": 100}},
     "wheels": {"wheels": {"rate": 50}},
     "satellite fixes": {"gnss": {"rate": 10}},
     "poses": {"truth": {**NOTHING["truth"], "poses": 10}},
@@ -84,16 +92,43 @@ def timed(params: dict[str, Any], seconds: float, repeats: int) -> tuple[float, 
     return sum(clock), sum(computing), len(clock)
 
 
+def against(other: Path, seconds: float, repeats: int) -> None:
+    """CPU of this checkout over that of another, each in processes of their own, in turns; the least of each counts."""
+    print("| what | world | other, ms of CPU a second | this | ratio |\n| --- | --- | --- | --- | --- |")
+    for name in SETUPS:
+        for world in WORLDS:
+            least: dict[Path, float] = {}
+            for _ in range(repeats):
+                for tree in (other, HERE):
+                    command = [sys.executable, __file__, "--cpu", name, world, "--seconds", str(seconds)]
+                    environment = {**os.environ, "PYTHONPATH": str(tree)}
+                    answer = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+                    least[tree] = min(least.get(tree, float("inf")), float(answer.stdout))
+            row = f"{least[other]:.0f} | {least[HERE]:.0f} | {least[HERE] / least[other]:.2f}"
+            print(f"| {name} | {world} | {row} |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=2, help="simulated time of each run")
     parser.add_argument("--repeats", type=int, default=3, help="runs of each; of every step the fastest counts")
+    parser.add_argument("--against", type=Path, help="another checkout to compare with")
+    parser.add_argument("--cpu", nargs=2, metavar=("SETUP", "WORLD"), help="print the ms of CPU of one and no more")
     arguments = parser.parse_args()
+    if arguments.against is not None:
+        against(arguments.against.resolve(), arguments.seconds, arguments.repeats)
+        return
+    if arguments.cpu is not None:
+        cv2.setNumThreads(1)
+        name, world = arguments.cpu
+        _, cpu, _ = timed({**SETUPS[name], "world": world}, arguments.seconds, 1)
+        print(1000 * cpu / arguments.seconds)
+        return
 
     print("| what | world | threads | ms a second of the world | ms of CPU | x real time | x by CPU |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     for name, params in SETUPS.items():
-        for world in ("office", "corridor", "table_top") if "640x480" in name else ("office",):
+        for world in WORLDS if "640x480" in name else ("office",):
             for threads in (1, 2):
                 cv2.setNumThreads(threads)
                 given = {**params, "world": world, "threads": threads}

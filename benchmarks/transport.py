@@ -1,4 +1,4 @@
-"""Measures the bus between two processes: latency and throughput by message size, network against shared memory.
+"""Measures Zenoh between two processes, as programs outside a run get its streams: latency, throughput by size.
 
 Run `python benchmarks/transport.py`; the last table is in `benchmarks/transport.md`. `--stall` stops the consumer for
 some seconds in mid-stream and counts what it gets.
@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.messages import Image
-from dataflow.transport import Bus, Envelope, Kind, NetworkConfig, decode, reserve_endpoints
+from dataflow.transport import Bus, Envelope, Kind, NetworkConfig, decode, encode, reserve_endpoints
 
 STREAM, ECHO = "bench/source/image", "bench/@/echo"
 SIZES = {"1 KB": (16, 21), "100 KB": (160, 208), "900 KB": (480, 640), "4 MB": (1080, 1296)}
@@ -33,10 +33,8 @@ IMAGES = 8
 ACK = struct.Struct("<QQ")
 
 MODES: dict[str, Mapping[str, Any]] = {
-    "network": {"shared_memory": False},
-    "shared": {"shared_memory": True},
+    "network": {},
     "zenoh-defaults": {
-        "shared_memory": False,
         "zenoh": {
             "transport/link/tx/lease": 10_000,
             "transport/link/tx/keep_alive": 4,
@@ -46,7 +44,6 @@ MODES: dict[str, Mapping[str, Any]] = {
         },
     },
     "zenoh-shm": {
-        "shared_memory": False,
         "zenoh": {
             "transport/shared_memory/enabled": True,
             "transport/shared_memory/mode": "init",
@@ -61,7 +58,7 @@ def consume(mode: str, endpoint: str) -> None:
     inbox: queue.SimpleQueue[Any] = queue.SimpleQueue()
     with Bus(NetworkConfig(connect=(endpoint,), **MODES[mode])) as bus:
         echo = bus.publisher(ECHO)
-        bus.subscribe(STREAM, inbox.put)
+        bus.session.declare_subscriber(STREAM, lambda sample: inbox.put(bytes(sample.payload)))
         count = 0
         while True:
             envelope = decode(inbox.get(timeout=60))
@@ -70,7 +67,7 @@ def consume(mode: str, endpoint: str) -> None:
             if envelope.message is not None:
                 assert envelope.message.data[-1, -1, 0] == envelope.seq % IMAGES
                 count += 1
-            echo.put_bytes(ACK.pack(count, time.monotonic_ns()))
+            echo.put(ACK.pack(count, time.monotonic_ns()))
 
 
 def make_images(shape: tuple[int, int]) -> list[Image]:
@@ -87,24 +84,23 @@ class Producer:
     """Sends images and waits for the consumer's answers."""
 
     def __init__(self, bus: Bus) -> None:
-        self.publisher = bus.publisher(STREAM, consumers=1)
+        self.publisher = bus.publisher(STREAM)
         self.bus = bus
         self.seq = 0
         self.acks: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
         self.answered = 0
-        bus.subscribe(ECHO, lambda payload: self.acks.put(ACK.unpack(payload)))
+        bus.session.declare_subscriber(ECHO, lambda sample: self.acks.put(ACK.unpack(bytes(sample.payload))))
 
     def connect(self) -> None:
-        """Probes until the consumer answers and, where it can, shares memory."""
+        """Probes until the consumer answers."""
         end = time.monotonic() + 20
         while time.monotonic() < end:
-            self.publisher.probe()
+            self.publisher.put(encode(Envelope(Kind.PROBE, STREAM, 0, 0, 0)))
             try:
                 self.acks.get(timeout=0.05)
             except queue.Empty:
                 continue
-            if self.publisher.shares or not self.bus.config.shared_memory:
-                break
+            break
         time.sleep(0.2)
         while not self.acks.empty():
             self.acks.get()
@@ -113,7 +109,7 @@ class Producer:
         """Publishes the next image; when that began (monotonic ns)."""
         image = images[self.seq % IMAGES]
         start = time.monotonic_ns()
-        self.publisher.put(Envelope(Kind.MESSAGE, STREAM, 0, self.seq, image.stamp, image))
+        self.publisher.put(encode(Envelope(Kind.MESSAGE, STREAM, 0, self.seq, image.stamp, image)))
         self.seq += 1
         return start
 
@@ -178,7 +174,7 @@ def run(mode: str, rounds: int, stalled: float) -> list[str]:
                     median, p90, send, rate = measure(producer, shape, rounds)
                     rows.append(f"| {name} | {mode} | {median:.0f} | {p90:.0f} | {send:.0f} | {rate:.0f} |")
                 print(f"{mode}: {bus.counters()}", file=sys.stderr)
-            producer.publisher.put(Envelope(Kind.END, STREAM, 0, producer.seq, producer.seq, reason="done"))
+            producer.publisher.put(encode(Envelope(Kind.END, STREAM, 0, producer.seq, producer.seq, reason="done")))
             child.wait(20)
         finally:
             child.kill()

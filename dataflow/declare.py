@@ -46,7 +46,7 @@ class Declaration:
         source: bool,
         takes: Callable[[Mapping[str, InputPort], Fault], tuple[str, ...]],
     ) -> OperatorSpec:
-        """What was declared, checked as a whole; `takes` reads the arguments of `process()`."""
+        """Returns what was declared, checked as a whole; `takes` reads the arguments of `process()`."""
         period = None if every is None else parse_duration(every)
         window = 0 if tolerance is None else parse_duration(tolerance)
         self._check_timing(bool(merge), window, period, every)

@@ -18,7 +18,7 @@ import hashlib
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, SupportsInt
 
 import numpy as np
 import pydantic
@@ -81,7 +81,7 @@ class Operator:
     external: ClassVar[bool] = False
     """Touches the world (an actuator, a network service): always recorded, never re-executed."""
     __generator: np.random.Generator | None = None
-    __seed: int = 0
+    __seed: SupportsInt = 0
 
     def __init_subclass__(
         cls,
@@ -121,10 +121,10 @@ class Operator:
     def rng(self) -> np.random.Generator:
         """The operator's own random generator: seeded anew before every call, made when it is first asked for."""
         if self.__generator is None:
-            self.__generator = np.random.Generator(np.random.PCG64(self.__seed))
+            self.__generator = np.random.Generator(np.random.PCG64(int(self.__seed)))
         return self.__generator
 
-    def seed_rng(self, seed: int) -> None:
+    def seed_rng(self, seed: SupportsInt) -> None:
         """Gives `rng` a new seed; the runtime does so before every call."""
         self.__generator, self.__seed = None, seed
 
@@ -213,7 +213,7 @@ class Source(Operator, abstract=True):
         raise TypeError(f"{type(self).__name__} is a source without stream()")
 
     def length(self) -> int | None:
-        """How many times `stream()` will yield, if known: for progress bars."""
+        """Tells how many times `stream()` will yield, if known: for progress bars."""
         return None
 
 
@@ -230,12 +230,15 @@ def validate_parameters(cls: type[Operator], params: Mapping[str, Any]) -> pydan
 
 
 def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
-    """What `process()` returned, as port → message; checked against the declared ports. Raises `OutputError`."""
-    spec = operator.spec
-    dynamic = [p for p in spec.outputs.values() if not p.static]
+    """Returns what `process()` returned as port → message, checked against the declared ports. Raises `OutputError`."""
     if returned is None:
         return {}
+    spec = operator.spec
     if isinstance(returned, Message):
+        only = spec.only_output
+        if only is not None and isinstance(returned, only.types):
+            return {only.name: returned}
+        dynamic = [p for p in spec.outputs.values() if not p.static]
         if len(dynamic) != 1:
             raise OutputError(
                 f"{spec.name} returned one {returned.SCHEMA}, but has {len(dynamic)} outputs "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
 
 import pydantic
@@ -175,7 +176,7 @@ class OutputPort:
         return " | ".join(t.SCHEMA or "Message" for t in self.types)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OperatorSpec:
     """All that an operator class declares; everything else (checks, docs, viewer) reads it from here.
 
@@ -196,10 +197,26 @@ class OperatorSpec:
     def triggers(self) -> tuple[InputPort, ...]:
         return tuple(p for p in self.inputs.values() if p.kind == "in")
 
+    @cached_property
+    def absent(self) -> Mapping[str, tuple[()] | None]:
+        """Returns what `process()` is given on each input where that takes no part."""
+        return {name: () if port.kind == "batch" else None for name, port in self.inputs.items()}
+
+    @cached_property
+    def takes_context(self) -> bool:
+        """Tells whether `process()` has a parameter named `context`."""
+        return "context" in self.process_takes
+
+    @cached_property
+    def only_output(self) -> OutputPort | None:
+        """The one output that is not static, where there is exactly one."""
+        dynamic = [port for port in self.outputs.values() if not port.static]
+        return dynamic[0] if len(dynamic) == 1 else None
+
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a firing is besides its messages: given to `process()` when it has a parameter named `context`.
+    """Holds what a firing is besides its messages: given to `process()` when it has a parameter named `context`.
 
     `stale` names the inputs whose message is marked stale, `late` those that hold a message that arrived late (live
     runs only), `tick` says that the timer fired.

@@ -23,7 +23,7 @@ NAMESPACE = "test"
 
 @dataclass(slots=True)
 class Played:
-    """What came of it: the messages of each output port, the firing records, and the drops by (input, reason)."""
+    """Result of a play: the messages of each output port, the firing records, and the drops by (input, reason)."""
 
     outputs: dict[str, list[Message]]
     records: list[FiringRecord]

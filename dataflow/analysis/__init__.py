@@ -1,1 +1,1 @@
-"""What the firing records of a run say about it: latencies from sources to sinks."""
+"""Analyses the firing records of a run: latencies from sources to sinks."""

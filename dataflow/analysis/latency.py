@@ -31,7 +31,7 @@ Place = tuple[str, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """What one operator contributes to a path, on average (ns): its own calls, and the wait in front of them."""
+    """Holds what one operator contributes to a path, on average (ns): its own calls, and the wait in front of them."""
 
     operator: str
     work: float
@@ -164,7 +164,7 @@ def _causing_inputs(node: Node, calls: Sequence[FiringRecord], stamps: Mapping[P
 
 
 def _triggers(node: Node, name: str, calls: Sequence[FiringRecord], stamps: Mapping[Place, int]) -> bool:
-    """Whether an input has, in every firing, messages of its stamp that no firing had before."""
+    """Tells whether an input has, in every firing, messages of its stamp that no firing had before."""
     seen: set[Place] = set()
     for record in calls:
         for place in _places(record.inputs.get(name)):

@@ -24,10 +24,8 @@ class InjectedFault(RuntimeError):
 class OperatorFaults:
     """Faults of one operator: a firing that fails, hangs or begins late, memory that is not given back."""
 
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep
-    ) -> None:
-        self._clock, self._sleep = clock, sleep
+    def __init__(self, clock: Callable[[], float] | None = None, sleep: Callable[[float], None] | None = None) -> None:
+        self._clock, self._sleep = clock or time.monotonic, sleep or time.sleep
         self._fail = False
         self._pause, self._until = 0.0, 0.0
         self._leaked: list[bytearray] = []
@@ -47,7 +45,7 @@ class OperatorFaults:
                 self._leaked += [bytearray(noise) for _ in range(fields["megabytes"])]  # others get a turn in between
 
     def before(self, firing: Firing) -> InjectedFault | None:
-        """What happens before a firing: a pause, and the error with which it is to fail, if any."""
+        """Pauses before a firing as planned; returns the error with which it is to fail, if any."""
         if self._pause and self._clock() < self._until:
             self._sleep(self._pause)
         if not self._fail or firing.kind == "finish":
@@ -57,7 +55,7 @@ class OperatorFaults:
 
 
 class SourceFaults:
-    """What is done to the steps of one source on their way out. `now` is in seconds, never going back."""
+    """Holds what is done to the steps of one source on their way out. `now` is in seconds, never going back."""
 
     def __init__(self) -> None:
         self._silent_until = 0.0

@@ -1,8 +1,8 @@
 """Faults on purpose: a seeded plan of what is to go wrong in a live run, and when.
 
-The plan is pure: it expands to the same timeline for the same seed. What the faults do is up to the supervisor (to
-processes) and the hosts (to operators and sources). All of it is what robots do to software anyway; the run records it,
-and `dataflow verify` repeats the run, faults included.
+The plan is pure: it expands to the same timeline for the same seed. The supervisor carries out faults of
+processes, and the processes those of their operators and sources. All of it is what robots do to software anyway; the
+run records it, and `dataflow verify` repeats the run, faults included.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 
-from dataflow.graph.document import at, parse, plain
+from dataflow.graph.document import parse
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.problems import Place, Problems, did_you_mean
+from dataflow.graph.tree import at, plain
 from dataflow.operator import ParameterError, is_live, validate_parameters
 from dataflow.sync.stamps import parse_duration
 

@@ -19,7 +19,7 @@ from dataflow.supervision.lateness import LATE, held_up_by
 from dataflow.sync import FOREVER, NEVER
 
 if TYPE_CHECKING:
-    from dataflow.client.processes import HostStatus
+    from dataflow.client.processes import ProcessStatus
     from dataflow.transport.registry import RunningGraph
 
 PATHS = 10
@@ -44,7 +44,7 @@ class Row:
     since the last update; `lag` event time (s) behind the foremost, `behind_clock` (s) of a source behind the clock."""
 
     operator: str
-    host: str
+    process: str
     state: str
     firings: int
     emitted: int
@@ -77,10 +77,10 @@ class Board:
     """Turns what processes answer into samples; an operator whose process does not answer keeps its last counts."""
 
     graph: Graph
-    _of: dict[str, HostStatus] = field(default_factory=dict)
+    _of: dict[str, ProcessStatus] = field(default_factory=dict)
     _monitor: HealthMonitor = field(default_factory=HealthMonitor)
 
-    def update(self, statuses: Sequence[HostStatus], now: float) -> Sample:
+    def update(self, statuses: Sequence[ProcessStatus], now: float) -> Sample:
         """`now`: seconds, never going back."""
         answered = {operator for status in statuses for operator in status.restarts}
         self._of |= {operator: status for status in statuses for operator in status.restarts}
@@ -101,12 +101,12 @@ class Board:
         return Sample(rows, _late_sources(rows, told), _notes(rows), paths)
 
 
-def _row(health: Health, status: HostStatus | None, lags: Mapping[str, float | None], answered: bool) -> Row:
+def _row(health: Health, status: ProcessStatus | None, lags: Mapping[str, float | None], answered: bool) -> Row:
     name = health.operator
     behind = None if status is None or name not in status.behind else max(status.behind[name])
     return Row(
         name,
-        "" if status is None else status.host,
+        "" if status is None else status.process,
         health.state if answered else "no answer",
         health.firings,
         health.emitted,
@@ -131,8 +131,8 @@ def _lags(counts: Mapping[str, Sequence[int]]) -> dict[str, float | None]:
     return {name: (front - reached[name]) * 1e-9 if name in reached else None for name in counts}
 
 
-def _late_sources(rows: Sequence[Row], told: Mapping[str, HostStatus]) -> dict[str, str]:
-    """Who is behind the clock, and who holds it up."""
+def _late_sources(rows: Sequence[Row], told: Mapping[str, ProcessStatus]) -> dict[str, str]:
+    """Names the sources that are behind the clock, and who holds each up."""
     said = {}
     for row in rows:
         if row.behind_clock is None or row.behind_clock <= LATE or row.state == "ended":
@@ -176,8 +176,8 @@ def operators_table(rows: Sequence[Row], heading: Text) -> Table:
     """Fits 80 columns: what is nothing of all has no column, nor have processes that are their operators' own."""
     made = _bare(heading)
     made.add_column("operator", overflow="fold", min_width=8)
-    shows_host = any(row.host not in ("", row.operator) for row in rows)
-    if shows_host:
+    shows_process = any(row.process not in ("", row.operator) for row in rows)
+    if shows_process:
         made.add_column("process", overflow="ellipsis", no_wrap=True, style="dim", max_width=10)
     made.add_column("state", no_wrap=True)
     made.add_column("Hz", justify="right", no_wrap=True)
@@ -188,7 +188,7 @@ def operators_table(rows: Sequence[Row], heading: Text) -> Table:
     for row in rows:
         made.add_row(
             Text(row.operator),
-            *((Text("" if row.host == row.operator else row.host),) if shows_host else ()),
+            *((Text("" if row.process == row.operator else row.process),) if shows_process else ()),
             Text(row.state, _STYLES.get(row.state, "")),
             f"{row.rate:.1f}",
             *(_warning(getattr(row, name)) for name in counted),

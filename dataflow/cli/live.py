@@ -51,8 +51,6 @@ Streams = Annotated[
 
 GRAPH_VARIABLE = "DATAFLOW_GRAPH"
 """Environment variable: the running graph that is meant where `--graph` is not given."""
-SHOWN_ELEMENTS = 16
-"""Arrays and lists up to this length are printed whole."""
 HISTORY = 2000
 """Messages of a stream over which its rates are taken, at most."""
 
@@ -141,6 +139,11 @@ def echo(
     limit: Annotated[
         int | None, typer.Option("--count", "-n", metavar="N", help="Stop after so many messages.")
     ] = None,
+    once: Annotated[bool, typer.Option("--once", metavar=FLAG, help="Stop after one message: --count 1.")] = False,
+    fields: Annotated[
+        list[str] | None,
+        typer.Option("--field", "-f", metavar="NAME", help="Print this field alone; may be given several times."),
+    ] = None,
     full: Annotated[bool, typer.Option("--full", metavar=FLAG, help="Print long arrays and lists whole.")] = False,
     graph: GraphName = None,
     wait: Wait = 0.0,
@@ -157,12 +160,17 @@ def echo(
 
       dataflow echo odometry/odometry
       dataflow echo "camera/*" -n 10
+      dataflow echo odometry/odometry --once --field position
       dataflow echo odometry/odometry --json | jq .position
     """
     from dataflow.client.attach import still_runs
 
     if limit is not None and limit < 1:
         raise fail(f"--count {limit}: expected 1 or more")
+    if once:
+        if limit not in (None, 1):
+            raise fail(f"--once is --count 1; --count {limit} contradicts it")
+        limit = 1
     with friendly_errors(), tapped(streams, graph, wait) as (found, client):
         printed = 0
         try:
@@ -175,7 +183,7 @@ def echo(
                 message = taken.decode().message
                 if message is not None:
                     printed += 1
-                    _print_message(taken.stream, message, full=full, json=json)
+                    _print_message(taken.stream, message, fields, full=full, json=json)
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
         finally:
@@ -185,58 +193,48 @@ def echo(
         raise fail(f"the graph ended after {plural(printed, 'message')}, {limit - printed:,} short of --count", code=1)
 
 
-def _print_message(stream: str, message: Message, *, full: bool, json: bool) -> None:
+def _print_message(stream: str, message: Message, asked: list[str] | None, *, full: bool, json: bool) -> None:
+    chosen = _chosen_fields(stream, message, asked)
     if json:
-        values = {name: value for name, value in message.items() if value is not None}
+        values = {name: value for name, value in message.items() if name in chosen}
         line = {"stream": stream, "type": message.SCHEMA, **values}
         print_json_line(line)
         return
+    from dataflow.messages.display import field_text
     from dataflow.sync.stamps import format_stamp
 
     out.print(Text.assemble((stream, "bold"), f"  {format_stamp(message.stamp)}  ", (message.SCHEMA, "dim")))
-    fields = [(name, value) for name, value in message.items() if name != "stamp" and value is not None]
+    fields = [(name, value) for name, value in message.items() if name != "stamp" and name in chosen]
     width = max((len(name) for name, _ in fields), default=0)
     for name, value in fields:
-        out.print(Text.assemble(f"  {name:<{width}}  ", _text(value, full)), soft_wrap=True)
+        out.print(Text.assemble(f"  {name:<{width}}  ", field_text(value, whole=full)), soft_wrap=True)
 
 
-def _text(value: Any, full: bool) -> str:
-    """A field for people: six digits, long arrays by their shape and range, long lists by their beginning."""
-    import numpy as np
+def _chosen_fields(stream: str, message: Message, asked: list[str] | None) -> set[str]:
+    """The fields of a message to print: those asked for, besides its timestamp, or all that are not None."""
+    from dataflow.graph.problems import did_you_mean
 
-    if isinstance(value, np.ndarray):
-        if full or value.size <= SHOWN_ELEMENTS:
-            limit = value.size + 1 if full else SHOWN_ELEMENTS
-            text = np.array2string(value, precision=6, suppress_small=True, threshold=limit, separator=", ")
-            return " ".join(text.split())
-        shape = " × ".join(map(str, value.shape))
-        return f"{value.dtype} {shape}{_range(value)}"
-    if isinstance(value, tuple):
-        shown = value if full or len(value) <= SHOWN_ELEMENTS else value[:5]
-        more = f", … {len(value)} in all" if len(shown) < len(value) else ""
-        return ", ".join(map(str, shown)) + more if value else "none"
-    if isinstance(value, float):
-        return f"{value:.6g}"
-    if isinstance(value, str):
-        return value if full or len(value) <= 200 else f"{value[:200]}… {len(value):,} characters in all"
-    return str(value)
-
-
-def _range(value: Any) -> str:
-    """The smallest and the largest finite element, in words."""
-    import numpy as np
-
-    if value.dtype.kind not in "iuf" or not value.size:
-        return ""
-    finite = value[np.isfinite(value)] if value.dtype.kind == "f" else value
-    return f"  from {finite.min():.4g} to {finite.max():.4g}" if finite.size else "  nothing finite"
+    if not asked:
+        return {name for name, value in message.items() if value is not None}
+    known = {name for name, _ in message.items()}
+    for name in asked:
+        if name not in known:
+            hint = did_you_mean(name, sorted(known), "it has")
+            raise fail(f"{stream} carries {message.SCHEMA}, which has no field {name!r}: {hint}")
+    return {"stamp", *asked}
 
 
 @dataclass(slots=True)
 class _Rate:
-    """What was seen of one stream: arrival (s), stamp (ns), number in the stream and bytes of the latest messages."""
+    """Holds what was seen of one stream: arrival (s), stamp (ns), number in the stream and bytes of the latest
+    messages."""
 
     seen: deque[tuple[float, int, int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY))
+
+    def forget_before(self, time: float) -> None:
+        """Leaves out what arrived before, the newest message aside."""
+        while len(self.seen) > 1 and self.seen[0][0] < time:
+            self.seen.popleft()
 
     def row(self, stream: str) -> dict[str, Any]:
         (t0, s0, n0, _), (t1, s1, n1, _) = self.seen[0], self.seen[-1]
@@ -255,6 +253,10 @@ class _Rate:
 def hz(
     streams: Streams = None,
     duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
+    window: Annotated[
+        float | None,
+        typer.Option("--window", metavar="SECONDS", help="Rates over the last so many seconds."),
+    ] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Json = False,
@@ -268,6 +270,7 @@ def hz(
 
       dataflow hz
       dataflow hz "camera/*" --seconds 5
+      dataflow hz camera/image --window 2
       dataflow hz --seconds 5 --json
     """
     from rich.live import Live
@@ -276,6 +279,8 @@ def hz(
 
     if duration is not None and not 0 < duration < 1e9:
         raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
+    if window is not None and not 0 < window < 1e9:
+        raise fail(f"--window {window:g}: expected seconds, more than 0")
     rates: dict[str, _Rate] = {}
     stopped = False
     with friendly_errors(), tapped(streams, graph, wait) as (found, client):
@@ -291,6 +296,9 @@ def hz(
                     _take_rate(rates, taken)
                 elif not still_runs(found):
                     break
+                if window is not None:
+                    for rate in rates.values():
+                        rate.forget_before(time.monotonic() - window)
                 if live is not None and time.monotonic() >= due:
                     due = time.monotonic() + 0.25
                     live.update(_rate_table(rates, found.namespace), refresh=True)

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli import execution, inspection, latency, live, param, recordings, top, verification, viewing
+from dataflow.cli import inspection, latency, live, param, recordings, replay, run, top, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
@@ -92,8 +92,8 @@ def _add(
     to.command(name, rich_help_panel=panel, help=text, context_settings=dict(settings))(function)
 
 
-_add(execution.run, _MAKE)
-_add(execution.replay, _MAKE)
+_add(run.run, _MAKE)
+_add(replay.replay, _MAKE)
 _add(verification.verify, _MAKE)
 _add(inspection.check, _LOOK)
 _add(inspection.show, _LOOK)
@@ -110,6 +110,8 @@ parameters = typer.Typer(no_args_is_help=True, help="Read and change the paramet
 _add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
 _add(param.get, None, to=parameters)
 _add(param.list_, None, "list", parameters)
+_add(param.dump, None, to=parameters)
+_add(param.load, None, to=parameters)
 app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 

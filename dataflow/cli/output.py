@@ -1,4 +1,5 @@
-"""How commands talk: results on standard output, progress and errors on standard error, one meaning per exit code."""
+"""Output of the commands: results on standard output, progress and errors on standard error, one meaning per exit
+code."""
 
 from __future__ import annotations
 
@@ -110,7 +111,7 @@ def fail(message: str, *, details: str = "", code: int = COULD_NOT_RUN) -> typer
 
 
 def wants_traceback() -> bool:
-    """Whether `dataflow --traceback` or the environment asks for our own tracebacks."""
+    """Tells whether `dataflow --traceback` or the environment asks for our own tracebacks."""
     return os.environ.get(TRACEBACK, "0") not in ("", "0")
 
 
@@ -181,7 +182,7 @@ _FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", 
 
 
 def _about_a_file(details: str) -> bool:
-    """Whether a traceback ends with a file that is missing or cannot be read."""
+    """Tells whether a traceback ends with a file that is missing or cannot be read."""
     last = details.rstrip().rpartition("\n")[2].partition(":")[0]
     return details.startswith("Traceback") and last.rpartition(".")[2] in _FILE_ERRORS
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json as json_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, find_modules_in
+from dataflow.cli.arguments import FLAG, Json, existing, find_modules_in
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, print_json_line, say, table
 
@@ -40,7 +41,7 @@ def set_(
       dataflow param set detector.score_threshold 0.5
       dataflow param set front/cloud.stride 4 --graph two_cameras
     """
-    from dataflow.client.processes import NoAnswer, Refused, hosts_of
+    from dataflow.client.processes import NoAnswer, Refused, processes_of
 
     _check(timeout)
     with friendly_errors():
@@ -49,9 +50,9 @@ def set_(
         if not name:
             raise fail(f"{parameter!r} names no parameter: write {operator}.NAME")
         wanted = _value(value)
-        with hosts_of(found) as hosts:
+        with processes_of(found) as processes:
             try:
-                taken = hosts.set_parameter(operator, name, wanted, timeout)
+                taken = processes.set_parameter(operator, name, wanted, timeout)
             except (Refused, NoAnswer) as error:
                 raise fail(str(error), code=DIFFERENT) from None
     if json:
@@ -141,6 +142,100 @@ def list_(
     _say_who_is_missing(operators, values, timeout)
 
 
+def dump(
+    file: Annotated[
+        Path | None, typer.Argument(metavar="FILE", help="A YAML file to write. Default: print it.")
+    ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", metavar=FLAG, help="Also those that cannot change while the graph runs.")
+    ] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", metavar=FLAG, help="Replace a file that exists.")] = False,
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    timeout: Timeout = 5.0,
+) -> None:
+    """Write the values that parameters have now as YAML: operator, name, value. `param load` sets them again.
+
+    Exit codes: 0 all answered; 1 an operator did not; 2 no such graph.
+
+    Examples:
+
+      dataflow param dump
+      dataflow param dump tuned.yaml
+    """
+    if file is not None and file.exists() and not overwrite:
+        raise fail(f"{file} exists; name another file, or replace it with --overwrite")
+    with friendly_errors():
+        operators, _, values = _asked(None, graph, wait, timeout)
+    lines: list[str] = []
+    for operator, parameters in values.items():
+        shown = {name: p.value for name, p in parameters.items() if p.live or every}
+        if shown:
+            lines.append(f"{json_module.dumps(operator, ensure_ascii=False)}:")
+            lines += [f"  {n}: {json_module.dumps(jsonable(v), ensure_ascii=False)}" for n, v in shown.items()]
+    text = "\n".join(lines) + "\n" if lines else "{}\n"
+    if file is None:
+        out.print(Text(text), end="", soft_wrap=True)
+    else:
+        with friendly_errors():
+            file.write_text(text, encoding="utf-8")
+    _say_who_is_missing(operators, values, timeout)
+
+
+def load(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="YAML as `param dump` writes it.")],
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+    timeout: Timeout = 5.0,
+) -> None:
+    """Set the parameters that a file names, as far as their values differ.
+
+    Names are checked before anything is changed. It stops at the first value that is refused.
+
+    Exit codes: 0 all set; 1 refused, or nobody answered; 2 no such file, graph, operator or parameter.
+
+    Examples:
+
+      dataflow param load tuned.yaml
+    """
+    from dataflow.client.processes import NoAnswer, Refused, processes_of
+    from dataflow.graph.problems import did_you_mean
+
+    with friendly_errors():
+        wanted = _read_values(existing(file, "a YAML file of parameters"))
+        found = running_graph(graph, wait)
+        for operator in wanted:
+            _split(operator, _graph(found))
+        _check(timeout)
+        with processes_of(found) as processes:
+            present = processes.parameters(list(wanted), timeout)
+            _say_who_is_missing(list(wanted), present, timeout)
+            changes = []
+            for operator, values in wanted.items():
+                for name, value in values.items():
+                    if name not in present[operator]:
+                        known = did_you_mean(name, present[operator], "its parameters")
+                        raise fail(f"{file}: {operator!r} has no parameter {name!r}: {known}")
+                    if jsonable(present[operator][name].value) != value:
+                        changes.append((operator, name, value))
+            for operator, name, value in changes:
+                try:
+                    taken = processes.set_parameter(operator, name, value, timeout)
+                except (Refused, NoAnswer) as error:
+                    raise fail(str(error), code=DIFFERENT) from None
+                out.print(Text(f"{operator}.{name} = {_text(taken)}"), soft_wrap=True)
+    if not changes:
+        say("every parameter has the value of the file already")
+
+
+def _read_values(file: Path) -> dict[str, dict[str, Any]]:
+    """Values by operator and parameter."""
+    values = _value(file.read_text(encoding="utf-8"), str(file))
+    if not isinstance(values, dict) or not all(isinstance(v, dict) for v in values.values()):
+        raise fail(f"{file}: expected a mapping from operators to their parameters, as `param dump` writes it")
+    return values
+
+
 def _check(timeout: float) -> None:
     if not 0 < timeout < 1e6:
         raise fail(f"--timeout {timeout:g}: expected seconds, more than 0")
@@ -162,7 +257,8 @@ def _split(word: str, graph: Graph) -> tuple[str, str]:
     return operator, name
 
 
-def _value(text: str) -> Any:
+def _value(text: str, shown: str = "") -> Any:
+    """The YAML value of a text; `shown` is how errors call it, by default the text itself."""
     import msgpack
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
@@ -170,13 +266,13 @@ def _value(text: str) -> Any:
     try:
         value = YAML(typ="safe", pure=True).load(text)
     except (YAMLError, ValueError) as error:
-        raise fail(f"{text!r} is no YAML value: {str(error).splitlines()[0]}") from None
+        raise fail(f"{shown or repr(text)} is no YAML value: {str(error).splitlines()[0]}") from None
     try:
         msgpack.packb(value)
     except (TypeError, ValueError, OverflowError):
         raise fail(
-            f"{text!r} cannot be the value of a parameter: expected a text, true, false, a number of at most 64 bits, "
-            "or a list or mapping of these"
+            f"{shown or repr(text)} cannot be the value of a parameter: expected a text, true, false, a number of at "
+            "most 64 bits, or a list or mapping of these"
         ) from None
     return value
 
@@ -185,15 +281,15 @@ def _asked(
     word: str | None, name: str | None, wait: float, timeout: float
 ) -> tuple[list[str], str, dict[str, dict[str, Parameter]]]:
     """The operators that were asked, the parameter (or none), and what they answered."""
-    from dataflow.client.processes import hosts_of
+    from dataflow.client.processes import processes_of
 
     _check(timeout)
     found = running_graph(name, wait)
     graph = _graph(found)
     operator, parameter = ("", "") if word is None else _split(word, graph)
     operators = [operator] if operator else list(graph.nodes)
-    with hosts_of(found) as hosts:
-        return operators, parameter, hosts.parameters(operators, timeout)
+    with processes_of(found) as processes:
+        return operators, parameter, processes.parameters(operators, timeout)
 
 
 def _say_who_is_missing(operators: list[str], values: dict[str, Any], timeout: float) -> None:

@@ -79,7 +79,7 @@ class RunDisplay:
         return None, 0.0
 
     def reached(self, status: Status) -> str:
-        """How far it has come, in words."""
+        """Tells how far it has come, in words."""
         total, completed = self.fraction(status)
         if self.span is not None and total is not None:
             return f"{completed:.1f} of {total:.1f} s"
@@ -114,7 +114,7 @@ class RunDisplay:
             rate = self._rates.of(name, counts.firings or counts.emitted, now)
             table.add_row(
                 Text(name),
-                Text(status.host_of.get(name, "")),
+                Text(status.process_of.get(name, "")),
                 count(counts.firings) if counts.firings else "",
                 "" if rate is None else f"{rate:.1f}",
                 count(counts.emitted) if counts.emitted else "",
@@ -139,7 +139,7 @@ def _share(nanoseconds: int, elapsed: float) -> str:
 
 
 def _lag(counts: OperatorCounts, front: int | None) -> str:
-    """How far an operator is behind the foremost one, in event time."""
+    """Tells how far an operator is behind the foremost one, in event time."""
     if counts.done == FOREVER:
         return "done"
     if counts.done == NEVER or front is None:

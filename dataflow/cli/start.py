@@ -112,7 +112,7 @@ def _say_unwritable(error: OutputFailed) -> None:
 
 
 def _discard_output() -> None:
-    """What could not be written is not tried again when the interpreter ends."""
+    """Keeps the interpreter from trying again at its end what could not be written."""
     null = os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
     os.close(null)

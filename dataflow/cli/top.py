@@ -15,7 +15,7 @@ from dataflow.cli.output import INTERRUPTED, err, fail, friendly_errors, out, pr
 
 if TYPE_CHECKING:
     from dataflow.cli.board import Sample
-    from dataflow.client.processes import Hosts
+    from dataflow.client.processes import Processes
     from dataflow.transport.registry import RunningGraph
 
 ANSWER_WITHIN = 1.0
@@ -52,52 +52,52 @@ def top(
       dataflow top | grep detector
       dataflow top --json
     """
-    from dataflow.client.processes import hosts_of
+    from dataflow.client.processes import processes_of
 
     if not 0.05 <= every < 1e6:
         raise fail(f"--every {every:g}: expected seconds, 0.05 or more")
     with friendly_errors():
         found = running_graph(graph, wait)
-        with hosts_of(found) as hosts:
-            hosts.connected(len(found.endpoints), CONNECT_WITHIN)
+        with processes_of(found) as processes:
+            processes.connected(len(found.endpoints), CONNECT_WITHIN)
             try:
                 if once or json:
-                    _print_one(found, hosts, every, json=json)
+                    _print_one(found, processes, every, json=json)
                 elif out.is_terminal:
-                    _follow(found, hosts, every)
+                    _follow(found, processes, every)
                 else:
-                    _print_lines(found, hosts, every)
+                    _print_lines(found, processes, every)
             except KeyboardInterrupt:
                 raise typer.Exit(INTERRUPTED) from None
     if not (once or json):
         err.print(Text(f"{found.name} has ended"))
 
 
-def _samples(found: RunningGraph, hosts: Hosts, every: float, *, latencies: bool = True) -> Iterator[Sample]:
+def _samples(found: RunningGraph, processes: Processes, every: float, *, latencies: bool = True) -> Iterator[Sample]:
     """Samples of a running graph, the first after `every` seconds, until it ends; one at least."""
     from dataflow.cli.board import Board
     from dataflow.client.attach import graph_of, still_runs
 
     board = Board(graph_of(found))
-    board.update(hosts.statuses(ANSWER_WITHIN), time.monotonic())
+    board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
     while True:
         time.sleep(every)
-        yield board.update(hosts.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
+        yield board.update(processes.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
         if not still_runs(found):
             return
 
 
-def _print_one(found: RunningGraph, hosts: Hosts, every: float, *, json: bool) -> None:
+def _print_one(found: RunningGraph, processes: Processes, every: float, *, json: bool) -> None:
     from dataflow.cli.board import as_json, shown
 
-    sample = next(_samples(found, hosts, every))
+    sample = next(_samples(found, processes, every))
     if json:
         print_json({"graph": found.name, **as_json(sample)})
     else:
         out.print(shown(sample, found))
 
 
-def _follow(found: RunningGraph, hosts: Hosts, every: float) -> None:
+def _follow(found: RunningGraph, processes: Processes, every: float) -> None:
     """Shows one table, which changes; the last one stays."""
     from rich.live import Live
 
@@ -105,20 +105,20 @@ def _follow(found: RunningGraph, hosts: Hosts, every: float) -> None:
 
     last: Any = None
     with Live(console=out, auto_refresh=False, transient=True) as live:
-        for sample in _samples(found, hosts, every):
+        for sample in _samples(found, processes, every):
             last = shown(sample, found)
             live.update(last, refresh=True)
     if last is not None:
         out.print(last)
 
 
-def _print_lines(found: RunningGraph, hosts: Hosts, every: float) -> None:
+def _print_lines(found: RunningGraph, processes: Processes, every: float) -> None:
     """Prints a heading once, then a line for each operator at every update; a note when a source falls behind."""
     from dataflow.cli.board import heading, line
 
     printed: Sequence[str] = ()
     behind: Mapping[str, str] = {}
-    for sample in _samples(found, hosts, every, latencies=False):
+    for sample in _samples(found, processes, every, latencies=False):
         if not printed:
             out.print(Text(heading(sample)), soft_wrap=True)
         printed = [line(row, sample, time.time() - found.started) for row in sample.rows]

@@ -98,7 +98,7 @@ def print_many(console: Console, all_checked: Sequence[Checked]) -> None:
 
 
 def reservations(checked: Checked) -> Iterator[str]:
-    """What is to be known of a recording besides verdicts: where it was cut, and what it lacks."""
+    """Returns what is to be known of a recording besides verdicts: where it was cut, and what it lacks."""
     if checked.report is None:
         return
     if said := _cut(checked.report):
@@ -140,7 +140,7 @@ def print_completion(console: Console, made: Completion) -> None:
 
 
 def explain(checked: Checked, judged: Judged) -> Iterator[str]:
-    """What there is to say about one operator besides its verdict."""
+    """Returns what there is to say about one operator besides its verdict."""
     report = checked.report
     assert report is not None
     yield from _changed(s for s in report.stored if s.maker == judged.operator)
@@ -178,7 +178,7 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
 
 
 def _cut(report: VerifyReport) -> str:
-    """Why a recording tells of its run only up to a cut; nothing where it tells of all."""
+    """Tells why a recording tells of its run only up to a cut; nothing where it tells of all."""
     if report.torn:
         return "the recording has no proper end: verified is what its writer had stored when it died"
     return "the run did not end in order: verified is what was recorded until then" if report.cut else ""
@@ -193,7 +193,7 @@ def _changed(streams: Iterable[StoredStream]) -> Iterator[str]:
 
 
 def _stand_in(s: StandIn) -> Iterator[str]:
-    """What is not in order in the books of a source, and what its streams lack."""
+    """Lists what is not in order in the books of a source, and what its streams lack."""
     if s.lost_records:
         yield f"{s.operator}: {plural(s.lost_records, 'firing')} after a gap in its firing records: records are lost"
     if s.unaccounted:
@@ -204,7 +204,7 @@ def _stand_in(s: StandIn) -> Iterator[str]:
 
 
 def _notes(report: VerifyReport) -> Iterator[str]:
-    """What is to be known of the streams that were not made again."""
+    """Returns what is to be known of the streams that were not made again."""
     for stand_in in report.stand_ins:
         yield from _stand_in(stand_in)
         if stand_in.missing:
@@ -224,7 +224,7 @@ def _number(place: tuple[int, int] | None) -> str:
 
 
 def _left_out(v: Verification) -> Iterator[str]:
-    """What could not be repeated, and what the recording lacks."""
+    """Returns what could not be repeated, and what the recording lacks."""
     if v.lost_records:
         yield f"{v.operator}: {plural(v.lost_records, 'firing')} could not be repeated (records before them are lost)"
     if v.unaccounted:
@@ -242,7 +242,7 @@ def _left_out(v: Verification) -> Iterator[str]:
 
 
 def fact_lines(report: VerifyReport) -> Iterator[str]:
-    """What differs between the machine that recorded and this one, for beside a difference."""
+    """Returns what differs between the machine that recorded and this one, for beside a difference."""
     if not report.facts:
         yield "machine, libraries, threads and devices are as when it was recorded"
     for fact, then, now in report.facts:

@@ -18,7 +18,6 @@ from dataflow.cli.arguments import (
     find_modules_in,
     output_file,
 )
-from dataflow.cli.execution import Quiet
 from dataflow.cli.output import (
     COULD_NOT_RUN,
     DIFFERENT,
@@ -30,6 +29,7 @@ from dataflow.cli.output import (
     print_json,
     say,
 )
+from dataflow.cli.run_options import Quiet
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -57,7 +57,7 @@ def types_of(graph: Graph) -> TypeOf:
 
 
 def still_runs(found: RunningGraph) -> bool:
-    """Whether that very run goes on."""
+    """Tells whether that very run goes on."""
     return any(g.pid == found.pid and g.started == found.started for g in running())
 
 

@@ -1,4 +1,4 @@
-"""Asking the hosts of a running graph: how far their operators are, and what their parameters are."""
+"""Asking the processes of a running graph: how far their operators are, and what their parameters are."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ from dataflow.transport.publisher import BusError
 from dataflow.transport.registry import RunningGraph
 
 AGAIN_AFTER = 0.05
-"""Seconds until a host that is not there (yet, or again) is asked once more."""
+"""Seconds until a process that is not there (yet, or again) is asked once more."""
 CLOSE_WITHIN = 0.5
 
 
 class NoAnswer(LookupError):
-    """No host answered for an operator in time."""
+    """No process answered for an operator in time."""
 
 
 class Refused(ValueError):
-    """The host of an operator refuses a parameter: says why."""
+    """The process of an operator refuses a parameter: says why."""
 
 
 @dataclass(frozen=True, slots=True)
-class HostStatus:
-    """What one host says of its operators.
+class ProcessStatus:
+    """Status that one process gives of its operators.
 
     `counts`: per operator firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns).
     `restarts`: how often each was restarted; `ended`: those that are through. `waits`: per operator how many, by
@@ -39,7 +39,7 @@ class HostStatus:
     it was read, and when it was sent. `firings`: batches of firing records, where they were asked for.
     """
 
-    host: str
+    process: str
     counts: Mapping[str, Sequence[int]]
     restarts: Mapping[str, int]
     ended: frozenset[str]
@@ -56,14 +56,14 @@ class Parameter:
     live: bool
 
 
-class Hosts:
-    """The hosts of one running graph. Every call waits for at most `timeout` seconds."""
+class Processes:
+    """The processes of one running graph. Every call waits for at most `timeout` seconds."""
 
     def __init__(self, bus: Bus, namespace: str) -> None:
         self._bus, self._namespace = bus, namespace
 
     def connected(self, number: int, timeout: float) -> bool:
-        """Whether so many hosts are reached by now."""
+        """Tells whether so many processes are reached by now."""
         deadline = time.monotonic() + timeout
         while len(self._bus.peers()) < number:
             if time.monotonic() > deadline:
@@ -71,14 +71,14 @@ class Hosts:
             time.sleep(AGAIN_AFTER / 5)
         return True
 
-    def statuses(self, timeout: float, *, firings: bool = False) -> list[HostStatus]:
-        """Of the hosts that answer, also while their operators are at work. `firings`: with the last ones."""
+    def statuses(self, timeout: float, *, firings: bool = False) -> list[ProcessStatus]:
+        """Of the processes that answer, also while their operators are at work. `firings`: with the last ones."""
         asked = msgpack.packb({"firings": True}) if firings else b""
         answers = self._bus.ask(runtime_key(self._namespace, "status", "**"), asked, timeout=timeout)
-        return sorted(map(_status, answers), key=lambda status: status.host)
+        return sorted(map(_status, answers), key=lambda status: status.process)
 
     def parameters(self, operators: Iterable[str], timeout: float) -> dict[str, dict[str, Parameter]]:
-        """By operator, of those whose hosts answer: between two firings."""
+        """By operator, of those whose processes answer: between two firings."""
         wanted = list(operators)
         key = wanted[0] if len(wanted) == 1 else "**"
         answers: dict[str, dict[str, Parameter]] = {}
@@ -109,10 +109,10 @@ class Hosts:
             time.sleep(AGAIN_AFTER)
 
 
-def _status(answer: bytes) -> HostStatus:
+def _status(answer: bytes) -> ProcessStatus:
     said = msgpack.unpackb(answer, raw=False)
-    return HostStatus(
-        said["host"],
+    return ProcessStatus(
+        said["process"],
         said["counts"],
         said["restarts"],
         frozenset(said["ended"]),
@@ -123,11 +123,11 @@ def _status(answer: bytes) -> HostStatus:
 
 
 @contextlib.contextmanager
-def hosts_of(found: RunningGraph) -> Iterator[Hosts]:
-    """A connection to the hosts of a running graph, which are reached one after the other from now on."""
+def processes_of(found: RunningGraph) -> Iterator[Processes]:
+    """A connection to the processes of a running graph, which are reached one after the other from now on."""
     bus = Bus(NetworkConfig(connect=found.endpoints))
     try:
-        yield Hosts(bus, found.namespace)
+        yield Processes(bus, found.namespace)
     finally:
         closing = threading.Thread(target=_close, args=(bus,), daemon=True)
         closing.start()
@@ -135,5 +135,5 @@ def hosts_of(found: RunningGraph) -> Iterator[Hosts]:
 
 
 def _close(bus: Bus) -> None:
-    with contextlib.suppress(BusError):  # a host that is stopped does not take leave; who asked need not wait for it
+    with contextlib.suppress(BusError):  # a process that is stopped does not take leave; who asked need not wait for it
         bus.close()

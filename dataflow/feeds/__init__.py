@@ -1,1 +1,1 @@
-"""What puts messages into a graph: windows, sources, recordings."""
+"""Feeds put messages into a graph: windows, sources, recordings."""

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dataflow.feeds.promises import promises
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter
 from dataflow.firing.work import Work
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import Emission
-from dataflow.sync import NEVER, Entry
+from dataflow.sync import FOREVER, NEVER, Entry
 
 
 @dataclass(slots=True)
@@ -20,11 +21,22 @@ class _LoggedStream:
     name: str
     node: str
     final: int
+    promises: Sequence[int] | None = None
+    """How far it may be promised by the number of messages given; None where its clock never went back."""
     promised: int = NEVER
     ended: bool = False
     incarnation: int = 0
     count: int = 0
     digest: StreamDigest = field(default_factory=StreamDigest)
+
+    def may_promise(self, frontier: int) -> int:
+        """Returns as much of a promise as the messages to come allow."""
+        return frontier if self.promises is None else min(frontier, self.promises[self.count])
+
+    @property
+    def is_over(self) -> bool:
+        """Tells whether all its messages were given, as far as that is known before the recording has been read."""
+        return self.promises is None or self.count == len(self.promises) - 1
 
 
 class LogFeed:
@@ -32,8 +44,8 @@ class LogFeed:
 
     `streams` maps each stream to the node that made it. `finals` holds the stamps that streams ended with in the
     recorded run, where known. `start` and `end` (ns, inclusive) cut the recording; static streams are always given.
-    Without `promises` nothing is said of stamps to come, so that they may go back, as after a jump of a clock: enough
-    for operators that are driven by their records.
+    A stream whose clock went back in the recorded run begins its next incarnation where that one did: what it promises
+    holds all the same (`dataflow.feeds.promises`).
     """
 
     def __init__(
@@ -46,31 +58,39 @@ class LogFeed:
         finals: Mapping[str, int],
         start: int | None = None,
         end: int | None = None,
-        promises: bool = True,
     ) -> None:
-        self.recording, self.emitter, self._promises = recording, emitter, promises
+        self.recording, self.emitter = recording, emitter
         self._ports = ports
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
         self._streams = {
-            name: _LoggedStream(name, node, self._final(name, finals, end))
+            name: _LoggedStream(name, node, self._final(name, finals, end), self._promises(name, start, end))
             for name, node in streams.items()
             if name not in self._static
         }
+        self._first_end = self._least_final()
         self._nodes = dict(streams)
         self._messages = iter(recording.messages(streams=list(streams), start=start, end=end))
         self._step: list[Recorded] = []
         self._following: Recorded | None = None
         self.last = NEVER
-        self.firings = 0
+        self.firings = self.emitted = 0
         self.ended = False
         self.work = Work()
         self.static_digests: dict[str, StreamDigest] = {}
 
     def _final(self, name: str, finals: Mapping[str, int], end: int | None) -> int:
         last = self.recording.streams[name].last
-        final = finals.get(name, last if last is not None else NEVER)
+        final = max(finals.get(name, NEVER), NEVER if last is None else last)
         return final if end is None else min(final, end)
+
+    def _least_final(self) -> int:
+        return min((state.final for state in self._streams.values() if not state.ended), default=FOREVER)
+
+    def _promises(self, name: str, start: int | None, end: int | None) -> Sequence[int] | None:
+        if self.recording.streams[name].incarnations < 2:
+            return None
+        return promises(list(self.recording.stamps(name, start, end)))
 
     def setup(self) -> None:
         """Gives the static streams, and ends the ones that hold nothing."""
@@ -83,6 +103,7 @@ class LogFeed:
             self.static_digests.setdefault(item.stream, StreamDigest()).update(digest)
             entry = Entry(item.message.stamp, item.message, item.seq, item.incarnation, digest, item.stream)
             self.emitter.message(item.stream, entry)
+            self.emitted += 1
             emitted[self._nodes[item.stream]][item.stream] = Emission(item.seq, item.message.stamp, digest)
         for stream in sorted(self._static):
             self.emitter.end(stream, None, "static")
@@ -119,7 +140,7 @@ class LogFeed:
             digest = item.message.digest()
             state.digest.update(digest)
             state.count += 1
-            state.promised, state.incarnation = stamp, item.incarnation
+            state.promised, state.incarnation = max(state.promised, stamp), item.incarnation
             nbytes += item.message.nbytes()
             self.emitter.message(
                 item.stream, Entry(stamp, item.message, item.seq, item.incarnation, digest, item.stream)
@@ -127,6 +148,7 @@ class LogFeed:
             by_node.setdefault(state.node, {})[item.stream] = Emission(item.seq, stamp, digest)
         self.last = stamp
         self.firings += 1
+        self.emitted += len(step)
         started = time.time_ns()
         for node, emitted in by_node.items():
             self._records[node].add("fire", stamp, started, outputs=tuple(emitted.get(s) for s in self._ports[node]))
@@ -134,20 +156,19 @@ class LogFeed:
 
     def promise(self) -> None:
         """Every stream of a log is known up to the last stamp that was read, so sparse streams hold nobody up."""
-        if not self._promises:
-            return
         self._end_before(self.last)
         for state in self._streams.values():
-            if not state.ended and state.promised < self.last:
-                state.promised = self.last
-                self.emitter.frontier(state.name, self.last)
+            if not state.ended and state.promised < (frontier := state.may_promise(self.last)):
+                state.promised = frontier
+                self.emitter.frontier(state.name, frontier)
 
     def _end_before(self, stamp: int) -> None:
-        if not self._promises:
+        if stamp <= self._first_end:
             return
         for state in self._streams.values():
-            if not state.ended and state.final < stamp:
+            if not state.ended and state.is_over and state.final < stamp:
                 self._end(state, state.final, "end of stream")
+        self._first_end = self._least_final()
 
     def _end(self, state: _LoggedStream, final: int, reason: str) -> None:
         state.ended = True

@@ -25,7 +25,7 @@ class Arrival(NamedTuple):
 
 
 class AdmissionQueue:
-    """What waits in front of the triggers of one operator, a queue for each stream.
+    """Queues in front of the triggers of one operator, one for each stream.
 
     At most `size` messages a stream: of more, policy `newest` drops the oldest and `oldest` the arriving one; `block`
     drops none, since flow control holds the producer back. What is dropped goes to `log`.
@@ -92,7 +92,7 @@ def dropped(input: str, stream: str, entry: Entry, reason: DropReason) -> Drop:
 
 
 class Patience:
-    """How long a decision has waited, and which inputs it need not wait for any longer.
+    """Measures how long a decision has waited, and which inputs it need not wait for any longer.
 
     A decision waits from when it came up, and never before event time has reached its stamp: a tick that lies ahead
     cannot be late. A static stream is waited for without a limit, since nothing takes its place.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from dataflow.firing.failure import RAISED, InputMutated, OperatorFailure
-from dataflow.firing.seeding import VERSION, change_seed, firing_seed, seed_generators
+from dataflow.firing.seeding import VERSION, FiringSeed, change_seed, firing_seed, seed_generators
 from dataflow.firing.shared_generators import AT_WORK
 from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.firing.threads import limit_threads_again
@@ -30,6 +30,7 @@ class Calls:
 
     def __init__(self, node: Node, operator: Operator, seed: int, *, version: int = VERSION) -> None:
         self.node, self.operator, self.seed, self.version = node, operator, seed, version
+        self._seeded_by = f"{seed}/{node.name}/"
 
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
@@ -52,11 +53,16 @@ class Calls:
             raise OperatorFailure(self.node.name, "static_outputs()", error) from error
 
     def process(self, firing: Firing) -> dict[str, Message]:
-        """What `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
+        """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
         AT_WORK.fires = True
-        with AT_WORK:
-            self._seed(firing_seed(self.seed, self.node.name, firing.stamp))
+        AT_WORK.begun += 1
+        try:
+            seed = FiringSeed(self._seeded_by, firing.stamp)
+            seed_generators(seed)
+            self.operator.seed_rng(seed)
             return outputs_of(self.operator, _call(self.operator, firing))
+        finally:
+            AT_WORK.ended += 1
 
     def reset(self, input: str, place: Place) -> None:
         """`on_reset()`. Raises what the operator raises."""
@@ -94,7 +100,7 @@ class Calls:
             raise OperatorFailure(self.node.name, "restore()", error) from error
 
     def summary(self, place: Place) -> dict[str, float | int | str]:
-        """What the operator sums up, as plain values. Raises `OperatorFailure`."""
+        """Returns what the operator sums up, as plain values. Raises `OperatorFailure`."""
         with AT_WORK:
             self._seed_change("summary", place)
             return summary_of(self.operator, self.node.name)
@@ -119,7 +125,7 @@ class Calls:
 
 
 def summary_of(operator: Operator, name: str) -> dict[str, float | int | str]:
-    """What an operator sums up, as plain values. Raises `OperatorFailure`."""
+    """Returns what an operator sums up, as plain values. Raises `OperatorFailure`."""
     try:
         found = dict(operator.summary())
         return {str(key): item if isinstance(item, str) else np.asarray(item).item() for key, item in found.items()}
@@ -156,17 +162,18 @@ def entries_of(given: InputValue) -> Sequence[Entry]:
 def _call(operator: Operator, firing: Firing) -> Outputs:
     if firing.kind == "finish":
         return operator.finish()
-    arguments: dict[str, Any] = {
-        name: _value_of(firing.inputs.get(name, () if port.kind == "batch" else None))
-        for name, port in operator.spec.inputs.items()
-    }
-    if "context" in operator.spec.process_takes:
+    arguments: dict[str, Any] = {}
+    given = firing.inputs
+    for name, absent in operator.spec.absent.items():
+        value = given.get(name, absent)
+        arguments[name] = value.value if value.__class__ is Entry else _value_of(value)
+    if operator.spec.takes_context:
         arguments["context"] = Context(firing.stamp, firing.tick, firing.stale, firing.late)
     return operator.process(**arguments)
 
 
 def _value_of(given: InputValue) -> Any:
-    """What `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
+    """Returns what `process()` gets: a message, None, a tuple of messages, or a dict from stream to message."""
     match given:
         case None:
             return None

@@ -37,6 +37,8 @@ class LiveRunner(OperatorRunner):
     new incarnation. `on_failure` is told of every failure that is outlived.
     """
 
+    keeps_time = True
+
     def __init__(
         self,
         node: Node,
@@ -47,7 +49,7 @@ class LiveRunner(OperatorRunner):
         paranoid: bool = False,
         operator: Operator | None = None,
         snapshots: int | None = None,
-        clock: Clock = time.monotonic,
+        clock: Clock | None = None,
         event_clock: EventClock = time.time_ns,
         on_failure: Callable[[OperatorFailure, float], None] = lambda failure, pause: None,
         fault: Fault = lambda firing: None,
@@ -70,6 +72,7 @@ class LiveRunner(OperatorRunner):
         }
         self._log = DropLog()  # of what did not reach an aligner
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
+        clock = clock or time.monotonic
         self._event_clock = event_clock
         self._newest, self._shift = NEVER, 0
         self.patience = Patience(node.live.wait, clock, self._event_time)
@@ -113,6 +116,9 @@ class LiveRunner(OperatorRunner):
         theirs, others = super().take_drops()
         return [*mine, *theirs], more + Counter(others)
 
+    def has_drops(self) -> bool:
+        return self._log.pending or super().has_drops()
+
     # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:
@@ -143,6 +149,7 @@ class LiveRunner(OperatorRunner):
         self._arrive(stream, Arrival("end", NEVER if final_stamp is None else final_stamp, None, reason))
 
     def _arrive(self, stream: str, arrival: Arrival) -> None:
+        self.wake()
         if stream in self.queue.triggers:
             self.queue.put(stream, arrival)
         else:
@@ -157,6 +164,7 @@ class LiveRunner(OperatorRunner):
                 return False
             self._start_again()
         if super().step():
+            self.wake()
             return True
         while not self.ended:
             taken = self.queue.take()
@@ -165,6 +173,7 @@ class LiveRunner(OperatorRunner):
             elif not self._give_up():
                 return False
             if super().step():
+                self.wake()
                 return True
         return False
 

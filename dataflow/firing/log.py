@@ -8,8 +8,8 @@ from typing import Any
 
 from dataflow.firing.ports import Emitter
 from dataflow.operator import Operator
-from dataflow.records.firing import Emission, FiringRecord, Kind
-from dataflow.sync import NEVER
+from dataflow.records.firing import Emission, FiringRecord, Kind, Outcome
+from dataflow.sync import NEVER, Drop, Firing, input_refs
 
 
 class FiringLog:
@@ -33,6 +33,37 @@ class FiringLog:
                 **fields,
             )
         )
+        self.index += 1
+
+    def add_firing(
+        self,
+        kind: Kind,
+        started: int,
+        firing: Firing,
+        outputs: tuple[Emission | None, ...],
+        outcome: Outcome,
+        drops: tuple[Drop, ...],
+        detail: Mapping[str, Any],
+    ) -> None:
+        """Hands on the record of a firing; `started` is wall time in ns."""
+        record = FiringRecord(
+            self.operator,
+            self.incarnation,
+            self.index,
+            kind,
+            firing.stamp,
+            firing.tick,
+            input_refs(firing),
+            firing.stale,
+            firing.late,
+            outputs,
+            outcome,
+            drops,
+            detail,
+            started,
+            time.time_ns() - started,
+        )
+        self.emitter.record(record)
         self.index += 1
 
     def add_setup(self, operator: Operator, started: int, emissions: tuple[Emission | None, ...]) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 from dataflow.graph.model import Node
@@ -16,7 +16,7 @@ from dataflow.sync import FOREVER, NEVER, Entry
 
 
 class Emitter(Protocol):
-    """Where a runner's output goes. Calls come in stream order."""
+    """Takes a runner's output. Calls come in stream order."""
 
     def message(self, stream: str, entry: Entry) -> None:
         """A message was emitted; `entry.value` is the message."""
@@ -41,10 +41,7 @@ class PortState:
     seq: int = 0
     last: int = NEVER
     promised: int = NEVER
-    digest: StreamDigest | None = None
-
-    def __post_init__(self) -> None:
-        self.digest = self.digest or StreamDigest()
+    digest: StreamDigest = field(default_factory=StreamDigest)
 
 
 class OutputPorts:
@@ -56,7 +53,9 @@ class OutputPorts:
         self.emitted = 0
         self.withheld: Counter[str] = Counter()
         """Messages that were not sent because their stamps did not increase, by port."""
-        self._prepared: list[tuple[str, Entry]] = []
+        self._prepared: list[Entry] = []
+        self._nothing = (None,) * len(self.states)
+        self._all = tuple(self.states.values())
 
     def prepare(self, messages: Mapping[str, Message], firing: int) -> tuple[Emission | None, ...]:
         """Checks and numbers what one firing emitted; `publish` sends it, after the firing was recorded.
@@ -64,6 +63,8 @@ class OutputPorts:
         Raises `OutputError` for a stamp that the port may not carry. With `lossy`, a stamp that does not increase is
         no error: the message is not sent, and its emission is marked `withheld`.
         """
+        if not messages:
+            return self._nothing
         self.check(messages, firing)
         emissions: list[Emission | None] = []
         for name, state in self.states.items():
@@ -71,18 +72,17 @@ class OutputPorts:
             if emitted is None:
                 emissions.append(None)
                 continue
-            digest = emitted.digest()
-            if emitted.stamp <= state.last:
+            digest, stamp = emitted.digest(), emitted.stamp
+            if stamp <= state.last:
                 self.withheld[name] += 1
-                emissions.append(Emission(WITHHELD, emitted.stamp, digest))
+                emissions.append(Emission(WITHHELD, stamp, digest))
                 continue
-            assert state.digest is not None
+            seq = state.seq
             state.digest.update(digest)
-            entry = Entry(emitted.stamp, emitted, state.seq, state.incarnation, digest, state.stream)
-            self._prepared.append((state.stream, entry))
-            state.last = state.promised = emitted.stamp
-            emissions.append(Emission(state.seq, emitted.stamp, digest))
-            state.seq += 1
+            self._prepared.append(Entry(stamp, emitted, seq, state.incarnation, digest, state.stream))
+            state.last = state.promised = stamp
+            emissions.append(Emission(seq, stamp, digest))
+            state.seq = seq + 1
             self.emitted += 1
         return tuple(emissions)
 
@@ -90,22 +90,23 @@ class OutputPorts:
         """Raises `OutputError` for a stamp that the port may not carry."""
         for name, message in messages.items():
             state = self.states[name]
-            earliest = firing - state.port.lag
-            if message.stamp < earliest:
+            stamp = message.stamp
+            if firing <= stamp and state.last < stamp:
+                continue
+            if stamp < firing - state.port.lag:
                 allowed = f"at or after the firing's {firing}" + (
                     f" less its lag of {state.port.lag} ns" if state.port.lag else ""
                 )
-                raise OutputError(f"{self.node.name}.{name} emitted stamp {message.stamp}; it must lie {allowed}")
-            if message.stamp <= state.last and not self.lossy:
+                raise OutputError(f"{self.node.name}.{name} emitted stamp {stamp}; it must lie {allowed}")
+            if stamp <= state.last and not self.lossy:
                 raise OutputError(
-                    f"{self.node.name}.{name} emitted stamp {message.stamp} after {state.last}: "
+                    f"{self.node.name}.{name} emitted stamp {stamp} after {state.last}: "
                     "the stamps of a stream strictly increase"
                 )
 
     def emit_as(self, name: str, message: Message, seq: int, incarnation: int) -> None:
         """Sends a message under the number that it had in a recorded run."""
         state = self.states[name]
-        assert state.digest is not None
         digest = message.digest()
         state.digest.update(digest)
         self.emitted += 1
@@ -121,9 +122,11 @@ class OutputPorts:
 
     def publish(self) -> None:
         """Sends what was prepared, in order."""
+        if not self._prepared:
+            return
         prepared, self._prepared = self._prepared, []
-        for stream, entry in prepared:
-            self.emitter.message(stream, entry)
+        for entry in prepared:
+            self.emitter.message(entry.stream, entry)
 
     def begin(self, incarnation: int, *, stamps_go_back: bool = False) -> None:
         """Begins a new incarnation of every dynamic port: numbers from 0 again, and stamps too if they may go back."""
@@ -142,7 +145,9 @@ class OutputPorts:
 
     def promise(self, frontier: int) -> None:
         """Raises the frontier of every dynamic port to `frontier` less its lag, where that is news."""
-        for state in self.states.values():
+        for state in self._all:
+            if frontier <= state.promised:
+                continue
             if state.port.static or frontier in (NEVER, FOREVER):
                 continue
             trailing = frontier - state.port.lag

@@ -15,6 +15,9 @@ from dataflow.sync import NEVER, Entry
 class Runner:
     """One operator with inputs, driven step by step on one thread."""
 
+    keeps_time = False
+    """Whether it may have something to do though nothing arrives (`next_due`)."""
+
     def __init__(self, node: Node, operator: Operator, emitter: Emitter, *, lossy: bool = False) -> None:
         self.node, self.operator, self.emitter = node, operator, emitter
         self.spec: OperatorSpec = operator.spec
@@ -30,6 +33,17 @@ class Runner:
         self.working_stamp = NEVER
         self.absent: set[str] = set()
         """Streams whose operator is gone at the moment; only a live run asks."""
+        self.awake = True
+        """Whether it is to be asked for a step; so until somebody drives it who asks only those that are."""
+        self.place = 0
+        self.wakes_in: list[Runner] = []
+        """Its place in the graph and where it puts itself when it wakes (`dataflow.firing.ready`)."""
+
+    def wake(self) -> None:
+        """Asks to be stepped: something was given that may decide a firing, or there may be another one."""
+        if not self.awake:
+            self.awake = True
+            self.wakes_in.append(self)
 
     def setup(self) -> None:
         """Sets the operator up and emits its static messages. Raises `OperatorFailure`."""
@@ -48,7 +62,10 @@ class Runner:
         raise NotImplementedError
 
     def step(self) -> bool:
-        """Makes the next firing if it is decided; False when there is nothing to do. Raises `OperatorFailure`."""
+        """Makes the next firing if it is decided; False when there was nothing to do. Raises `OperatorFailure`.
+
+        Where there may be more to do it wakes.
+        """
         raise NotImplementedError
 
     def next_due(self) -> float | None:
@@ -88,10 +105,11 @@ class Runner:
 
     @property
     def refused(self) -> Mapping[str, int]:
-        """What streams said against their own promises and was left aside, by stream; where it is not raised."""
+        """Returns what streams said against their own promises and was left aside, by stream; where it is not
+        raised."""
         return {}
 
     @property
     def restarted(self) -> int:
-        """How often the operator was restarted in this process."""
+        """Tells how often the operator was restarted in this process."""
         return 0

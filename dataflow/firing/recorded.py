@@ -60,7 +60,7 @@ class RecordedRunner(Runner):
 
     @property
     def result(self) -> Verification:
-        """What re-execution has come to so far."""
+        """Returns what re-execution has come to so far."""
         return self.judge.result
 
     def setup(self) -> None:
@@ -74,7 +74,8 @@ class RecordedRunner(Runner):
         self.ports.end_statics()
 
     def _take_up(self) -> None:
-        """Where re-execution begins in the middle: the last restart, the parameters and the state of that moment."""
+        """Tells where re-execution begins in the middle: the last restart, the parameters and the state of that
+        moment."""
         changes: dict[str, Any] = {}
         for record in self._before:
             if record.kind == "param":
@@ -131,7 +132,7 @@ class RecordedRunner(Runner):
         return True
 
     def _repeat_changes(self) -> None:
-        """What happened to the operator between the last firing and the next, in its recorded order."""
+        """Returns what happened to the operator between the last firing and the next, in its recorded order."""
         while self._position < len(self._records) and self._records[self._position].kind not in CALLS:
             record = self._records[self._position]
             self._position += 1
@@ -179,7 +180,7 @@ class RecordedRunner(Runner):
         self.calls.restore(state, (record.incarnation, record.stamp))
 
     def _is_lost(self, missing: MessageRef | None) -> bool:
-        """Whether a message that the next firing needs can no longer come."""
+        """Tells whether a message that the next firing needs can no longer come."""
         if missing is None:
             return not self._open
         passed = self._latest.get(missing.stream, (-1, -1)) > (missing.incarnation, missing.seq)

@@ -1,4 +1,4 @@
-"""How often what failed is started again, and when: the restart policy of one operator or host."""
+"""Decides whether and when what failed is restarted: the policy of one operator or process."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Restarts:
 
     @property
     def pending(self) -> bool:
-        """Whether an attempt is to be made, now or later."""
+        """Tells whether an attempt is to be made, now or later."""
         return self._due is not None
 
     def due_in(self) -> float:

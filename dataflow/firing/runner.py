@@ -20,11 +20,15 @@ from dataflow.firing.protocol import Runner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
 from dataflow.records.firing import Emission, Kind
-from dataflow.sync import FOREVER, NEVER, Aligner, Drop, Entry, Firing, format_duration, format_stamp, refs_of
+from dataflow.sync import FOREVER, NEVER, Aligner, Drop, Entry, Firing, format_duration, format_stamp
 
 MOST_TICKS = 1_000_000
 """Ticks that may be due at once, with no message between them: 10 Hz for a day and more. A timer that owes more was led
 by a wrong stamp. A live run leaves ticks out instead, and counts them."""
+
+SHORT = 1_000_000
+"""ns: an operator whose calls take less on average does not announce each one by a frontier below its stamp. What it
+emits says the same at once."""
 
 MOST_DROPPED = 10_000
 """Stamps that one step may drop before it returns to whoever drives it, who has other things to look at."""
@@ -79,8 +83,12 @@ class OperatorRunner(Runner):
         return self.aligner.late
 
     def take_drops(self) -> tuple[list[Drop], Mapping[tuple[str, str], int]]:
-        """What was dropped since the last record, and the number of what was too much to be listed."""
+        """Returns what was dropped since the last record, and the number of what was too much to be listed."""
         return self.aligner.take_drops(), self.aligner.take_unlisted()
+
+    def has_drops(self) -> bool:
+        """Tells whether anything was dropped since the last record."""
+        return self.aligner.has_drops()
 
     def waiting(self) -> tuple[int | None, dict[str, int]]:
         """The stamp that cannot be decided yet, and the frontiers that would decide it, by input."""
@@ -96,12 +104,17 @@ class OperatorRunner(Runner):
 
     def push(self, stream: str, entry: Entry) -> None:
         self.aligner.push(stream, entry)
+        if not self.awake:
+            self.wake()
 
     def advance(self, stream: str, frontier: int) -> None:
         self.aligner.advance(stream, frontier)
+        if not self.awake:
+            self.wake()
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self.aligner.end(stream, final_stamp, reason)
+        self.wake()
 
     def step(self) -> bool:
         if self.ended:
@@ -113,19 +126,30 @@ class OperatorRunner(Runner):
             frontier = self.aligner.output_frontier()
             self.ports.promise(frontier)
             self.done = max(self.done, frontier)
+            if self.aligner.paused:
+                self.wake()
             return self.aligner.paused
-        self.ports.promise(firing.stamp - 1)
-        self.working_stamp, self.working_since = firing.stamp, time.monotonic()
+        work = self.work
+        if work.mean_ns > SHORT:
+            self.ports.promise(firing.stamp - 1)
+        self.working_stamp = firing.stamp
+        self.working_since = work.begin() * 1e-9
         try:
-            with self.work:
-                self._fire(firing)
+            self._fire(firing)
         finally:
+            work.end()
             self.working_since = None
         if firing.kind == "finish":
             self.ended, self.done = True, FOREVER
             self.ports.end(self.aligner.final_stamp(), "end of input")
-        else:
-            self.done = max(self.done, firing.stamp)
+            return True
+        frontier = self.aligner.idle_frontier()
+        if frontier == NEVER:
+            frontier = firing.stamp
+            self.wake()
+        self.ports.promise(frontier)
+        if frontier > self.done:
+            self.done = frontier
         return True
 
     def _bound_ticks(self, period: int) -> None:
@@ -185,17 +209,9 @@ class OperatorRunner(Runner):
             detail = {"error": error, **({"injected": True} if injected else {})}
         elif kind == "finish" and (summary := self.calls.summary((self.records.incarnation, firing.stamp))):
             detail = {"summary": summary}
-        dropped, more = self.take_drops()
-        self.records.add(
-            kind,
-            firing.stamp,
-            started,
-            tick=firing.tick,
-            inputs=refs_of(firing).inputs,
-            stale=firing.stale,
-            late=firing.late,
-            outputs=outputs,
-            outcome="ok" if error is None else "error",
-            drops=tuple(dropped),
-            detail={**detail, **unlisted(more)},
-        )
+        dropped: tuple[Drop, ...] = ()
+        if self.has_drops():
+            listed, more = self.take_drops()
+            dropped = tuple(listed)
+            detail |= unlisted(more)
+        self.records.add_firing(kind, started, firing, outputs, "ok" if error is None else "error", dropped, detail)

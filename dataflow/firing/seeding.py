@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import random
 import sys
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Any, Final, SupportsInt
 
-import numpy as np
 import xxhash
+
+from dataflow.firing import lazy_numpy, lazy_random
 
 VERSION: Final = 2
 """The scheme by which calls are seeded; recordings name it, and re-execution follows the one they name.
@@ -32,7 +32,7 @@ def version_of(run_facts: Mapping[str, str]) -> int:
 
 def firing_seed(graph_seed: int, operator: str, stamp: int) -> int:
     """63 bits from (graph seed, operator, stamp); independent of grouping, machine and run."""
-    return xxhash.xxh3_64_intdigest(f"{graph_seed}/{operator}/{stamp}".encode()) & (2**63 - 1)
+    return int(FiringSeed(f"{graph_seed}/{operator}/", stamp))
 
 
 def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, stamp: int) -> int:
@@ -41,14 +41,30 @@ def change_seed(graph_seed: int, operator: str, what: str, incarnation: int, sta
     return xxhash.xxh3_64_intdigest(text.encode()) & (2**63 - 1)
 
 
-def seed_generators(seed: int) -> None:
-    """Seeds the global generators of Python, numpy and the libraries that are loaded."""
-    random.seed(seed)
-    np.random.seed(seed & 0xFFFFFFFF)
+class FiringSeed:
+    """The seed of a firing, made from (graph seed, operator, stamp) when somebody asks for it as an integer."""
+
+    __slots__ = ("_of", "_stamp")
+
+    def __init__(self, of: str, stamp: int) -> None:
+        """`of`: `GRAPH_SEED/OPERATOR/`."""
+        self._of, self._stamp = of, stamp
+
+    def __int__(self) -> int:
+        return xxhash.xxh3_64_intdigest(f"{self._of}{self._stamp}".encode()) & (2**63 - 1)
+
+
+def seed_generators(seed: SupportsInt) -> None:
+    """Seeds the global generators of Python, numpy and the libraries that are loaded.
+
+    Those of Python and numpy are seeded when somebody draws from them.
+    """
+    lazy_random.seed_lazily(seed)
+    lazy_numpy.seed_lazily(seed)
     modules: dict[str, Any] = sys.modules  # a library that is not loaded is not loaded for this
     if (torch := modules.get("torch")) is not None:
-        torch.default_generator.manual_seed(seed)
+        torch.default_generator.manual_seed(int(seed))
     if (cv2 := modules.get("cv2")) is not None:
-        cv2.setRNGSeed(seed & 0x7FFFFFFF)
+        cv2.setRNGSeed(int(seed) & 0x7FFFFFFF)
     if (open3d := modules.get("open3d")) is not None:
-        open3d.utility.random.seed(seed & 0x7FFFFFFF)
+        open3d.utility.random.seed(int(seed) & 0x7FFFFFFF)

@@ -8,12 +8,11 @@ operator is at work, where nobody else can have drawn. (OpenCV has a generator f
 
 from __future__ import annotations
 
-import random
 import sys
 from types import TracebackType
 from typing import Any
 
-import numpy as np
+from dataflow.firing import lazy_numpy, lazy_random
 
 
 class SharedGenerators(RuntimeError):
@@ -67,8 +66,7 @@ class Tripwire:
 
 
 def _state() -> tuple[object, ...]:
-    mersenne: dict[str, Any] = np.random.get_state(legacy=False)
     modules: dict[str, Any] = sys.modules
     torch = modules.get("torch")
     drawn = None if torch is None else torch.default_generator.get_state().numpy().tobytes()
-    return random.getstate(), mersenne["state"]["key"].tobytes(), mersenne["state"]["pos"], drawn
+    return lazy_random.peek(), lazy_numpy.peek(), drawn

@@ -139,7 +139,7 @@ class SourceRunner:
         return step_size(step)
 
     def _take_refused(self) -> dict[str, int]:
-        """How many steps were not sent since the last record that says so, by reason."""
+        """Tells how many steps were not sent since the last record that says so, by reason."""
         fresh, self._recorded = self.refused - self._recorded, self.refused.copy()
         return dict(fresh)
 
@@ -250,5 +250,5 @@ def step_stamp(step: Mapping[str, Message]) -> int:
 
 
 def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
-    """How many messages and bytes a step is."""
+    """Tells how many messages and bytes a step is."""
     return len(step), sum(m.nbytes() for m in step.values())

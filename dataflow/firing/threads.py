@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from dataflow.graph.search import import_path
@@ -20,7 +22,7 @@ _VARIABLES = (
 
 
 def environment(threads: int) -> dict[str, str]:
-    """The environment of a host process: thread counts, the import path of this one, and hashing without a salt."""
+    """Returns the environment of operators: thread counts, the import path of this process, hashing without a salt."""
     return {
         **os.environ,
         "PYTHONPATH": import_path(),
@@ -50,3 +52,22 @@ def limit_threads_again() -> None:
         cv2.setNumThreads(threads)
     if (torch := modules.get("torch")) is not None:
         torch.set_num_threads(threads)
+
+
+@contextmanager
+def limited_threads(threads: int) -> Iterator[None]:
+    """Limits those libraries while a graph runs in a process that has other work too, and lifts the limit again."""
+    global _limit
+    modules: dict[str, Any] = sys.modules
+    loaded = {name: modules[name] for name in ("cv2", "torch") if name in modules}
+    before = {
+        name: library.getNumThreads() if name == "cv2" else library.get_num_threads()
+        for name, library in loaded.items()
+    }
+    limit_threads(threads)
+    try:
+        yield
+    finally:
+        _limit = None
+        for name, library in loaded.items():
+            (library.setNumThreads if name == "cv2" else library.set_num_threads)(before[name])

@@ -1,4 +1,4 @@
-"""Which operators there are, and what each declares: for `dataflow operators`, the docs and other tools."""
+"""Lists the operators with what each declares: for `dataflow operators`, the docs and other tools."""
 
 from __future__ import annotations
 
@@ -158,7 +158,7 @@ def find(catalogue: Catalogue, name: str) -> Described:
 
 
 def fires(cls: type[Operator]) -> str:
-    """When the operator fires, in words."""
+    """Tells when the operator fires, in words."""
     spec = cls.spec
     if is_source(cls):
         return "by itself (a device)" if getattr(cls, "live", False) else "by itself (can wait)"
@@ -308,7 +308,7 @@ def _notes(notes: Sequence[str], doc: str) -> Text:
 
 
 def input_notes(port: InputPort) -> list[str]:
-    """What is particular to an input, in a few words each."""
+    """Returns what is particular to an input, in a few words each."""
     notes = []
     if port.kind == "sampled" and not port.required:
         notes.append("optional")
@@ -324,13 +324,13 @@ def input_notes(port: InputPort) -> list[str]:
 
 
 def parameter_notes(row: Mapping[str, Any]) -> list[str]:
-    """What is particular to a parameter: its bounds, and whether it may change while the graph runs."""
+    """Returns what is particular to a parameter: its bounds, and whether it may change while the graph runs."""
     unit = "" if not row["unit"] or row["bounds"].startswith(("items", "length", "matches")) else f" {row['unit']}"
     notes = [row["bounds"] + unit] if row["bounds"] else []
     return [*notes, "changes while running"] if row["live"] else notes
 
 
 def output_notes(port: OutputPort) -> list[str]:
-    """What is particular to an output, in a few words each."""
+    """Returns what is particular to an output, in a few words each."""
     notes = ["static"] if port.static else []
     return [*notes, f"up to {format_duration(port.lag)} late"] if port.lag else notes

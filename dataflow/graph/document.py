@@ -1,4 +1,4 @@
-"""YAML with marks: a graph file as a tree of values that know their line and column, and `${}` substitution in it.
+"""Reads YAML with marks: the text of a graph file becomes a tree of values that know their line and column.
 
 The language is YAML 1.2 less its surprises: no tags, directives, merge keys, NaN, octal-looking `010`, or second
 documents. `${name}` may stand unquoted inside `{...}` and `[...]`.
@@ -7,9 +7,7 @@ documents. `${name}` may stand unquoted inside `{...}` and `[...]`.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -19,51 +17,11 @@ from ruamel.yaml.nodes import MappingNode, ScalarNode
 from ruamel.yaml.nodes import Node as YamlNode
 from ruamel.yaml.reader import ReaderError
 
-from dataflow.graph.limits import MAX_DIGITS, MAX_NESTING, MAX_TEXT, MAX_VALUES, Budget
+from dataflow.graph.limits import MAX_DIGITS, MAX_NESTING, MAX_TEXT, MAX_VALUES, NESTED_TOO_DEEP
 from dataflow.graph.problems import Place, Problems
+from dataflow.graph.references import REFERENCE
+from dataflow.graph.tree import UNKNOWN, Entry, Items, Leaf, Table, Tree
 
-
-@dataclass(frozen=True, slots=True)
-class Leaf:
-    """A scalar: its value, and the text as it stood in the file."""
-
-    value: Any
-    place: Place
-    raw: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Items:
-    """A list."""
-
-    items: tuple[Tree, ...]
-    place: Place
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One `key: value` of a mapping."""
-
-    key: Leaf
-    value: Tree
-
-
-@dataclass(frozen=True, slots=True)
-class Table:
-    """A mapping; keys are text."""
-
-    entries: dict[str, Entry]
-    place: Place
-
-    def get(self, key: str) -> Tree | None:
-        entry = self.entries.get(key)
-        return None if entry is None else entry.value
-
-
-Tree = Leaf | Items | Table
-
-NESTED_TOO_DEEP = f"values nest deeper than {MAX_NESTING} levels"
-_REFERENCE = re.compile(r"\$\{[^{}\n]*\}")
 _FLOW = "{}[],:#"
 _HIDDEN = "".join(chr(0xF8D0 + i) for i in range(len(_FLOW)))
 _HIDE, _SHOW = str.maketrans(_FLOW, _HIDDEN), str.maketrans(_HIDDEN, _FLOW)
@@ -85,7 +43,7 @@ def parse(text: str, file: str, problems: Problems, lines: Sequence[str] = ()) -
         if line.startswith("%"):
             problems.add(Place(file, number, 1, len(line)), "YAML directives are not part of the graph language")
             return None
-    hidden = _REFERENCE.sub(lambda match: match[0].translate(_HIDE), text)
+    hidden = REFERENCE.sub(lambda match: match[0].translate(_HIDE), text)
     try:
         node = _yaml().compose(hidden)
     except MarkedYAMLError as error:
@@ -126,166 +84,6 @@ def _too_deep(text: str, file: str) -> Place:
     return Place(file, 1, 1)
 
 
-def plain(tree: Tree) -> Any:
-    """The tree as ordinary Python values."""
-    match tree:
-        case Leaf():
-            return tree.value
-        case Items():
-            return [plain(item) for item in tree.items]
-        case Table():
-            return {key: plain(entry.value) for key, entry in tree.entries.items()}
-
-
-def at(tree: Tree, path: tuple[str | int, ...]) -> Tree:
-    """The value at `path`, or the nearest one above it that exists."""
-    for step in path:
-        if isinstance(tree, Table) and str(step) in tree.entries:
-            tree = tree.entries[str(step)].value
-        elif isinstance(tree, Items) and isinstance(step, int) and step < len(tree.items):
-            tree = tree.items[step]
-        else:
-            break
-    return tree
-
-
-def moved(tree: Tree, place: Place) -> Tree:
-    """The tree as if all of it stood at `place`."""
-    match tree:
-        case Leaf():
-            return replace(tree, place=place)
-        case Items():
-            return Items(tuple(moved(item, place) for item in tree.items), place)
-        case Table():
-            return Table(
-                {k: Entry(replace(e.key, place=place), moved(e.value, place)) for k, e in tree.entries.items()}, place
-            )
-
-
-def describe(tree: Tree) -> str:
-    """What a value is, for messages: `text 'abc'`, `number 3`, `a list`."""
-    match tree:
-        case Items():
-            return "a list"
-        case Table():
-            return "a mapping"
-        case Leaf(value=None):
-            return "nothing"
-        case Leaf(value=bool()):
-            return f"{str(tree.value).lower()}"
-        case Leaf(value=int() | float()):
-            return f"the number {tree.value}"
-    return f"the text {tree.value!r}"
-
-
-@dataclass(frozen=True, slots=True)
-class Reference:
-    """One `${...}`: `name` or `env:NAME`, and the text after `:-`, if any."""
-
-    name: str
-    default: str | None
-    place: Place
-
-    @property
-    def variable(self) -> str | None:
-        """The environment variable that is asked for, or None when it is a graph parameter."""
-        return self.name.removeprefix("env:") if self.name.startswith("env:") else None
-
-
-Lookup = Callable[[Reference], Tree | None]
-"""Gives the value of a reference; None when there is none, which it has then reported."""
-
-
-def substitute(tree: Tree, lookup: Lookup, problems: Problems, budget: Budget, depth: int = 1) -> Tree:
-    """The tree with every `${...}` replaced. A value that is one reference keeps its type; `$${` stands for `${`.
-
-    What comes out is charged to `budget`: references multiply.
-    """
-    budget.charge(tree.place, 1)
-    if depth > MAX_NESTING:
-        problems.stop(tree.place, NESTED_TOO_DEEP)
-    match tree:
-        case Items():
-            items = tuple(substitute(item, lookup, problems, budget, depth + 1) for item in tree.items)
-            return Items(items, tree.place)
-        case Table():
-            entries = {
-                k: Entry(e.key, substitute(e.value, lookup, problems, budget, depth + 1))
-                for k, e in tree.entries.items()
-            }
-            return Table(entries, tree.place)
-    if not isinstance(tree.value, str) or "${" not in tree.value:
-        return tree
-    whole = _REFERENCE.fullmatch(tree.value)
-    if whole is None:
-        return _interpolated(tree, tree.value, lookup, problems, budget)
-    value = lookup(_reference(whole[0], tree.place, problems))
-    if value is None:
-        return Leaf(UNKNOWN, tree.place, tree.raw)
-    values, levels = _measured(value)
-    budget.charge(tree.place, values)
-    if depth + levels - 1 > MAX_NESTING:
-        problems.stop(tree.place, NESTED_TOO_DEEP)
-    return moved(value, tree.place)
-
-
-def _interpolated(leaf: Leaf, text: str, lookup: Lookup, problems: Problems, budget: Budget) -> Leaf:
-    """A text with references in it, as one text."""
-    parts: list[str] = []
-    end = 0
-    for match in _REFERENCE.finditer(text):
-        parts.append(text[end : match.start()])
-        end = match.end()
-        if parts[-1].endswith("$"):
-            parts.append(match[0][1:])
-            continue
-        reference = _reference(match[0], leaf.place, problems)
-        value = lookup(reference)
-        if value is None:
-            return Leaf(UNKNOWN, leaf.place, leaf.raw)
-        if not isinstance(value, Leaf):
-            what = f"${{{reference.name}}} is {describe(value)}, which cannot stand inside a text"
-            problems.add(reference.place, what)
-            return Leaf(UNKNOWN, leaf.place, leaf.raw)
-        inner = value.value
-        parts.append(str(inner).lower() if isinstance(inner, bool) else str(inner))
-        budget.charge_text(leaf.place, len(parts[-1]))
-    return Leaf("".join(parts) + text[end:], leaf.place, leaf.raw)
-
-
-def _measured(tree: Tree) -> tuple[int, int]:
-    """(number of values, levels) of a tree."""
-    match tree:
-        case Leaf():
-            return 1, 1
-        case Items():
-            inner = [_measured(item) for item in tree.items]
-        case Table():
-            inner = [_measured(entry.value) for entry in tree.entries.values()]
-    return 1 + sum(values for values, _ in inner), 1 + max((levels for _, levels in inner), default=0)
-
-
-class _Unknown:
-    """Stands for a value that could not be had, so that nothing further is said about it."""
-
-    def __repr__(self) -> str:
-        return "unknown"
-
-
-UNKNOWN = _Unknown()
-
-
-def unknown(tree: Tree) -> bool:
-    """True when the value, or something inside it, could not be had (which is reported already)."""
-    match tree:
-        case Leaf():
-            return tree.value is UNKNOWN
-        case Items():
-            return any(unknown(item) for item in tree.items)
-        case Table():
-            return any(unknown(entry.value) for entry in tree.entries.values())
-
-
 def parse_scalar(text: str, place: Place) -> Leaf:
     """The text of an environment variable or of a default, as YAML reads a scalar; anything else is a text."""
     try:
@@ -298,15 +96,6 @@ def parse_scalar(text: str, place: Place) -> Leaf:
     leaf = _Builder(place.file, scratch).build(node)
     assert isinstance(leaf, Leaf)
     return Leaf(text if scratch.found else leaf.value, place, text)
-
-
-def _reference(text: str, around: Place, problems: Problems) -> Reference:
-    name, colon, default = text[2:-1].partition(":-")
-    lines = problems.texts.get(around.file, ())
-    line = lines[around.line - 1] if 0 < around.line <= len(lines) else ""
-    column = line.find(text, around.column - 1)
-    place = around if column < 0 else Place(around.file, around.line, column + 1, len(text))
-    return Reference(name.strip(), default if colon else None, place)
 
 
 def _quoted(raw: str) -> str:

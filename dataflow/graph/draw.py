@@ -14,10 +14,10 @@ _ARROW = {"in": "-->", "sampled": "-.->", "batch": "==>"}
 
 def tree(graph: Graph) -> Tree:
     """Processes, their operators, and of each its inputs (kind, type, streams) and outputs (type)."""
-    hosts = graph.hosts()
+    grouped = graph.processes()
     title = Text.assemble((graph.name, "bold"), f"  {graph.namespace}  ", (_counts(graph), "dim"))
     root = Tree(title)
-    for process, names in hosts.items():
+    for process, names in grouped.items():
         machines = {graph.nodes[name].machine for name in names} - {None}
         where = f" on {', '.join(sorted(m for m in machines if m))}" if machines else ""
         branch = root.add(Text.assemble(("process ", "dim"), (process, "cyan"), (where, "dim")))
@@ -31,7 +31,7 @@ def tree(graph: Graph) -> Tree:
 
 
 def _counts(graph: Graph) -> str:
-    processes = len(graph.hosts())
+    processes = len(graph.processes())
     counts = ((len(graph.nodes), "operator"), (len(graph.streams), "stream"))
     others = [f"{number} {word}{'' if number == 1 else 's'}" for number, word in counts]
     return ", ".join([f"{processes} process{'' if processes == 1 else 'es'}", *others])
@@ -69,7 +69,7 @@ def mermaid(graph: Graph) -> str:
     """A Mermaid flowchart: a subgraph per shared process; triggers solid, Sampled dotted, Batch thick."""
     ids = {name: f"n{i}" for i, name in enumerate(graph.nodes)}
     lines = ["flowchart LR"]
-    for number, (label, names) in enumerate(graph.hosts().items()):
+    for number, (label, names) in enumerate(graph.processes().items()):
         boxes = [f'{ids[name]}["<b>{name}</b><br/>{graph.nodes[name].use.rpartition(":")[2]}"]' for name in names]
         if len(names) == 1:
             lines.append(f"    {boxes[0]}")

@@ -6,8 +6,9 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import TypeVar
 
-from dataflow.graph.document import UNKNOWN, Items, Leaf, Table, Tree, describe
+from dataflow.graph.keys import NAME_RULE, name_fault
 from dataflow.graph.problems import Problems, did_you_mean
+from dataflow.graph.tree import UNKNOWN, Items, Leaf, Table, Tree, describe
 from dataflow.sync.stamps import parse_duration
 
 Choice = TypeVar("Choice", bound=str)
@@ -105,3 +106,35 @@ class Fields:
         word = str(tree.value) if isinstance(tree, Leaf) else ""
         self.wrong(tree, what, f"one of {', '.join(choices)}", did_you_mean(word, choices))
         return None
+
+    def name(self, tree: Tree | None, what: str) -> str | None:
+        """A name of one part, without '/'."""
+        word = self.text(tree, what)
+        if word is None or tree is None:
+            return None
+        if fault := name_fault(word):
+            self.problems.add(tree.place, f"{what} name {fault}", NAME_RULE)
+            return None
+        return word
+
+    def namespace(self, tree: Tree | None) -> str | None:
+        """Names joined by '/'."""
+        word = self.text(tree, "namespace")
+        if word is None or tree is None:
+            return None
+        for part in word.split("/"):
+            if fault := name_fault(part):
+                hint = f"names joined by '/', such as robot1 or site/robot1; {NAME_RULE}"
+                self.problems.add(tree.place, f"namespace {word!r}: {fault}", hint)
+                return None
+        return word
+
+    def label(self, tree: Tree | None, what: str) -> Leaf | None:
+        """A name, with its place."""
+        word = self.text(tree, what)
+        if word is None or tree is None:
+            return None
+        if fault := name_fault(word):
+            self.problems.add(tree.place, f"{what} label {fault}", NAME_RULE)
+            return None
+        return Leaf(word, tree.place, word)

@@ -13,7 +13,7 @@ _WITHIN = re.compile(r"\$\*|.", re.DOTALL)
 
 
 def name_fault(name: str) -> str | None:
-    """Why `name` cannot name an operator, a graph or one part of a namespace; None when it can."""
+    """Tells why `name` cannot name an operator, a graph or one part of a namespace; None when it can."""
     if _NAME.fullmatch(name):
         return None
     bad = next((c for c in name if not re.match(r"[\w-]", c)), None)
@@ -26,7 +26,7 @@ NAME_RULE = "a name is letters, digits, '_' and '-', and begins with a letter or
 
 
 def key_fault(key: str) -> str | None:
-    """Why a key expression (without a leading '/') is not one, in our own words; None when it is."""
+    """Tells why a key expression (without a leading '/') is not one, in our own words; None when it is."""
     if not key:
         return "it is empty"
     if key.startswith("/") or key.endswith("/") or "//" in key:

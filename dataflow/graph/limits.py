@@ -12,6 +12,7 @@ MAX_VALUES = 100_000
 """Values of one file, aliases expanded."""
 MAX_NESTING = 64
 """Lists and mappings within one another."""
+NESTED_TOO_DEEP = f"values nest deeper than {MAX_NESTING} levels"
 MAX_DIGITS = 80
 """Characters of a whole number, in any notation; its value has 64 bits."""
 MAX_DEPTH = 16

@@ -17,7 +17,7 @@ from dataflow.operator import Operator, Source
 
 @dataclass(frozen=True, slots=True)
 class NotFound:
-    """Why there is no operator behind a path."""
+    """Says why there is no operator behind a path."""
 
     message: str
     hint: str = ""

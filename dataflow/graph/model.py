@@ -9,17 +9,30 @@ from __future__ import annotations
 import importlib
 import json
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from dataflow.messages.base import Message, MessageError, import_type, message_type
 from dataflow.messages.declaration import Declaration
-from dataflow.operator import InputPort, Operator, OperatorSpec, OutputPort
+from dataflow.operator import InputPort, Operator, OperatorSpec
 
 QueuePolicy = Literal["newest", "oldest", "block"]
 StalePolicy = Literal["use", "drop"]
-Placement = Literal["graph", "one_host", "host_each"]
+Placement = Literal["graph", "one_process", "process_each"]
+
+FORMER_PLACEMENTS = {"one_host": "one_process", "host_each": "process_each"}
+"""Placements by their names of the version before, which still work in this one."""
+
+
+def current_placement(placement: Any) -> Any:
+    """Returns a placement by the name it has now, with a DeprecationWarning where it is called by its former one."""
+    if not isinstance(placement, str) or placement not in FORMER_PLACEMENTS:
+        return placement
+    now = FORMER_PLACEMENTS[placement]
+    warnings.warn(f"placement {placement!r} is now {now!r}", DeprecationWarning, stacklevel=3)
+    return now
 
 
 class OperatorImportError(ImportError):
@@ -41,7 +54,7 @@ def import_operator(use: str) -> type[Operator]:
 
 @dataclass(frozen=True, slots=True)
 class Restart:
-    """How often a failed operator is started again in a live run, and how long to wait before each attempt (ns)."""
+    """Restart policy of an operator in a live run: the most restarts, and the pause before each attempt (ns)."""
 
     max: int = 0
     backoff: int = 1_000_000_000
@@ -49,7 +62,7 @@ class Restart:
 
 @dataclass(frozen=True, slots=True)
 class Live:
-    """How an operator behaves in a live run; replay and verify ignore all of it.
+    """Policies of an operator in a live run; replay and verify ignore all of it.
 
     - `queue`, `size`: at most `size` undecided messages on each stream of a trigger; beyond that the oldest is dropped
       (`newest` is kept), the arriving one is dropped (`oldest` is kept), or the producer waits (`block`).
@@ -105,19 +118,16 @@ class Node:
 
     @property
     def spec(self) -> OperatorSpec:
-        """What the class declares. Mind `tolerance` and `every`, which the graph may change: the node's count."""
+        """The declaration of the class. Mind `tolerance` and `every`, which the graph may change: the node's count."""
         return self.operator.spec
 
     @property
-    def host(self) -> str:
-        """Label of the process it runs in unless the placement is overridden: its `process:` label, or its own name."""
+    def process_label(self) -> str:
+        """The process it runs in unless the placement is overridden: its `process:` label, or its own name."""
         return self.process or self.name
 
     def input_port(self, name: str) -> InputPort:
         return self.spec.inputs[name]
-
-    def output_port(self, name: str) -> OutputPort:
-        return self.spec.outputs[name]
 
     def make(self) -> Operator:
         """A new operator object with this node's parameters."""
@@ -141,7 +151,7 @@ class Stream:
 
 @dataclass(frozen=True, slots=True)
 class Record:
-    """Which streams a recording holds. `thin`: not all of them; firing records are always written.
+    """Choice of the streams that a recording holds. `thin`: not all of them; firing records are always written.
 
     `snapshots`: nanoseconds of event time between two snapshots of an operator's state; None for none.
     """
@@ -153,7 +163,7 @@ class Record:
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What the viewer leaves out: stream names."""
+    """Streams that the viewer leaves out, by name."""
 
     hide: tuple[str, ...] = ()
 
@@ -318,27 +328,28 @@ class Graph:
         """The operators without outputs."""
         return tuple(node for node in self.nodes.values() if not node.outputs)
 
-    def hosts(self, placement: Placement | Mapping[str, str] = "graph") -> dict[str, tuple[str, ...]]:
+    def processes(self, placement: Placement | Mapping[str, str] = "graph") -> dict[str, tuple[str, ...]]:
         """Process label → the nodes it runs, both in graph order.
 
         `placement`: as the graph's `process:` labels say, all in one process, one process each, or an explicit mapping
         from node name to label (nodes left out keep the graph's label). Raises ValueError for an unknown node or word.
         """
-        if isinstance(placement, str) and placement not in ("graph", "one_host", "host_each"):
-            raise ValueError(f"placement {placement!r}: expected graph, one_host, host_each or a mapping")
+        placement = current_placement(placement)
+        if isinstance(placement, str) and placement not in ("graph", "one_process", "process_each"):
+            raise ValueError(f"placement {placement!r}: expected graph, one_process, process_each or a mapping")
         if not isinstance(placement, str) and (unknown := sorted(placement.keys() - self.nodes.keys())):
             raise ValueError(f"placement names no operator of the graph: {', '.join(unknown)}")
         grouped: dict[str, list[str]] = {}
         for node in self.nodes.values():
             match placement:
-                case "one_host":
+                case "one_process":
                     label = "all"
-                case "host_each":
+                case "process_each":
                     label = node.name
                 case "graph":
-                    label = node.host
+                    label = node.process_label
                 case _:
-                    label = placement.get(node.name, node.host)
+                    label = placement.get(node.name, node.process_label)
             grouped.setdefault(label, []).append(node.name)
         return {label: tuple(names) for label, names in grouped.items()}
 

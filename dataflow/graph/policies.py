@@ -1,14 +1,14 @@
-"""What a graph says about how one operator synchronises (`sync:`) and behaves in a live run (`live:`)."""
+"""Policies of one operator: how it synchronises (`sync:`) and behaves in a live run (`live:`)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from dataflow.graph.document import Leaf, Table, Tree
-from dataflow.graph.expand import Draft
+from dataflow.graph.drafts import Draft
 from dataflow.graph.fields import Fields
 from dataflow.graph.model import Live, QueuePolicy, Restart, StalePolicy
 from dataflow.graph.problems import did_you_mean
+from dataflow.graph.tree import Leaf, Table, Tree
 from dataflow.operator import InputPort, OperatorSpec
 
 QUEUE_SIZE = 16
@@ -97,7 +97,7 @@ def _wait(tree: Tree, default: int | None, fields: Fields) -> int | None:
 
 
 def default_wait(spec: OperatorSpec, port: InputPort, devices: bool) -> int | None:
-    """How long (ns) a live decision waits for an input; None, for ever, where every source upstream can wait.
+    """Tells how long (ns) a live decision waits for an input; None, for ever, where every source upstream can wait.
 
     Fed by a device: 0 for Sampled and Batch and for a single trigger, `JOIN_WAIT` for joined and merged triggers, and
     for a trigger beside a timer the timer's period, if that is less: else a tick would shut out messages of its stamp.

@@ -1,4 +1,4 @@
-"""What is wrong with a graph, said like a compiler: place, message, the line with a caret, the nearest right word."""
+"""Problems of a graph, reported as a compiler does: place, message, the line with a caret, the nearest right word."""
 
 from __future__ import annotations
 

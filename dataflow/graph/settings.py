@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from dataflow.graph import document
-from dataflow.graph.document import UNKNOWN, Entry, Leaf, Table, Tree
 from dataflow.graph.problems import Place, Problems
+from dataflow.graph.tree import UNKNOWN, Entry, Leaf, Table, Tree
 
 
 @dataclass(slots=True)
@@ -54,3 +54,16 @@ def put(table: Table, path: tuple[str, ...], setting: Setting) -> Table:
         inner = table.get(head)
         value = put(inner if isinstance(inner, Table) else Table({}, setting.place), tuple(rest), setting)
     return Table({**table.entries, head: Entry(key, value)}, table.place)
+
+
+def overridden(settings: Iterable[Setting], owner: str, params: Tree | None, place: Place) -> Tree | None:
+    """`params` of an operator or nested graph with the `--set` words for it put in."""
+    for setting in settings:
+        if setting.owner != owner:
+            continue
+        setting.used = True
+        if params is None or (isinstance(params, Leaf) and params.value is None):
+            params = Table({}, place)
+        if isinstance(params, Table):
+            params = put(params, setting.path, setting)
+    return params

@@ -8,18 +8,15 @@ have equal digests wherever and however they were made.
 from __future__ import annotations
 
 import importlib
-import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Self, dataclass_transform
 
 import numpy as np
 import numpy.typing as npt
-import xxhash
 
+from dataflow.messages.compiled import Compiled, compile_class
 from dataflow.messages.fields import (
-    INT64_MAX,
-    INT64_MIN,
     MISSING,
     SYMBOL,
     TAKEN,
@@ -31,6 +28,7 @@ from dataflow.messages.fields import (
     ScalarKind,
     array,
     array_value,
+    canonical_stamp,
     check_shape,
     scalar,
     scalar_value,
@@ -84,7 +82,7 @@ def type_path(message: type[Message]) -> str:
 
 
 def is_built_in(message: type[Message]) -> bool:
-    """Whether the class is one of `dataflow.messages`, which every process knows."""
+    """Tells whether the class is one of `dataflow.messages`, which every process knows."""
     return message is Message or message.__module__.startswith("dataflow.messages.")
 
 
@@ -126,6 +124,8 @@ class Message(_Declared):
     SCALARS: ClassVar[tuple[ScalarField, ...]] = ()
     ARRAYS: ClassVar[tuple[ArrayField, ...]] = ()
     _names: ClassVar[frozenset[str]] = frozenset()
+    _made: ClassVar[Compiled | None] = None
+    """The functions made for this class, as soon as they are needed."""
 
     stamp: int
 
@@ -145,6 +145,7 @@ class Message(_Declared):
         cls.ARRAYS = tuple(f for f in cls.FIELDS if isinstance(f, ArrayField))
         cls._names = frozenset(f.name for f in cls.FIELDS)
         cls.SCHEMA = schema or cls.__name__
+        cls._made = None
         cls._register()
 
     @classmethod
@@ -158,9 +159,15 @@ class Message(_Declared):
         _registry[cls.SCHEMA] = cls
 
     def __init__(self, *, stamp: int, **values: Any) -> None:
+        """Constructs a message from values of any accepted form. Raises `MessageError`.
+
+        A class whose messages are constructed gets a constructor of its own, which comes here with what does not fit.
+        """
         cls = type(self)
+        if cls._made is None:
+            cls._compile()
         state = self.__dict__
-        state["stamp"] = _stamp(cls.SCHEMA, stamp)
+        state["stamp"] = canonical_stamp(cls.SCHEMA, stamp)
         unknown = values.keys() - cls._names
         if unknown:
             raise MessageError(
@@ -174,6 +181,24 @@ class Message(_Declared):
             state[aspec.name] = array_value(cls.SCHEMA, aspec, values.get(aspec.name), extents)
         self.validate()
 
+    @classmethod
+    def compiled(cls) -> Compiled:
+        """Returns the functions that are made for the class."""
+        return cls._made or cls._compile()
+
+    @classmethod
+    def _compile(cls) -> Compiled:
+        """Makes the functions of the class; its constructor too, unless somebody has written one."""
+        validates = cls.validate is not Message.validate
+        cls._made = made = compile_class(
+            cls, cls.SCHEMA, cls.SCALARS, cls.ARRAYS, Message.__init__, validates=validates
+        )
+        owner: Any = next(above for above in cls.__mro__ if "__init__" in vars(above))
+        written = owner is not Message and (owner._made is None or vars(owner)["__init__"] is not owner._made.construct)
+        if not written and made.construct is not None:
+            type.__setattr__(cls, "__init__", made.construct)
+        return made
+
     def validate(self) -> None:
         """Checks what the declaration cannot say (value ranges, relations between fields). Overridden by subclasses.
 
@@ -186,14 +211,16 @@ class Message(_Declared):
 
         The arrays must be views of memory that nobody writes to. Everything is validated as in the constructor.
         """
+        self = cls.__new__(cls)
+        if (cls._made or cls._compile()).adopt(self, stamp, header, arrays):
+            return self
         if len(header) != len(cls.SCALARS) or len(arrays) != len(cls.ARRAYS):
             raise MessageError(
                 f"{cls.SCHEMA} takes {len(cls.SCALARS)} header fields and {len(cls.ARRAYS)} arrays, "
                 f"got {len(header)} and {len(arrays)}"
             )
-        self = cls.__new__(cls)
         state = self.__dict__
-        state["stamp"] = _stamp(cls.SCHEMA, stamp)
+        state["stamp"] = canonical_stamp(cls.SCHEMA, stamp)
         for spec, value in zip(cls.SCALARS, header, strict=True):
             if value is None and not spec.optional:
                 raise MessageError(f"{cls.SCHEMA}.{spec.name} is required, got None")
@@ -214,11 +241,11 @@ class Message(_Declared):
 
     def header(self) -> tuple[Scalar | None, ...]:
         """The scalar fields in declaration order."""
-        return tuple(self.__dict__[f.name] for f in self.SCALARS)
+        return (self._made or self._compile()).header(self)
 
     def arrays(self) -> tuple[npt.NDArray[Any] | None, ...]:
         """The array fields in declaration order."""
-        return tuple(self.__dict__[f.name] for f in self.ARRAYS)
+        return (self._made or self._compile()).arrays(self)
 
     def nbytes(self) -> int:
         """Bytes held in arrays."""
@@ -233,17 +260,7 @@ class Message(_Declared):
 
     def compute_digest(self) -> bytes:
         """The digest computed afresh: a difference from `digest()` means that somebody changed frozen memory."""
-        h = xxhash.xxh3_128()
-        h.update(b"".join(_canonical_head(self)))
-        for data in self.arrays():
-            if data is None:
-                h.update(b"\x00")
-            else:
-                shape = data.shape
-                h.update(b"\x01" + data.dtype.str.encode() + struct.pack(f"<B{len(shape)}q", len(shape), *shape))
-                if data.size:
-                    h.update(data.data.cast("B"))
-        return h.digest()
+        return (self._made or self._compile()).digest(self)
 
     def replace(self, **changes: Any) -> Self:
         """A copy with some fields changed."""
@@ -281,6 +298,19 @@ class Message(_Declared):
         """Pickled by value and remade by the constructor, so that the arrays come back frozen."""
         return _remake, (type(self), dict(self.items()))
 
+    def _repr_html_(self) -> str:
+        """HTML for notebooks."""
+        from dataflow.messages.display import message_html
+
+        return message_html(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """A PNG file for notebooks, of messages that can be drawn."""
+        from dataflow.messages.display import image_file
+
+        found = image_file(self)
+        return found[1] if found is not None and found[0] == "png" else None
+
     def __repr__(self) -> str:
         words = [f"stamp={self.stamp}"]
         for f in self.FIELDS:
@@ -296,40 +326,7 @@ def _remake(cls: type[Message], values: dict[str, Any]) -> Message:
     return cls(**values)
 
 
-def _stamp(schema: str, stamp: Any) -> int:
-    if isinstance(stamp, (bool, float, str)) or not hasattr(stamp, "__index__"):
-        raise MessageError(f"{schema}.stamp must be an integer (nanoseconds since the epoch), got {stamp!r}")
-    value = int(stamp)
-    if not INT64_MIN < value < INT64_MAX:
-        raise MessageError(f"{schema}.stamp {value} is outside the 64-bit range of nanoseconds")
-    return value
-
-
 def _place(message: type[Message]) -> str:
     """The import path of a class and the file it stands in, for people."""
     file = getattr(sys.modules.get(message.__module__), "__file__", None)
     return type_path(message) + (f" ({file})" if file else "")
-
-
-def _canonical_head(message: Message) -> Iterator[bytes]:
-    """The bytes of schema, stamp and header fields that the digest covers; strings and lists carry their length."""
-    schema = message.SCHEMA.encode()
-    yield struct.pack("<I", len(schema)) + schema + struct.pack("<q", message.stamp)
-    for value in message.header():
-        match value:
-            case None:
-                yield b"n"
-            case bool():
-                yield b"T" if value else b"F"
-            case int():
-                yield b"i" + struct.pack("<q", value)
-            case float():
-                yield b"f" + struct.pack("<d", value)
-            case str():
-                text = value.encode()
-                yield b"s" + struct.pack("<I", len(text)) + text
-            case tuple():
-                yield b"l" + struct.pack("<I", len(value))
-                for word in value:
-                    text = word.encode()
-                    yield struct.pack("<I", len(text)) + text

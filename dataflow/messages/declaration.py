@@ -11,8 +11,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, ClassVar
 
-import numpy as np
-
 from dataflow.messages.base import Message, registered_type, type_path
 from dataflow.messages.fields import (
     MISSING,
@@ -24,6 +22,7 @@ from dataflow.messages.fields import (
     ScalarField,
     ScalarKind,
     canonical_scalar,
+    little_endian,
 )
 
 _BITS = ("8", "16", "32", "64")
@@ -182,7 +181,7 @@ def _field_from_json(values: Any) -> Field:
         raise TypeError(f"field {name!r}: optional is {optional!r}")
     if "kind" in values:
         return _scalar_from_json(name, doc, optional, values)
-    dtypes = tuple(np.dtype(_one_of(name, d, DTYPES)).newbyteorder("<") for d in values["dtypes"])
+    dtypes = tuple(little_endian(_one_of(name, d, DTYPES)) for d in values["dtypes"])
     shapes = tuple(tuple(_extent(name, extent) for extent in shape) for shape in values["shapes"])
     if not dtypes or not shapes or any(len(shape) > MAX_DIMENSIONS for shape in shapes):
         raise ValueError(f"field {name!r} has dtypes {values['dtypes']} and shapes {values['shapes']}")

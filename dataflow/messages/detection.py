@@ -1,4 +1,4 @@
-"""What a detector found: boxes in the image and in space."""
+"""Detections: boxes in the image and in space."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ from dataflow.messages.checks import parallel, within_length
 
 
 class Level(IntEnum):
-    """How serious a status is; the values of ROS's DiagnosticStatus."""
+    """Severity of a status; the values of ROS's DiagnosticStatus."""
 
     OK = 0
     """works"""

@@ -41,6 +41,11 @@ class ScalarField:
         return self.default is MISSING and not self.optional
 
 
+def little_endian(dtype: str) -> np.dtype[Any]:
+    """The dtype of that name, little-endian: the one object that numpy has for it, so that `is` tells it."""
+    return np.dtype(np.dtype(dtype).newbyteorder("<").str)
+
+
 @dataclass(frozen=True, slots=True)
 class ArrayField:
     """An array field.
@@ -109,8 +114,18 @@ def array(
     for extent in (e for s in shapes for e in s if isinstance(e, str)):
         if not SYMBOL.fullmatch(extent):
             raise MessageError(f"array shape {shape!r}: {extent!r} is neither a number nor a capitalised symbol")
-    dtypes = tuple(np.dtype(d.strip()).newbyteorder("<") for d in dtype.split("|"))
+    dtypes = tuple(little_endian(d.strip()) for d in dtype.split("|"))
     return ArrayField("", dtypes, shapes, doc, unit, optional or default is None)
+
+
+def canonical_stamp(schema: str, stamp: Any) -> int:
+    """Returns a stamp as an int. Raises `MessageError` for what is none."""
+    if isinstance(stamp, (bool, float, str)) or not hasattr(stamp, "__index__"):
+        raise MessageError(f"{schema}.stamp must be an integer (nanoseconds since the epoch), got {stamp!r}")
+    value = int(stamp)
+    if not INT64_MIN < value < INT64_MAX:
+        raise MessageError(f"{schema}.stamp {value} is outside the 64-bit range of nanoseconds")
+    return value
 
 
 def scalar_value(schema: str, spec: ScalarField, value: Any) -> Scalar | None:

@@ -31,7 +31,7 @@ class Image(Message):
 
     @property
     def is_color(self) -> bool:
-        """Whether there are three channels."""
+        """Tells whether there are three channels."""
         return self.data.ndim == 3
 
 

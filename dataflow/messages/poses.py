@@ -1,4 +1,4 @@
-"""Where things are and how they move: poses, transforms, odometry, velocities, paths, satellite fixes, particles."""
+"""Places and motions: poses, transforms, odometry, velocities, paths, satellite fixes, particles."""
 
 from __future__ import annotations
 

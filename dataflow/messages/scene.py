@@ -1,4 +1,4 @@
-"""What the scene means: objects and their relations, what is being done, appearance and language features."""
+"""The meaning of a scene: objects and their relations, what is being done, appearance and language features."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class SceneGraph(Message):
         return len(self.ids)
 
     def names(self) -> tuple[str, ...]:
-        """What to call each node: its label, else its class name and id."""
+        """Returns what to call each node: its label, else its class name and id."""
         if self.labels:
             return self.labels
         words = [self.class_names[c] if self.class_names else str(c) for c in self.class_ids.tolist()]
@@ -61,7 +61,7 @@ class SceneGraph(Message):
 
 
 class Activity(Message):
-    """What subjects (tracks, people, the robot) are doing."""
+    """Activities of subjects (tracks, people, the robot)."""
 
     class_names: tuple[str, ...] = scalar(
         "strs", "name of each activity, indexed by class id; empty where they have no names", default=()

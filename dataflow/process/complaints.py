@@ -15,10 +15,8 @@ AGAIN_AFTER = 10.0
 class Complaints:
     """Prints to stderr, but never waits for whoever reads it."""
 
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, printing: Callable[[str], bool] | None = None
-    ) -> None:
-        self._clock, self._print = clock, printing or print_without_waiting
+    def __init__(self, clock: Callable[[], float] | None = None, printing: Callable[[str], bool] | None = None) -> None:
+        self._clock, self._print = clock or time.monotonic, printing or print_without_waiting
         self._due: dict[str, float] = {}
         self._unprinted: Counter[str] = Counter()
 

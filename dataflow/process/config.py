@@ -1,16 +1,16 @@
-"""What the supervisor tells an operator process to be, in plain values."""
+"""Configuration of an operator process, as plain values."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 
 @dataclass(frozen=True, slots=True)
 class Resumed:
-    """Where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp of
-    each port, the parameters that were changed, and how often it has been restarted."""
+    """Says where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp
+    of each port, the parameters that were changed, and how often it has been restarted."""
 
     incarnation: int = 0
     last: Mapping[str, int] = field(default_factory=dict)
@@ -20,15 +20,18 @@ class Resumed:
 
 @dataclass(frozen=True, slots=True)
 class ProcessConfig:
-    """What the supervisor tells an operator process to be. Travels as plain values.
+    """Configuration of an operator process, from its supervisor. Travels as plain values.
 
     `publish` maps the local streams that other processes take (firing records included) to how many take them;
-    `subscribe` are the remote ones taken here. `secret` is the run's: only messages that were sealed with it count.
+    `subscribe` are the remote ones taken here. `listen` are the endpoints at which programs from outside reach it.
     `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`:
     whether a recorder takes the firing records. `live`: sources do not wait for the graph, and operators not for their
     inputs. `resume` is given to a process that takes the place of one that died: for each operator, where it had got
     to (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the
-    operators' states of that moment. `snapshots`: nanoseconds of event time between two snapshots of an operator.
+    operators' states of that moment. `rings_out` and `rings_in`: for each link to and from another process the keys of
+    its channels, after whether messages may be dropped for a consumer that takes nothing; their descriptors were handed
+    down in this order.
+    `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
     label: str
@@ -37,8 +40,6 @@ class ProcessConfig:
     publish: dict[str, int]
     subscribe: list[str]
     listen: list[str]
-    connect: list[str]
-    secret: str
     replay: dict[str, Any] | None = None
     window: tuple[int, int] = (256, 64 << 20)
     rate: float | None = None
@@ -48,7 +49,9 @@ class ProcessConfig:
     resume: dict[str, Any] | None = None
     snapshots: int | None = None
     warm: dict[str, Any] | None = None
+    rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
+    rings_in: Sequence[Sequence[str]] = ()
 
     def resumed(self, operator: str) -> Resumed:
-        """Where an operator had got to in the process before this one."""
+        """Tells where an operator had got to in the process before this one."""
         return Resumed(**(self.resume or {}).get(operator, {}))

@@ -24,7 +24,7 @@ class Feeding:
 
     @property
     def full(self) -> bool:
-        """Whether a step waits for room in the window."""
+        """Tells whether a step waits for room in the window."""
         return self._window.full and not self.ended
 
     @property

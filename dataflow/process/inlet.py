@@ -6,20 +6,16 @@ envelopes that contradict what their stream has said so far (`misplaced`). Neith
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 from dataflow.process.channel import Channel
 from dataflow.process.complaints import Complaints
 from dataflow.process.stream_order import StreamOrder
-from dataflow.transport import Bus, DecodeError, Envelope, Kind, decode
+from dataflow.transport import DecodeError, Envelope, Kind, decode
 
 Deliver = Callable[[str, Envelope], None]
 """Takes the next envelope of a stream."""
-
-
-STATICS_WITHIN = 5.0
 
 
 class StreamDamaged(RuntimeError):
@@ -37,9 +33,12 @@ class Inlet:
         *,
         static: Collection[str],
         live: bool,
+        from_start: bool = False,
         complaints: Complaints | None = None,
     ) -> None:
+        """`from_start`: this process takes its streams from their first message on, so one that is missing was lost."""
         self.label, self.live = label, live
+        self._first = (0, 0) if from_start else None
         self.received = 0
         """Envelopes that counted, for the proof of quiescence."""
         self.malformed = self.misplaced = 0
@@ -88,7 +87,7 @@ class Inlet:
         return {stream for stream in streams if stream in self._static} - self._seen
 
     def _order(self, stream: str) -> StreamOrder:
-        return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder())
+        return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder(self._first))
 
     def _take_static(self, stream: str, envelope: Envelope) -> None:
         """Takes the one message of a static stream, if it has one, and its end; both come again after a restart.
@@ -106,7 +105,12 @@ class Inlet:
             self._deliver(stream, envelope)
 
     def _take_in_order(self, stream: str, envelope: Envelope) -> None:
-        verdict = self._order(stream).take(envelope)
+        order = self._order(stream)
+        if order.goes_on(envelope):
+            self.received += 1
+            self._deliver(stream, envelope)
+            return
+        verdict = order.take(envelope)
         if verdict.refused:
             if verdict.damaged and not self.live:
                 raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")
@@ -125,24 +129,6 @@ class Inlet:
                 f"number {first} was due, {following} came"
             )
         self._channel.send("gap", stream=stream, first=first, following=following)
-
-
-def fetch_statics(bus: Bus, namespace: str, inlet: Inlet, streams: Collection[str]) -> None:
-    """Asks for the static ones of some streams, which were given before this process came to be.
-
-    Raises `StreamDamaged` when they do not come in time.
-    """
-    deadline = time.monotonic() + STATICS_WITHIN
-    while missing := inlet.statics_missing(streams):
-        for stream, payload in bus.fetch_statics(namespace, timeout=1.0).items():
-            if stream in missing:
-                inlet.take(stream, payload)
-        if time.monotonic() > deadline and (missing := inlet.statics_missing(streams)):
-            raise StreamDamaged(
-                f"process {inlet.label!r} was restarted and did not get the static streams "
-                f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"
-            )
-        time.sleep(0.01)
 
 
 def _described(envelope: Envelope) -> str:

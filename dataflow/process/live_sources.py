@@ -7,7 +7,6 @@ also ends the generator that it reads, so `close()` is never called while `strea
 from __future__ import annotations
 
 import contextlib
-import queue
 import sys
 import threading
 import time
@@ -22,6 +21,7 @@ from dataflow.firing.restarts import Restarts
 from dataflow.firing.source import SourceRunner, step_size, step_stamp
 from dataflow.messages.base import Message
 from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.inbox import Inbox
 from dataflow.process.pace import Pace
 
 MISSED_AFTER = 0.2
@@ -118,7 +118,7 @@ class LiveSources:
 
     def __init__(
         self,
-        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        inbox: Inbox,
         channel: Channel,
         pace: Pace,
         window: Window,
@@ -156,7 +156,7 @@ class LiveSources:
             self._read(runner, behind=self._resumed)
 
     def restarts_of(self, name: str) -> int:
-        """How often a source of this process was restarted here."""
+        """Tells how often a source of this process was restarted here."""
         return self._restarts[name].total if name in self._restarts else 0
 
     def begin_fault(self, kind: str, operator: str, fields: Mapping[str, Any]) -> bool:

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from dataflow.firing.failure import MOST_OF_A_TRACEBACK, cut
 from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.handed import Handed, take_handed
+from dataflow.process.inbox import Inbox
 
 if TYPE_CHECKING:
     from dataflow.graph.model import Graph
@@ -27,7 +29,7 @@ SWITCH_INTERVAL = 0.0005
 """Seconds that a thread may compute in Python before another gets its turn: Zenoh's threads must not wait long."""
 
 
-def _listen(channel: Channel, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None:
+def _listen(channel: Channel, inbox: Inbox) -> None:
     """Moves control messages to the inbox. When the supervisor is gone, makes sure that this process goes too."""
     try:
         while True:
@@ -43,10 +45,10 @@ def _make(
     kind: str,
     config: dict[str, Any],
     channel: Channel,
-    inbox: queue.SimpleQueue[tuple[Any, ...]],
-    handed: Sequence[int],
+    inbox: Inbox,
+    handed: Handed,
 ) -> Any:
-    """Makes the process that the supervisor asks for: "host" runs operators, "sink" takes whole streams."""
+    """Makes the process that the supervisor asks for: "operators" runs operators, "sink" takes whole streams."""
     if kind == "sink":
         from dataflow.process.sink import SinkConfig, SinkProcess
 
@@ -55,7 +57,7 @@ def _make(
     from dataflow.process.config import ProcessConfig
     from dataflow.process.operator_process import OperatorProcess
 
-    return OperatorProcess(ProcessConfig(**config), channel, inbox, box=handed[0] if handed else None)
+    return OperatorProcess(ProcessConfig(**config), channel, inbox, handed.outgoing, box=handed.box)
 
 
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
@@ -72,7 +74,7 @@ def _viewer_file(config: SinkConfig, graph: Graph) -> StreamSink:
     return ViewerFileSink(config.options["path"], graph, config.streams)
 
 
-def _show_name(label: str) -> None:
+def show_name(label: str) -> None:
     """Gives this process the name that ps, top and htop show: the first 15 bytes of its label, as Linux allows."""
     with contextlib.suppress(OSError):  # no /proc here: it keeps the name of the interpreter
         Path("/proc/self/comm").write_bytes(label.encode()[:15])
@@ -99,7 +101,7 @@ def _report(channel: Channel, error: BaseException, phase: str) -> None:
         print(text, file=sys.stderr)
 
 
-def _await_leave(inbox: queue.SimpleQueue[tuple[Any, ...]]) -> str:
+def _await_leave(inbox: Inbox) -> str:
     """After a failure: waits (bounded) until the supervisor has dealt with it; returns the outcome it names."""
     deadline = time.monotonic() + LEAVE_WITHIN
     while (left := deadline - time.monotonic()) > 0:
@@ -115,23 +117,23 @@ def _await_leave(inbox: queue.SimpleQueue[tuple[Any, ...]]) -> str:
 def main(descriptor: int, handed: Sequence[int]) -> int:
     """Runs one process to its end; returns the exit code.
 
-    `descriptor` is its end of the control channel, `handed` what it inherits besides: in a live run the memory for its
-    firing records.
+    `descriptor` is its end of the control channel, `handed` what it inherits besides (`take_handed`).
     """
     for each in handed:
         os.set_inheritable(each, False)  # operators' own processes get none of it
     channel = Channel(descriptor)
-    inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
     try:
         kind, config = channel.receive()
     except ChannelClosed:
         return SUPERVISOR_GONE
-    _show_name(config["label"])
+    show_name(config["label"])
+    given = take_handed(handed, config)
+    inbox = Inbox(given.wake, given.incoming)
     sys.setswitchinterval(SWITCH_INTERVAL)
     threading.Thread(target=_listen, args=(channel, inbox), name="control", daemon=True).start()
     code, process, phase = 0, None, "starting"
     try:
-        process = _make(kind, config, channel, inbox, handed)
+        process = _make(kind, config, channel, inbox, given)
         process.open()
         phase = "running"
         process.run()

@@ -11,9 +11,7 @@ BLOCKED, BLOCKED_LIVE = 30.0, 2.0
 """Seconds that a publication waits for a subscriber that takes nothing. A live run loses messages rather than time."""
 
 
-def network_config(
-    network: Network, secret: str, listen: Iterable[str], connect: Iterable[str], *, live: bool
-) -> NetworkConfig:
+def network_config(network: Network, listen: Iterable[str], *, live: bool) -> NetworkConfig:
     """Returns a process's configuration: its own endpoints, and what the graph says of TLS and other machines."""
     settings = {
         "transport/link/tls": dict(network.tls),
@@ -22,9 +20,7 @@ def network_config(
     }
     return NetworkConfig(
         listen=tuple(listen),
-        connect=(*connect, *network.connect),
-        shared_memory=network.shared_memory,
-        secret=secret,
+        connect=tuple(network.connect),
         blocked=BLOCKED_LIVE if live else BLOCKED,
         exposed=not network.loopback_only,
         zenoh={path: value for path, value in settings.items() if value},

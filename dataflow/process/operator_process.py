@@ -7,10 +7,11 @@ when there is nothing to do.
 
 from __future__ import annotations
 
+import gc
 import queue
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dataflow.chaos.faults import OperatorFaults
@@ -22,10 +23,12 @@ from dataflow.graph.model import Graph, Node
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
-from dataflow.process.inlet import Inlet, fetch_statics
+from dataflow.process.handed import BACKLOG
+from dataflow.process.inbox import Inbox
+from dataflow.process.inlet import Inlet, StreamDamaged
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.network import network_config
-from dataflow.process.outlet import Links, Outlet, incarnations_of
+from dataflow.process.outlet import Network, Outlet, incarnations_of
 from dataflow.process.pace import Pace
 from dataflow.process.planned_faults import do_fault
 from dataflow.process.progress import Progress
@@ -33,15 +36,17 @@ from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
-from dataflow.transport import Bus, Envelope, TapServer
-from dataflow.transport.publisher import BusError
+from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
+from dataflow.transport.fanout import POOL_BYTES
 
 IDLE_WAIT = 0.1
 TAKE_WITHIN = 0.001
 """Seconds for what has arrived, before what is decided is run; live runs take all, to know the newest."""
 PROBE_EVERY = 0.01
-BACKLOG = (16, 8)
-"""How many windows of messages and of bytes may wait for operators that no source waits for."""
+STATICS_WITHIN = 5.0
+
+Links = Sequence[tuple[Sequence[str], Outgoing]]
+"""The links to other processes, each with the keys of its channels."""
 
 
 class OperatorProcess:
@@ -51,7 +56,8 @@ class OperatorProcess:
         self,
         config: ProcessConfig,
         channel: Channel,
-        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        inbox: Inbox,
+        outgoing: Links = (),
         box: int | None = None,
     ) -> None:
         """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
@@ -70,10 +76,13 @@ class OperatorProcess:
             self._deliver,
             static=self.static,
             live=config.live,
+            from_start=config.live and config.resume is None,
         )
+        pool_bytes = POOL_BYTES if self.graph.network.shared_memory else 0
         self.outlet = Outlet(
             channel,
             self.runners.taking,
+            fanout=Fanout(outgoing, pool_bytes=pool_bytes),
             namespace=self.graph.namespace,
             static=self.static,
             live=config.live,
@@ -98,13 +107,13 @@ class OperatorProcess:
     def open(self) -> None:
         """Joins the network, makes the operators and sets them up, then tells the supervisor that it is ready."""
         config, graph = self.config, self.graph
-        settings = network_config(graph.network, config.secret, config.listen, config.connect, live=config.live)
+        settings = network_config(graph.network, config.listen, live=config.live)
         self.bus = Bus(settings)
+        self.outside = OutsidePublisher(self.bus.counted, lossless=not config.live)
         self.taps = TapServer(self.bus, graph.namespace)
-        publishers = {s: self.bus.publisher(s, consumers=consumers) for s, consumers in config.publish.items()}
-        self.outlet.open(Links(self.bus, self.taps, publishers, config.publish))
-        for stream in config.subscribe:
-            self.bus.subscribe(stream, self._receiver(stream))
+        made = {*config.publish, *(s for name in config.nodes for s in graph.nodes[name].outputs.values())}
+        publishers = {stream: self.bus.publisher(stream) for stream in sorted(made)}
+        self.outlet.open(Network(self.bus, self.taps, self.outside, publishers))
         self.channel.send("joined")
         for stream in config.subscribe:
             graph.message_types(stream)  # its messages may be of a type that no operator here names
@@ -112,12 +121,24 @@ class OperatorProcess:
         self.requests.serve(self.bus, graph.namespace, self.inbox)
         self.set_up()
         if config.resume is not None:
-            fetch_statics(self.bus, graph.namespace, self.inlet, config.subscribe)
+            self._await_statics()
         for log in self.feeding.logs:
             log.setup()
         first = [*self.feeding.first_stamps(), *self.live.first_stamps()]
         lengths = [n for source in self.runners.sources if (n := source.source.length()) is not None]
         self.channel.send("ready", first=min(first, default=None), steps=sum(lengths) if lengths else None)
+
+    def _await_statics(self) -> None:
+        """Waits (bounded) for the static messages that were given before this process came to be: those who made them
+        send them again. Raises `StreamDamaged`."""
+        deadline = time.monotonic() + STATICS_WITHIN
+        while (missing := self.inlet.statics_missing(self.config.subscribe)) and not self._left:
+            if time.monotonic() > deadline:
+                raise StreamDamaged(
+                    f"process {self.config.label!r} was restarted and did not get the static streams "
+                    f"{', '.join(sorted(missing))} within {STATICS_WITHIN:g} s"
+                )
+            self._take(PROBE_EVERY)
 
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
@@ -153,14 +174,7 @@ class OperatorProcess:
         limit_threads(self.graph.threads)
         for maker in self.runners.all:
             maker.setup()
-
-    def _receiver(self, stream: str) -> Callable[[Any], None]:
-        put = self.inbox.put
-
-        def receive(payload: Any) -> None:
-            put(("envelope", stream, payload))
-
-        return receive
+        gc.freeze()  # modules and operators live as long as the process: collections need not look at them
 
     def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
         self.channel.send(
@@ -172,7 +186,8 @@ class OperatorProcess:
         while True:
             if self._probing:
                 self.outlet.probe()
-            self._take(self._wait_time())
+            self.outlet.push()
+            self._take(self._wait_time() if self.inbox.empty() else 0.0)
             if self._left:
                 break
             self.live.restart_due()
@@ -186,6 +201,7 @@ class OperatorProcess:
         """Sends the firing records that were not sent yet: after a failure here, the failed one among them."""
         if self._released:
             self.outlet.flush_all()
+            self.outlet.push_all()
 
     def close(self) -> None:
         """Closes every operator and the network; the first error is raised when all are closed."""
@@ -206,6 +222,8 @@ class OperatorProcess:
         for log in self.feeding.logs:
             log.close()
         self.taps.close()
+        self.outside.close()
+        self.outlet.close()
         try:
             self.bus.close()
         except BusError as error:  # a neighbour that hangs takes no leave; everything that was to be done is done
@@ -218,8 +236,8 @@ class OperatorProcess:
     def _wait_time(self) -> float:
         if self._probing:
             return PROBE_EVERY
-        patient = (runner.next_due() for runner in self.runners.operators)
-        due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), *patient]
+        patient = self.runners.ready.next_due()
+        due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), patient]
         return max(0.0, min(seconds for seconds in due if seconds is not None))
 
     def _next_due(self) -> float | None:
@@ -272,6 +290,8 @@ class OperatorProcess:
             if self._step_all() or (self.inbox.empty() and self._admit()):
                 worked = True
             elif self.inbox.empty():
+                if not self.feeding.feeds:
+                    break
                 self.feeding.promise()
                 if not self._step_all():
                     break
@@ -284,13 +304,10 @@ class OperatorProcess:
         return worked
 
     def _step_all(self) -> bool:
-        """One step of every operator, last ones first, so that what is under way is done before more is begun."""
+        """One step of every operator that has something to do."""
         if self.config.live and not self._released:
             return False  # a restarted process is sent messages before it is told what time it is
-        worked = False
-        for runner in reversed(self.runners.operators):
-            worked = runner.step() or worked
-        return worked
+        return self.runners.ready.step()
 
     def _admit(self) -> bool:
         return self._released and not self._stopping and self.feeding.admit()
@@ -300,8 +317,12 @@ class OperatorProcess:
             self._ended = True
             self.outlet.flush_all()
             self.progress.report(idle=True)
-            transport = {**self.bus.counters(), "malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
-            self.channel.send("ended", report=self.progress.final_report(transport))
+            self.channel.send("ended", report=self.progress.final_report(self._moved()))
+
+    def _moved(self) -> dict[str, int]:
+        """Counts what has passed between this process and others."""
+        refused = {"malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
+        return self.outlet.counters() | self.inbox.counters() | self.bus.counters() | refused
 
     def _answer_poll(self, *, idle: bool) -> None:
         """Answers after the work that was there: a process is idle only when a look at everything found nothing."""
@@ -355,6 +376,8 @@ class OperatorProcess:
                 self._stopping = True
                 self.feeding.finish("interrupted")
                 self.live.finish("interrupted")
+            case "gone":
+                self.outlet.consumer_gone(fields["ring"])
             case "lacks":
                 self.outlet.send_again(fields["operator"])
             case "leave":
@@ -366,5 +389,6 @@ class OperatorProcess:
         self._probing, self._released = False, True
         self.outlet.release()
         self.pace.begin(first, at)
+        self.runners.ready.wake_all()
         self.live.start()
         self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)

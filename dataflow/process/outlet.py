@@ -1,9 +1,9 @@
-"""Where the operators of a process put what they make: messages, frontiers and firing records."""
+"""The outlet takes what the operators of a process make: messages, frontiers and firing records."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -14,10 +14,23 @@ from dataflow.process.recent import RecentFirings
 from dataflow.records.black_box import BlackBox
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.sync import NEVER, Entry
-from dataflow.transport import Bus, Envelope, Kind, StreamPublisher, TapServer, encode
+from dataflow.transport import (
+    Bus,
+    Envelope,
+    Fanout,
+    Kind,
+    Outgoing,
+    OutsidePublisher,
+    StreamPublisher,
+    TapServer,
+    encode,
+    encode_parts,
+)
+from dataflow.transport.codec import parts_size
 
 BATCH_RECORDS = 64
 BATCH_SECONDS = 0.25
+PUSH_WITHIN = 2.0
 
 
 class Consumer(Protocol):
@@ -34,23 +47,22 @@ class Consumer(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Links:
-    """What an outlet publishes through: the bus, its taps, a publisher for each stream that other processes take, and
-    how many of them do."""
+class Network:
+    """Holds what an outlet publishes through besides its links: the bus, its taps, and a publisher for each stream."""
 
     bus: Bus
     taps: TapServer
+    outside: OutsidePublisher
     publishers: Mapping[str, StreamPublisher]
-    takers: Mapping[str, int]
 
 
 class Outlet:
     """The emitter of all operators of a process: to local aligners by reference, to other processes and taps as
     envelopes.
 
-    `live`: the supervisor is told that a stream has ended. `box`: what keeps the latest firing records should this
-    process die. `firings`: whether a recorder takes the firing records. `incarnations`: by stream, the ones that begin
-    above 0.
+    `fanout`: the links to the others. `live`: the supervisor is told that a stream has ended. `box`: what keeps the
+    latest firing records should this process die. `firings`: whether a recorder takes the firing records.
+    `incarnations`: by stream, the ones that begin above 0.
     """
 
     def __init__(
@@ -58,6 +70,7 @@ class Outlet:
         channel: Channel,
         consumers: Callable[[str], Iterable[Consumer]],
         *,
+        fanout: Fanout,
         namespace: str,
         static: frozenset[str],
         live: bool,
@@ -69,80 +82,145 @@ class Outlet:
         self.recent = RecentFirings()
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
         self._live, self._box, self._firings = live, box, firings
-        self._links: Links | None = None
-        self._held: list[tuple[str, Envelope | bytes]] | None = []
+        self._network: Network | None = None
+        self._fanout = fanout
+        self._once: dict[str, list[Envelope]] = {}
+        """What was said on static streams: a consumer that was started again gets it again."""
+        self._held: list[tuple[str, Envelope | bytes, bool]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
         self._logs: dict[str, list[FiringRecord]] = {}
         self._flushed = time.monotonic()
 
-    def open(self, links: Links) -> None:
+    def open(self, network: Network) -> None:
         """Begins to publish static streams to late joiners, and copies to taps; the rest waits for `release`."""
-        self._links = links
+        self._network = network
 
     def release(self) -> None:
         """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
         held, self._held = self._held or [], None
-        for stream, envelope in held:
-            self._send(stream, envelope)
+        for key, said, droppable in held:
+            if isinstance(said, Envelope):
+                self._send(key, said, droppable=droppable)
+            else:
+                self._send_bytes(key, said)
 
     def probe(self) -> None:
         """Sends a probe on every key that another process takes."""
-        for publisher in self._publishers.values():
-            publisher.probe()
+        for stream, takers in self._fanout.takers.items():
+            parts = encode_parts(Envelope(Kind.PROBE, stream, 0, 0, 0))
+            for link, channel in takers:
+                if not link.waiting:
+                    link.send(channel, parts, parts_size(parts))
 
-    @property
-    def _publishers(self) -> Mapping[str, StreamPublisher]:
-        return {} if self._links is None else self._links.publishers
+    def push(self) -> None:
+        """Sends what has waited for room, as far as there is some, and static messages to who was started again."""
+        for keys, link in self._fanout.joined():
+            if self._held is None:
+                self._say_again(keys, link)
+        self._fanout.flush()
 
-    def _send(self, stream: str, envelope: Envelope | bytes) -> None:
-        publisher = self._publishers.get(stream)
-        if publisher is None:
-            return
+    def _say_again(self, keys: Sequence[str], link: Outgoing) -> None:
+        for number, key in enumerate(keys):
+            for envelope in self._once.get(key, ()):
+                parts = encode_parts(envelope)
+                link.send(number, parts, parts_size(parts), droppable=False)
+                self.sent += 1
+
+    def push_all(self) -> None:
+        """Waits (bounded) until everything has room: before this process leaves."""
+        deadline = time.monotonic() + PUSH_WITHIN
+        while not self._fanout.flush() and time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    def consumer_gone(self, number: int) -> None:
+        """The process at the other end of a link has died."""
+        self._fanout.take_leave(number)
+
+    def counters(self) -> dict[str, int]:
+        """Returns what was sent to other processes (`Fanout.counters`)."""
+        return self._fanout.counters()
+
+    def close(self) -> None:
+        """Lets go of the memory that other processes read."""
+        self._fanout.close()
+
+    def _listened(self, stream: str) -> StreamPublisher | None:
+        """Returns the publisher of a stream to which somebody outside the run subscribes."""
+        publisher = None if self._network is None else self._network.publishers.get(stream)
+        return publisher if publisher is not None and publisher.matched else None
+
+    def _send(self, stream: str, envelope: Envelope, *, droppable: bool = True) -> None:
+        """Sends to every process that takes a stream, and over the network if anybody there subscribes to it."""
         if self._held is not None:
-            self._held.append((stream, envelope))
+            self._held.append((stream, envelope, droppable))
             return
-        assert self._links is not None
-        self.sent += self._links.takers[stream]
-        if isinstance(envelope, bytes):
-            publisher.put_bytes(envelope)
-        else:
-            publisher.put(envelope)
+        listened = self._listened(stream)
+        if listened is None and stream not in self._fanout.takers:
+            return
+        parts = encode_parts(envelope)
+        if listened is not None and self._network is not None:
+            self._network.outside.put(listened, b"".join(parts))
+        self.sent += self._fanout.send(stream, parts, envelope=envelope, droppable=droppable)
+
+    def _send_records(self, operator: str, batch: bytes) -> None:
+        """Sends firing records, to the recorder and to who subscribes to them from outside."""
+        self._send_bytes(firings_key(self._namespace, operator), batch)
+
+    def _send_bytes(self, key: str, batch: bytes) -> None:
+        if self._held is not None:
+            self._held.append((key, batch, False))
+            return
+        listened = self._listened(key)
+        if listened is not None and self._network is not None:
+            self._network.outside.put(listened, batch)
+        self.sent += self._fanout.send(key, [batch], droppable=False)
 
     def message(self, stream: str, entry: Entry) -> None:
         for consumer in self._consumers(stream):
             consumer.push(stream, entry)
-        message: Message = entry.value
-        envelope = Envelope(
-            Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=time.time_ns()
-        )
-        links = self._links
-        if links is not None and stream in self._static:
-            links.bus.declare_static(stream, encode(envelope))
         begun = entry.incarnation != self._next.get(stream, (0, 0))[0]
         self._next[stream] = entry.incarnation, entry.seq + 1
-        self._send(stream, envelope)
-        if begun and stream in self._publishers:  # by this a taker knows that the new incarnation is the stream's own
+        static, network = stream in self._static, self._network
+        tapped = network is not None and network.taps.active
+        if not (static or tapped or self._is_taken(stream)):
+            return
+        message: Message = entry.value
+        now = time.time_ns()
+        envelope = Envelope(Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=now)
+        if static:
+            self._once[stream] = [envelope]
+            if network is not None:
+                network.bus.declare_static(stream, encode(envelope))
+        self._send(stream, envelope, droppable=not static)
+        if begun:  # by this a taker knows that the new incarnation is the stream's own
             self._send(stream, self._envelope(Kind.FRONTIER, stream, entry.stamp))
-        if links is not None and links.taps.active:
-            links.taps.offer(stream, envelope)
+        if network is not None and tapped:
+            network.taps.offer(stream, envelope)
+
+    def _is_taken(self, stream: str) -> bool:
+        """Whether anybody outside this process takes a stream; before `release` somebody still may."""
+        return self._held is not None or stream in self._fanout.takers or self._listened(stream) is not None
 
     def frontier(self, stream: str, frontier: int) -> None:
         for consumer in self._consumers(stream):
             consumer.advance(stream, frontier)
-        if stream in self._publishers:
+        if self._is_taken(stream):
             self._send(stream, self._envelope(Kind.FRONTIER, stream, frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         for consumer in self._consumers(stream):
             consumer.end(stream, final_stamp, reason)
         if stream in self._static:
-            self._send(stream, self._envelope(Kind.END, stream, NEVER, reason))
+            over = self._envelope(Kind.END, stream, NEVER, reason)
+            self._once.setdefault(stream, []).append(over)
+            self._send(stream, over, droppable=False)
             return
         if self._live:
             self._channel.send("stream_ended", stream=stream, reason=reason)
         if final_stamp is not None:  # by this a taker that has lost the last messages believes the end
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, final_stamp))
-        self._send(stream, self._envelope(Kind.END, stream, NEVER if final_stamp is None else final_stamp, reason))
+            self._send(stream, self._envelope(Kind.FRONTIER, stream, final_stamp), droppable=False)
+        over = self._envelope(Kind.END, stream, NEVER if final_stamp is None else final_stamp, reason)
+        self._send(stream, over, droppable=False)
 
     def _envelope(self, kind: Kind, stream: str, stamp: int, reason: str = "") -> Envelope:
         incarnation, seq = self._next.get(stream, (0, 0))
@@ -163,7 +241,7 @@ class Outlet:
     def flush(self, operator: str, *, last: bool = False) -> None:
         log = self._logs.get(operator)
         if log:
-            self._send(firings_key(self._namespace, operator), encode_batch(log, last=last))
+            self._send_records(operator, encode_batch(log, last=last))
             log.clear()
 
     def flush_due(self) -> None:
@@ -182,12 +260,12 @@ class Outlet:
             return
         for part in consecutive(self._box.kept(operator)):
             for first in range(0, len(part), BATCH_RECORDS):
-                self._send(firings_key(self._namespace, operator), encode_batch(part[first : first + BATCH_RECORDS]))
+                self._send_records(operator, encode_batch(part[first : first + BATCH_RECORDS]))
 
     def put_raw(self, stream: str, payload: bytes) -> None:
         """Publishes bytes that are no envelope: a planned fault."""
-        if self._links is not None:
-            self._links.bus.session.put(stream, payload)
+        if self._network is not None:
+            self._network.bus.session.put(stream, payload)
 
 
 def incarnations_of(resumed: Mapping[str, Any], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from dataflow.feeds.log import LogFeed
@@ -15,9 +15,11 @@ from dataflow.process.feeding import Feeding
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.runners import Runners
 
-REPORT_EVERY = 0.004
-REPORT_IDLE = 0.002
+REPORT_EVERY = 0.02
+REPORT_IDLE = 0.01
 """Seconds between two reports of a process that has nothing more to do: others may be waiting for this one."""
+COUNT_EVERY = 0.05
+"""Seconds between two counts of what operators have done, while there is more to do. Flow control needs none."""
 
 
 class Progress:
@@ -29,17 +31,20 @@ class Progress:
         runners: Runners,
         feeding: Feeding,
         live: LiveSources,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] | None = None,
     ) -> None:
         self._channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
-        self._clock = clock
+        self._clock = clock or time.monotonic
         self.counted: dict[str, list[int]] = {}
-        """The counts that were last reported."""
+        """The counts that were last reported, of all operators."""
         self.waited: dict[str, list[list[Any]]] = {}
         """The waits that were last reported."""
         self.behind: dict[str, list[float]] = {}
         """By how much sources were last reported to be behind the clock (s): when read, and when sent."""
         self._dropped: dict[str, list[list[Any]]] = {}
+        self._counted: dict[str, tuple[int, int]] = {}
+        self._count_due = -COUNT_EVERY
+        self._uncounted = False
         self._done: dict[str, int] = {}
         self._firings = 0
         self._reported = -REPORT_EVERY
@@ -48,26 +53,35 @@ class Progress:
     def report(self, *, idle: bool) -> None:
         """Sends what has changed, if it is time to."""
         now = self._clock()
-        self._owed = False
-        if not idle and now < self._reported + REPORT_EVERY:
+        if now < self._reported + (REPORT_IDLE if idle else REPORT_EVERY):
+            self._owed = self._owed or idle
             return
+        self._owed = False
         done = {r.node.name: r.done for r in self._runners.operators if self._done.get(r.node.name) != r.done}
         firings = self._made()
-        if not done and firings == self._firings:
-            return
-        if now < self._reported + (REPORT_IDLE if done else REPORT_EVERY):
-            self._owed = True
+        counts_due = idle or now >= self._count_due
+        if not done and firings == self._firings and not (self._uncounted and counts_due):
             return
         self._reported = now
         self._done.update(done)
         self._firings = firings
-        self.counted = self.counts()
-        drops = {name: found for name, found in self.drops().items() if found != self._dropped.get(name)}
+        changed: list[Runner] = []
+        self._uncounted = not counts_due
+        if counts_due:
+            self._count_due = now + COUNT_EVERY
+            for runner in self._runners.operators:
+                reached = runner.firings, runner.done
+                if self._counted.get(runner.node.name) != reached:
+                    self._counted[runner.node.name] = reached
+                    changed.append(runner)
+        counts = self._counts_of(changed)
+        self.counted |= counts
+        drops = {name: found for name, found in self._drops_of(changed).items() if found != self._dropped.get(name)}
         self._dropped |= drops
-        waits = {name: found for name, found in self.waits().items() if found != self.waited.get(name)}
+        waits = {name: found for name, found in self._waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
         self.behind = self._live.behind()
-        self._channel.send("progress", done=done, counts=self.counted, drops=drops, waits=waits, behind=self.behind)
+        self._channel.send("progress", done=done, counts=counts, drops=drops, waits=waits, behind=self.behind)
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""
@@ -77,33 +91,34 @@ class Progress:
         operators = sum(runner.firings for runner in self._runners.operators)
         return operators + sum(f.firings for f in self._feeding.feeds) + sum(s.firings for s in self._live.runners)
 
-    def counts(self) -> dict[str, list[int]]:
-        """For each operator: firings, messages emitted, messages dropped, CPU time (ns), last stamp, wall time (ns)."""
+    def _counts_of(self, operators: Iterable[Runner]) -> dict[str, list[int]]:
+        """For all sources and some operators: firings, messages emitted, messages dropped, CPU time (ns), last stamp,
+        wall time (ns)."""
         counts = {}
         for source in self._runners.sources:
             refused = source.refused.total()
             counts[source.node.name] = _row(source, source.ports.emitted, refused, source.last)
-        for runner in self._runners.operators:
+        for runner in operators:
             drops = sum(runner.drops.values())
             counts[runner.node.name] = _row(runner, runner.ports.emitted, drops, runner.done)
         for log in self._feeding.logs:
-            counts["@log"] = _row(log, sum(n for _, n, _ in log.counts()), 0, log.last)
+            counts["@log"] = _row(log, log.emitted, 0, log.last)
         return counts
 
-    def drops(self) -> dict[str, list[list[Any]]]:
-        """For each operator: input ("" for a source), reason and number of what it dropped."""
-        return {
-            r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in self._runners.operators
-        } | {s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self._live.runners}
+    def _drops_of(self, operators: Iterable[Runner]) -> dict[str, list[list[Any]]]:
+        """For all sources and some operators: input ("" for a source), reason and number of what they dropped."""
+        return {r.node.name: [[i, why, n] for (i, why), n in sorted(r.drops.items())] for r in operators} | {
+            s.node.name: [["", why, n] for why, n in sorted(s.refused.items())] for s in self._live.runners
+        }
 
-    def waits(self) -> dict[str, list[list[Any]]]:
-        """For each operator: input, "timeout" or "late", and number: waits given up, and messages that came late."""
+    def _waits_of(self, operators: Iterable[Runner]) -> dict[str, list[list[Any]]]:
+        """For some operators: input, "timeout" or "late", and number: waits given up, and messages that came late."""
         return {
             r.node.name: [
                 *([i, "timeout", n] for i, n in sorted(r.timeouts.items())),
                 *([i, "late", n] for i, n in sorted(r.late.items())),
             ]
-            for r in self._runners.operators
+            for r in operators
         }
 
     def waiting(self) -> dict[str, list[Any]]:
@@ -111,19 +126,18 @@ class Progress:
         return {r.node.name: list(r.waiting()) for r in self._runners.operators if not r.ended}
 
     def final_report(self, transport: Mapping[str, int]) -> dict[str, Any]:
-        """What came of everything; `transport`: what the process has moved."""
+        """Returns what came of everything; `transport`: what the process has moved."""
         streams: dict[str, list[Any]] = {}
         for maker in self._runners.all:
             for state in maker.ports.states.values():
-                assert state.digest is not None
                 streams[state.stream] = [state.digest.count, state.digest.hexdigest()]
         for log in self._feeding.logs:
             streams |= {name: [count, digest] for name, count, digest in log.counts()}
         return {
             "streams": streams,
-            "counts": self.counts(),
-            "drops": self.drops(),
-            "waits": self.waits(),
+            "counts": self._counts_of(self._runners.operators),
+            "drops": self._drops_of(self._runners.operators),
+            "waits": self._waits_of(self._runners.operators),
             "summaries": {r.node.name: s for r in self._runners.operators if (s := _summary(r))},
             "transport": dict(transport),
         }

@@ -9,7 +9,10 @@ from dataclasses import replace
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 
 KEPT = 256
-"""Firings of one operator that are kept."""
+"""Firings of one operator that are kept, at most."""
+KEPT_IN_ALL, KEPT_AT_LEAST = 4096, 32
+"""Firings of all operators together, and of each one however many there are: what is kept has to stay in the caches of
+the CPU, and the garbage collector looks at all of it."""
 OVER = 10.0
 """Seconds before a request from which firings are answered."""
 
@@ -28,9 +31,15 @@ class RecentFirings:
         if record.kind in ("fire", "tick") and record.outcome == "ok":
             kept = self._kept.get(record.operator)
             if kept is None:
-                kept = self._kept[record.operator] = deque(maxlen=KEPT)
+                kept = self._add(record.operator)
             bare = replace(record, drops=(), detail={}) if record.drops or record.detail else record
             kept.append(bare)
+
+    def _add(self, operator: str) -> deque[FiringRecord]:
+        """Begins to keep firings of one more operator, at the expense of the others where they are many."""
+        share = max(KEPT_AT_LEAST, min(KEPT, KEPT_IN_ALL // (len(self._kept) + 1)))
+        self._kept = {name: deque(kept, share) for name, kept in self._kept.items()} | {operator: deque(maxlen=share)}
+        return self._kept[operator]
 
     def batches(self, now: int | None = None) -> list[bytes]:
         """Returns the firings of the last seconds, in batches; from any thread.

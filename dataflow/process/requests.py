@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable
 from typing import Any
 
@@ -11,6 +10,7 @@ import msgpack
 from dataflow.firing.source import SourceRunner
 from dataflow.operator import ParameterError, is_live
 from dataflow.process.config import ProcessConfig
+from dataflow.process.inbox import Inbox
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.progress import Progress
 from dataflow.process.recent import RecentFirings
@@ -28,7 +28,7 @@ class Requests:
         self._config, self._runners, self._live = config, runners, live
         self._progress, self._recent = progress, recent
 
-    def serve(self, bus: Bus, namespace: str, inbox: queue.SimpleQueue[tuple[Any, ...]]) -> None:
+    def serve(self, bus: Bus, namespace: str, inbox: Inbox) -> None:
         """Declares what is answered."""
         for name in self._config.nodes:
             bus.serve(runtime_key(namespace, "param", name), _to_inbox(inbox, name))
@@ -63,7 +63,7 @@ class Requests:
         """
         with query:
             status: dict[str, Any] = {
-                "host": self._config.label,
+                "process": self._config.label,
                 "counts": self._progress.counted,
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,
@@ -75,7 +75,7 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(status))
 
     def _restarts_of(self, maker: Maker) -> int:
-        """How often an operator was restarted, by this process and in the processes before it."""
+        """Tells how often an operator was restarted, by this process and in the processes before it."""
         here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
         return self._config.resumed(maker.node.name).restarts + here
 
@@ -90,7 +90,7 @@ def _asks_for_firings(query: Any) -> bool:
         return False
 
 
-def _to_inbox(inbox: queue.SimpleQueue[tuple[Any, ...]], name: str) -> Callable[[Any], None]:
+def _to_inbox(inbox: Inbox, name: str) -> Callable[[Any], None]:
     put = inbox.put
 
     def asked(query: Any) -> None:

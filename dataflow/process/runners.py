@@ -12,6 +12,7 @@ from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.live import LiveRunner
 from dataflow.firing.ports import Emitter
 from dataflow.firing.protocol import Runner
+from dataflow.firing.ready import Ready
 from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Graph, Node
@@ -31,6 +32,8 @@ class Runners:
     def __init__(self) -> None:
         self.sources: list[SourceRunner] = []
         self.operators: list[Runner] = []
+        self.ready = Ready()
+        """Those of them that have something to do."""
         self.consumers: dict[str, list[Runner]] = {}
         self.faults: dict[str, OperatorFaults] = {}
         """What is done on purpose to the operators of a live run."""
@@ -45,6 +48,7 @@ class Runners:
 
     def add(self, runner: Runner) -> None:
         self.operators.append(runner)
+        self.ready.add(runner)
         for stream in {s for streams in runner.node.inputs.values() for s in streams}:
             self.consumers.setdefault(stream, []).append(runner)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import queue
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -20,32 +20,31 @@ from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
-from dataflow.process.network import network_config
 from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
-from dataflow.transport import Bus, Envelope, Kind
+from dataflow.transport import Envelope, Kind
 from dataflow.transport.envelope import MAGIC
 
 IDLE_WAIT = 0.1
 REPORT_EVERY = 0.01
 FLUSH_EVERY = 1.0
-DRAIN_QUIET = 0.2
 DRAIN_WITHIN = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class SinkConfig:
-    """What the supervisor tells a sink process to be: `kind` is "record" or "view", `options` belong to the kind."""
+    """Configuration of a sink process, from its supervisor: `kind` is "record" or "view", `options` belong to the
+    kind, `rings_in` are the keys of each link from another process."""
 
     label: str
     kind: str
     graph: dict[str, Any]
     streams: list[str]
     firings: list[str]
-    connect: list[str]
-    secret: str
     options: dict[str, Any]
+    rings_in: Sequence[Sequence[str]] = ()
     live: bool = False
 
 
@@ -62,7 +61,7 @@ class StreamSink(Protocol):
         """Something happened to the run: an operator was restarted, a fault was planned."""
 
     def diagnostics(self, message: Diagnostics) -> None:
-        """How every operator fares."""
+        """Tells how every operator fares."""
 
     def flush(self) -> None: ...
 
@@ -81,7 +80,7 @@ class SinkProcess:
         self,
         config: SinkConfig,
         channel: Channel,
-        inbox: queue.SimpleQueue[tuple[Any, ...]],
+        inbox: Inbox,
         make_sink: Callable[[SinkConfig, Graph], StreamSink],
     ) -> None:
         self.config, self.channel, self.inbox = config, channel, inbox
@@ -93,7 +92,9 @@ class SinkProcess:
         """Keys on which an operator's last firing records have not come yet."""
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
-        self.inlet = Inlet(config.label, channel, self._deliver, static=static, live=config.live)
+        self.inlet = Inlet(
+            config.label, channel, self._deliver, static=static, live=config.live, from_start=config.live
+        )
         self.batches = 0
         """Batches of firing records that were taken."""
         self.written = 0
@@ -111,38 +112,32 @@ class SinkProcess:
         self._outcome = "the supervisor is gone"
 
     def open(self) -> None:
-        config = self.config
-        self.bus = Bus(network_config(self.graph.network, config.secret, [], config.connect, live=config.live))
-        for key in (*self.frontiers, *self._operator_of):
-            self.bus.subscribe(key, self._receiver(key))
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
         self.channel.send("ready", first=None, steps=None)
 
-    def _receiver(self, key: str) -> Callable[[Any], None]:
-        put = self.inbox.put
-
-        def receive(payload: Any) -> None:
-            put(("envelope", key, payload))
-
-        return receive
-
     def run(self) -> None:
         assert self.sink is not None
+        now, changed = time.monotonic(), True
         while not self._left:
-            idle = False
-            try:
-                item = self.inbox.get(timeout=IDLE_WAIT)
-            except queue.Empty:
-                idle = True
-            else:
-                self._handle(item)
+            if self._take(max(0.0, self._report_due - now) if changed else IDLE_WAIT):
+                changed = True
             now = time.monotonic()
             if now >= self._flush_due:
                 self._flush_due = now + FLUSH_EVERY
                 self.sink.flush()
-            if idle or self.inbox.empty() or now >= self._report_due:
+            if changed and now >= self._report_due:
+                changed = False
                 self._report(now)
+
+    def _take(self, timeout: float) -> bool:
+        """Handles the next item; False when there is none in time."""
+        try:
+            item = self.inbox.get(timeout=timeout)
+        except queue.Empty:
+            return False
+        self._handle(item)
+        return True
 
     def _handle(self, item: tuple[Any, ...]) -> None:
         match item:
@@ -204,6 +199,9 @@ class SinkProcess:
         fresh = [r for r, place in zip(batch.records, places, strict=True) if place >= following or place in lacking]
         lacking.difference_update(places)
         self._recorded[batch.operator] = max(following, (places[-1][0], places[-1][1] + 1))
+        if len(fresh) == len(batch.records):
+            self.sink.firings(batch.operator, last.stamp, batch.data)
+            return batch.last
         for part in consecutive(fresh):
             self.sink.firings(batch.operator, part[-1].stamp, encode_batch(part, last=batch.last and part[-1] is last))
         return batch.last
@@ -217,13 +215,13 @@ class SinkProcess:
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
         self._done = min(dynamic, default=FOREVER)
         done = dict(self._taken) if self.config.live else {self.config.label: self._done}
+        self._report_due = now + REPORT_EVERY
         if done != self._told:
             self._told = done
-            self._report_due = now + REPORT_EVERY
             self.channel.send("progress", done=done, counts=self._counts())
         if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
             self._ended = True
-            self.channel.send("ended", report={"counts": self._counts(), "transport": self.bus.counters()})
+            self.channel.send("ended", report={"counts": self._counts(), "transport": self.inbox.counters()})
 
     def _counts(self) -> dict[str, list[int]]:
         return {self.config.label: [0, self.written, 0, self._work.cpu_ns, self._done, self._work.wall_ns]}
@@ -255,20 +253,16 @@ class SinkProcess:
             case "leave":
                 self._outcome = fields["outcome"]
                 self._left = True
-                if self._outcome != "complete" or any(self._lacking.values()):
-                    self._drain()
+                self._drain()
             case "lost":
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")
 
     def _drain(self) -> None:
-        """Takes what is still on its way after the run has ended early."""
+        """Takes what has arrived: all others have left, or nobody can say whether they have."""
         deadline = time.monotonic() + DRAIN_WITHIN
-        while time.monotonic() < deadline:
-            try:
-                item = self.inbox.get(timeout=DRAIN_QUIET)
-            except queue.Empty:
-                return
+        while not self.inbox.empty() and time.monotonic() < deadline:
+            item = self.inbox.get_nowait()
             if item[0] == "envelope":
                 self._handle(item)
 
@@ -279,7 +273,6 @@ class SinkProcess:
         facts: Mapping[str, Any] = {}
         if self.sink is not None:
             facts = self.sink.close(self._outcome)
-        self.bus.close()
         return facts
 
 

@@ -37,11 +37,15 @@ class Verdict:
 
 
 class StreamOrder:
-    """Follows one stream that is not static. A pure state machine: envelopes in, verdicts out."""
+    """Follows one stream that is not static. A pure state machine: envelopes in, verdicts out.
 
-    def __init__(self) -> None:
+    `first` is the place that the stream begins with; None for a taker that may come late: until the first message it
+    believes any place.
+    """
+
+    def __init__(self, first: Place | None = None) -> None:
         self.incarnation = 0
-        self._next: Place | None = None  # None until the first message: a taker may come late
+        self._next = first
         self._promised = NEVER
         self._ended = False
         self._announced = False
@@ -50,6 +54,23 @@ class StreamOrder:
     def announce(self) -> None:
         """Notes that the stream's process was restarted: a higher incarnation is to come."""
         self._announced = True
+
+    def goes_on(self, envelope: Envelope) -> bool:
+        """Takes a message that simply goes on: at the place that is due, above what was promised, with nothing held.
+
+        False, and nothing is taken note of, for anything else: that is for `take`.
+        """
+        if (
+            envelope.kind is not Kind.MESSAGE
+            or self._held
+            or self._ended
+            or (envelope.incarnation, envelope.seq) != self._next
+            or envelope.incarnation != self.incarnation
+            or not self._promised < envelope.stamp < FOREVER
+        ):
+            return False
+        self._next, self._promised = (envelope.incarnation, envelope.seq + 1), envelope.stamp
+        return True
 
     def take(self, envelope: Envelope) -> Verdict:
         """Returns what may be believed after this envelope."""

@@ -5,7 +5,8 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.facts import machine_facts
 from dataflow.recording.foreign import ForeignDecoder, register_decoder
 from dataflow.recording.info import Description, describe
-from dataflow.recording.reader import Event, RawRecord, Recorded, Recording, StreamInfo
+from dataflow.recording.reader import Event, RawRecord, Recorded, Recording
+from dataflow.recording.streams import StreamInfo
 from dataflow.recording.text import visible
 from dataflow.recording.writer import RecordingWriter
 

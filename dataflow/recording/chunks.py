@@ -22,6 +22,11 @@ LZ4_AT_ONCE = 2**26
 """Bytes that are asked of the LZ4 library at once: it takes twice as many."""
 UNDOUBTED_BYTES = 2**31
 """Expanded bytes of a file whose ratio is not looked at."""
+LARGE_BYTES = 2**26
+"""A chunk that expands to more is large: writers begin a new one long before, so it holds one very large message."""
+MAX_LARGE_RATIO = 50
+UNDOUBTED_LARGE_BYTES = 3 * 2**28
+"""Expanded bytes of a file's large chunks whose ratio is not looked at: making memory for them takes the time."""
 
 _CHUNK = struct.Struct("<QQQII")
 CHUNK_HEAD = _CHUNK.size
@@ -50,6 +55,7 @@ class Chunks:
         self._cache: OrderedDict[int, bytes] = OrderedDict()
         self._cached_bytes = 0
         self._packed_bytes = self._unpacked_bytes = 0
+        self._large: dict[int, tuple[int, int]] = {}  # by number: packed and unpacked bytes
         self._decompressor = zstandard.ZstdDecompressor()
 
     def add(self, ref: ChunkRef) -> int:
@@ -84,6 +90,18 @@ class Chunks:
                 f"{self._unpacked_bytes} bytes and it has no index of them, so all would have to be expanded"
             )
 
+    def _check_large(self, number: int, size: int) -> None:
+        """Refuses a file whose large chunks, those read so far, expand beyond reason."""
+        if size <= LARGE_BYTES or number in self._large:
+            return
+        self._large[number] = self.refs[number].length, size
+        packed, unpacked = map(sum, zip(*self._large.values(), strict=True))
+        if unpacked > max(UNDOUBTED_LARGE_BYTES, MAX_LARGE_RATIO * packed):
+            raise self._file.damaged(
+                f"{self.where(number)} is one of {len(self._large)} chunks that together expand from {packed} to "
+                f"{unpacked} bytes: they hold next to nothing"
+            )
+
     def where(self, number: int) -> str:
         return f"chunk {number} at byte {self.refs[number].offset}"
 
@@ -105,6 +123,7 @@ class Chunks:
             raise self._file.damaged(f"{where} is too short")
         if size > MAX_CHUNK_BYTES:
             raise self._file.damaged(f"{where} says it has {size} bytes, at most {MAX_CHUNK_BYTES} are read")
+        self._check_large(number, size)
         name = body[_CHUNK.size : at].decode("ascii", "replace")
         (length,) = struct.unpack_from("<Q", body, at)
         packed = memoryview(body)[at + 8 : at + 8 + length]

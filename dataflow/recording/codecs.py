@@ -1,10 +1,10 @@
-"""How message types become MCAP messages and back: Foxglove protobuf with a companion, or JSON."""
+"""Codecs between message types and MCAP messages: Foxglove protobuf with a companion, or JSON."""
 
 from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -24,6 +24,7 @@ from dataflow.recording.json_codec import (
     json_schema,
     timestamp_object,
 )
+from dataflow.recording.json_columns import Values, decode_json_columns
 from dataflow.recording.layout import FIELDS
 
 M = TypeVar("M", bound=Message)
@@ -55,6 +56,15 @@ class Codec(Protocol):
     def decode(self, stamp: int, data: Any, companion: Any | None) -> Message:
         """The message back; raises `RecordingError`."""
 
+    def fields(self, data: Any, companion: Any | None, names: Collection[str]) -> dict[str, Any]:
+        """The named fields alone, those that are None left out: canonical scalars and frozen arrays.
+
+        Cheaper than the message, which checks them together. Raises `RecordingError`.
+        """
+
+    def columns(self, messages: Sequence[tuple[Any, Any | None]], names: Collection[str]) -> dict[str, Values]:
+        """The named fields of many messages, each given as data and companion. Raises `RecordingError`."""
+
 
 class JsonCodec(Generic[M]):
     """Any message type as JSON."""
@@ -77,6 +87,13 @@ class JsonCodec(Generic[M]):
 
     def decode(self, stamp: int, data: Any, companion: Any | None) -> M:
         return build(self._message, stamp, decode_fields(decode_object(data), self._message.FIELDS))
+
+    def fields(self, data: Any, companion: Any | None, names: Collection[str]) -> dict[str, Any]:
+        return decode_fields(decode_object(data), [f for f in self._message.FIELDS if f.name in names])
+
+    def columns(self, messages: Sequence[tuple[Any, Any | None]], names: Collection[str]) -> dict[str, Values]:
+        fields = [f for f in self._message.FIELDS if f.name in names]
+        return decode_json_columns((data for data, _ in messages), fields)
 
 
 class FoxgloveCodec(Generic[M]):
@@ -110,12 +127,23 @@ class FoxgloveCodec(Generic[M]):
         return parts, encode_object(companion)
 
     def decode(self, stamp: int, data: Any, companion: Any | None) -> M:
+        return build(self._message, stamp, self._decoded(data, companion))
+
+    def fields(self, data: Any, companion: Any | None, names: Collection[str]) -> dict[str, Any]:
+        found = self._decoded(data, companion)
+        return {name: found[name] for name in names if found.get(name) is not None}
+
+    def columns(self, messages: Sequence[tuple[Any, Any | None]], names: Collection[str]) -> dict[str, Values]:
+        found = [self._decoded(data, companion) for data, companion in messages]
+        return {name: [fields.get(name) for fields in found] for name in names}
+
+    def _decoded(self, data: Any, companion: Any | None) -> dict[str, Any]:
         fields = self._schema.decode(self._schema.parse(data))
         if companion is not None:
             extra = decode_object(companion)
             fields |= decode_fields(extra, self._companion)
             fields |= dict.fromkeys(extra.get(NONE, ()), None)
-        return build(self._message, stamp, fields)
+        return fields
 
 
 def build(message: type[M], stamp: int, fields: Mapping[str, Any]) -> M:
@@ -144,7 +172,8 @@ def codec_for(message: type[Message]) -> Codec:
 
 
 def declaration_metadata(message: type[Message]) -> dict[str, str]:
-    """What a stream's channel says of its type: a digest of the declaration, and the whole of it for an own type."""
+    """Returns what a stream's channel says of its type: a digest of the declaration, and the whole of it for an own
+    type."""
     declared = {"declaration": declaration_digest(message)}
     if not is_built_in(message):
         declared[FIELDS] = json.dumps(Declaration.of(message).to_json(), ensure_ascii=False)

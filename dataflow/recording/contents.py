@@ -1,4 +1,4 @@
-"""What an MCAP file holds and where, gathered record by record from its summary or by a pass."""
+"""Contents of an MCAP file and their places, gathered record by record from its summary or by a pass."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class _Growing:
 
 
 class Contents:
-    """What has been found so far.
+    """Findings so far.
 
     `damage`: notes of what was damaged and got round; `loose_bytes`: data of messages outside chunks, by channel.
     """
@@ -83,7 +83,7 @@ class Contents:
         return {channel: growing.done() for channel, growing in self._growing.items()}
 
     def counts(self) -> dict[int, int]:
-        """How many messages were found, by channel."""
+        """Tells how many messages were found, by channel."""
         return {channel: len(growing.times) for channel, growing in self._growing.items()}
 
     def undeclared(self) -> list[int]:

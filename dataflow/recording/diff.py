@@ -47,7 +47,7 @@ class FieldDifference:
 
 @dataclass(slots=True)
 class StreamDiff:
-    """How one stream compares. `missing_in_a`, `missing_in_b`: messages without a partner of equal stamp.
+    """Comparison of one stream. `missing_in_a`, `missing_in_b`: messages without a partner of equal stamp.
 
     `differing` counts the pairs that differ beyond the tolerance, `first` is the first difference of the first of them,
     or the first message without a partner where that comes earlier (field `(message)`). `max_difference` is over all
@@ -244,7 +244,7 @@ def _field_difference(
 
 
 def _unequal(left: npt.NDArray[Any], right: npt.NDArray[Any], tolerance: float | None) -> npt.NDArray[np.bool_]:
-    """Which elements of two arrays of one shape and type differ, flat: beyond the tolerance, or in any bit."""
+    """Tells which elements of two arrays of one shape and type differ, flat: beyond the tolerance, or in any bit."""
     if tolerance is not None and left.dtype.kind == "f":
         x, y = left.reshape(-1).astype(np.float64), right.reshape(-1).astype(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):

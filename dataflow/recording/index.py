@@ -1,4 +1,4 @@
-"""Where every message of an MCAP file lies, from its index or, for torn and foreign files without one, by a pass.
+"""Finds every message of an MCAP file, from its index or, for torn and foreign files without one, by a pass.
 
 The index takes 24 bytes of memory a message, whatever the messages hold.
 """
@@ -48,6 +48,7 @@ class McapFile:
         self.lost_bytes = 0
         self.damage: list[str] = []
         self._sealed = False
+        self.path = path
         self._file = RawFile(path)
         try:
             contents = self._load()
@@ -151,7 +152,8 @@ class McapFile:
         return None
 
     def _from_scan(self) -> Contents:
-        """What a pass finds. Message indexes are not believed once anything was damaged: every chunk is read."""
+        """Returns what a pass finds. Message indexes are not believed once anything was damaged: every chunk is
+        read."""
         found = scan(self._file, sealed=self._sealed, trusting=not self.damage)
         if self.torn:
             self.lost_bytes = self._file.size - found.end

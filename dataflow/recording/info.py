@@ -1,4 +1,4 @@
-"""What a recording holds, at a glance: streams, rates, sizes, firing records, metadata; without decoding anything."""
+"""Describes a recording at a glance: streams, rates, sizes, firing records, metadata; without decoding anything."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class StreamSummary:
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """What `describe` finds. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
+    """Result of `describe`. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
 
     `start`, `end`, `duration` leave static streams out. `firings` counts batches of records by operator. `damage` notes
     what is damaged. Text is as in the file: for a terminal, `dataflow.recording.visible` escapes it.

@@ -32,6 +32,7 @@ NONE = "_none"
 MAX_LISTED = 64
 MAX_SAFE_INTEGER = 2**53
 
+_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
 _CANONICAL_NAN = struct.pack("<d", math.nan)
 _FLOAT_WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _FLOAT_PATTERN = "^(NaN|-?Infinity|0x[0-9a-f]{16})$"
@@ -84,7 +85,7 @@ def decode_fields(value: Any, fields: Iterable[Field]) -> dict[str, Any]:
 
 
 def encode_object(value: Mapping[str, Any]) -> bytes:
-    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+    return _encode(value).encode()
 
 
 def decode_object(data: Any) -> Any:
@@ -188,7 +189,7 @@ def _encode_array(spec: ArrayField, data: npt.NDArray[Any], plain: dict[str, Any
 
 
 def _listable(data: npt.NDArray[Any]) -> bool:
-    """Whether JSON numbers hold every element."""
+    """Tells whether JSON numbers hold every element."""
     if data.dtype.kind == "f":
         return bool(np.isfinite(data).all())
     if data.dtype.itemsize == 8 and data.size:

@@ -1,4 +1,4 @@
-"""What is where in a recording: topics, channel kinds, metadata names. `docs/recordings.md` describes it for others."""
+"""Layout of a recording: topics, channel kinds, metadata names. `docs/recordings.md` describes it for others."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SEQUENCE_SPAN: Final = 2**32
 
 
 class Kind(StrEnum):
-    """What a channel holds, in its metadata under `kind`."""
+    """Kinds of channels, in their metadata under `kind`."""
 
     STREAM = "stream"
     COMPANION = "companion"

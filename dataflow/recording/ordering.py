@@ -111,7 +111,7 @@ def companions_of(
 def _columns(
     track: Track, passed: int
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[npt.NDArray[np.int64]]]:
-    """What the messages are ordered by, the order, and the columns of a row between its key and its rank.
+    """Returns what the messages are ordered by, the order, and the columns of a row between its key and its rank.
 
     `passed`: entries of the tracks before.
     """

@@ -1,4 +1,4 @@
-"""What an MCAP file holds, by a pass over its records: for torn files, and those whose summary is no help."""
+"""Scans the records of an MCAP file: for torn files, and those whose summary is no help."""
 
 from __future__ import annotations
 

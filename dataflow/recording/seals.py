@@ -17,7 +17,7 @@ _SEAL = struct.Struct("<4sI")
 
 
 class Seal(Enum):
-    """What a record's checksum says of it."""
+    """Verdict of a record's checksum."""
 
     SOUND = "sound"
     BROKEN = "broken"
@@ -32,7 +32,7 @@ def sealed(record: bytes) -> bytes:
 
 
 def seal_of(record: bytes) -> Seal:
-    """Whether a whole record, opcode and length included, is as it was sealed."""
+    """Tells whether a whole record, opcode and length included, is as it was sealed."""
     if len(record) < _RECORD.size + _SEAL.size:
         return Seal.ABSENT
     tag, crc = _SEAL.unpack_from(record, len(record) - _SEAL.size)

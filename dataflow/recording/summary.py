@@ -1,4 +1,4 @@
-"""What an MCAP file holds, from the summary at its end."""
+"""Reads the summary at the end of an MCAP file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def read_footer(file: RawFile) -> Footer | None:
 
 
 def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Contents | None:
-    """What the summary tells; None where it does not suffice to find every message.
+    """Returns what the summary tells; None where it does not suffice to find every message.
 
     Raises `DamagedError` where it fails its checksum or contradicts itself or the file. Chunks, message indexes and
     metadata must not overlap, so that what is read is bounded by the size of the file.

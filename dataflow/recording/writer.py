@@ -97,6 +97,7 @@ class RecordingWriter:
 
     @property
     def path(self) -> Path:
+        """The file."""
         return self._file.path
 
     @property

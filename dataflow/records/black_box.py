@@ -31,8 +31,8 @@ _GENERATION, _OFFSET, _CAPACITY, _LENGTH = range(4)
 
 @dataclass(slots=True)
 class Reached:
-    """Where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, and the
-    parameters that were changed."""
+    """Says where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, and
+    the parameters that were changed."""
 
     incarnation: int = 0
     last: dict[str, int] = field(default_factory=dict)
@@ -127,7 +127,7 @@ class BlackBox:
 
 @dataclass(frozen=True, slots=True)
 class Remains:
-    """What a dead process left: its operators' latest records as batches of one, and where each had got to."""
+    """Holds what a dead process left: its operators' latest records as batches of one, and where each had got to."""
 
     batches: Mapping[str, Sequence[bytes]]
     reached: Mapping[str, Reached]

@@ -23,6 +23,10 @@ OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
 CALLS: tuple[Kind, ...] = ("fire", "tick", "finish")
 """The kinds that stand for a call with messages."""
 
+_KIND_NUMBER = {kind: number for number, kind in enumerate(KINDS)}
+_NO_NAMES: frozenset[str] = frozenset()
+_NO_DETAIL: Mapping[str, Any] = {}
+
 WITHHELD = -1
 """The place in its stream of a message that was not sent, since its stamp did not increase (live runs only)."""
 
@@ -31,18 +35,19 @@ class FiringRecordError(ValueError):
     """A batch of firing records that cannot be written or read: says what is wrong with it."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Emission:
-    """What came out of one port: its place in the stream (or `WITHHELD`), its stamp and its digest (16 bytes)."""
+    """Output of one port: its place in the stream (or `WITHHELD`), its stamp and its digest (16 bytes)."""
 
     seq: int
     stamp: int
     digest: bytes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class FiringRecord:
-    """One call of an operator.
+    """One call of an operator. Nobody changes a record; it is not frozen since that would make it cost four times as
+    much, and one is made for every firing.
 
     `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
@@ -70,7 +75,7 @@ class FiringRecord:
     duration: int = 0
 
     def firing(self) -> FiringInputs:
-        """What an aligner that is driven by records needs. Only for the kinds fire, tick and finish."""
+        """Returns what an aligner that is driven by records needs. Only for the kinds fire, tick and finish."""
         kind = self.kind
         if kind not in ("fire", "tick", "finish"):
             raise FiringRecordError(f"{self.operator}: record {self.index} is a {kind!r}, which no message made")
@@ -81,7 +86,11 @@ def encode_batch(records: list[FiringRecord], *, last: bool = False) -> bytes:
     """A batch of consecutive records of one operator as msgpack. `last` marks the operator's final batch."""
     if not records:
         raise FiringRecordError("a batch holds at least one firing record")
-    if len({(r.operator, r.incarnation, r.index - k) for k, r in enumerate(records)}) > 1:
+    begin = records[0]
+    operator, incarnation, index = begin.operator, begin.incarnation, begin.index
+    if any(
+        r.index != index + k or r.incarnation != incarnation or r.operator != operator for k, r in enumerate(records)
+    ):
         raise FiringRecordError("a batch holds consecutive records of one incarnation of one operator")
     names = list(dict.fromkeys(name for record in records for name in record.inputs))
     streams: dict[str, int] = {}
@@ -90,28 +99,29 @@ def encode_batch(records: list[FiringRecord], *, last: bool = False) -> bytes:
         return streams.setdefault(name, len(streams))
 
     rows = [
-        [
-            KINDS.index(r.kind),
+        (
+            _KIND_NUMBER[r.kind],
             r.stamp,
             r.tick,
-            [_encode_ref(r.inputs.get(name), stream_index) for name in names] if r.inputs else [],
-            sorted(r.stale),
-            sorted(r.late),
-            [None if e is None else [e.seq, e.stamp - r.stamp, e.digest] for e in r.outputs],
+            [_encode_ref(r.inputs.get(name), stream_index) for name in names] if r.inputs else (),
+            sorted(r.stale) if r.stale else (),
+            sorted(r.late) if r.late else (),
+            [None if e is None else (e.seq, e.stamp - r.stamp, e.digest) for e in r.outputs],
             OUTCOMES.index(r.outcome),
-            [[d.input, stream_index(d.stream), d.incarnation, d.seq, d.stamp, d.reason, d.because] for d in r.drops],
-            dict(r.detail),
+            [(d.input, stream_index(d.stream), d.incarnation, d.seq, d.stamp, d.reason, d.because) for d in r.drops]
+            if r.drops
+            else (),
+            dict(r.detail) if r.detail else _NO_DETAIL,
             r.wall_start,
             r.duration,
-        ]
+        )
         for r in records
     ]
-    first = records[0]
     batch = {
         "format": FORMAT,
-        "operator": first.operator,
-        "incarnation": first.incarnation,
-        "first": first.index,
+        "operator": operator,
+        "incarnation": incarnation,
+        "first": index,
         "last": last,
         "inputs": names,
         "streams": list(streams),
@@ -135,12 +145,13 @@ def consecutive(records: Iterable[FiringRecord]) -> Iterator[list[FiringRecord]]
 
 @dataclass(frozen=True, slots=True)
 class Batch:
-    """A decoded batch of consecutive firing records of one operator."""
+    """A decoded batch of consecutive firing records of one operator, with the bytes that it was decoded from."""
 
     operator: str
     incarnation: int
     last: bool
     records: tuple[FiringRecord, ...]
+    data: bytes
 
 
 def decode_batch(data: bytes) -> Batch:
@@ -161,7 +172,7 @@ def decode_batch(data: bytes) -> Batch:
     except (ValueError, TypeError, KeyError, IndexError, RecursionError, msgpack.UnpackException) as error:
         what = f"{type(error).__name__}: {error}".rstrip(": ")
         raise FiringRecordError(f"not a batch of firing records ({what})") from error
-    return Batch(operator, incarnation, last, records)
+    return Batch(operator, incarnation, last, records, data)
 
 
 def _record(
@@ -176,11 +187,11 @@ def _record(
         stamp=stamp,
         tick=bool(tick),
         inputs={name: _decode_ref(ref, streams) for name, ref in zip(names, inputs, strict=True)} if inputs else {},
-        stale=frozenset(stale),
-        late=frozenset(late),
+        stale=frozenset(stale) if stale else _NO_NAMES,
+        late=frozenset(late) if late else _NO_NAMES,
         outputs=tuple(None if e is None else Emission(e[0], stamp + e[1], e[2]) for e in outputs),
         outcome=OUTCOMES[outcome],
-        drops=tuple(Drop(i, streams[s], at, n, inc, why, of) for i, s, inc, n, at, why, of in drops),
+        drops=tuple(Drop(i, streams[s], at, n, inc, why, of) for i, s, inc, n, at, why, of in drops) if drops else (),
         detail=detail,
         wall_start=wall_start,
         duration=duration,
@@ -189,11 +200,11 @@ def _record(
 
 def _encode_ref(ref: InputRef, stream_index: Callable[[str], int]) -> list[Any] | None:
     """nil, [0, stream, incarnation, seq], [1, runs of (stream, incarnation, first, more)...], [2, messages...]."""
+    if isinstance(ref, MessageRef):
+        return [0, stream_index(ref.stream), ref.incarnation, ref.seq]
     match ref:
         case None:
             return None
-        case MessageRef():
-            return [0, stream_index(ref.stream), ref.incarnation, ref.seq]
         case tuple():
             return [1, *([stream_index(r.stream), r.incarnation, r.first_seq, r.last_seq - r.first_seq] for r in ref)]
         case _:

@@ -59,7 +59,7 @@ class FiringLog:
         return self._decoded[operator]
 
     def digests(self, makers: Iterable[Maker], streams: Collection[str]) -> Digests:
-        """What `makers` emitted on `streams`, by its records."""
+        """Returns what `makers` emitted on `streams`, by its records."""
         found: dict[str, dict[Place, bytes]] = {stream: {} for stream in streams}
         for maker in makers:
             outputs = list(maker.outputs.values())
@@ -146,7 +146,7 @@ def whole(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
 def beginning(
     records: list[FiringRecord], begin: int | None, *, stateless: bool
 ) -> tuple[list[FiringRecord], list[FiringRecord], str]:
-    """What lies before the place from which records are repeated, the rest, and how that place was found.
+    """Returns what lies before the place from which records are repeated, the rest, and how that place was found.
 
     It is after the last snapshot at or before the stamp `begin`, or at `begin` itself for an operator without state;
     for any other at the start, since its state in the middle is not known.

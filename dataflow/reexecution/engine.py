@@ -53,7 +53,7 @@ class Unwatched:
 
 @dataclass(frozen=True, slots=True)
 class Feeding:
-    """What is re-executed and what is read: operators in graph order, and the recorded streams that feed them."""
+    """Holds what is re-executed and what is read: operators in graph order, and the recorded streams that feed them."""
 
     operators: tuple[str, ...]
     streams: tuple[str, ...]
@@ -141,7 +141,6 @@ class Recomputation:
             finals=final_stamps(recording, feeding.streams),
             start=None if begin is None else _first_stamp(log, graph, self.runners.values()),
             end=end,
-            promises=False,
         )
         self._threads = graph.threads
 

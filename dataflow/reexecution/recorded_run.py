@@ -69,7 +69,7 @@ def _bundle(packed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
-    """What a recording must hold so that its graph can be loaded again, or looked at without its operators."""
+    """Returns what a recording must hold so that its graph can be loaded again, or looked at without its operators."""
     resolved = {name: value for name, value in graph.to_json().items() if name != "bundle"}
     return {
         GRAPH: {

@@ -25,7 +25,7 @@ class WarmStart:
 
 
 def fresh_because(recording: Recording, graph: Graph, node: Node) -> str | None:
-    """Why an operator must begin with fresh state, in words; None where its recorded state can be had again."""
+    """Tells why an operator must begin with fresh state, in words; None where its recorded state can be had again."""
     if node.operator.stateless:
         return None
     try:
@@ -65,7 +65,8 @@ def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | 
 
 
 def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> tuple[list[Entry], bool]:
-    """What the operator's aligner held just before `stamp`, as far as it matters, and whether it had fired before.
+    """Returns what the operator's aligner held just before `stamp`, as far as it matters, and whether it had fired
+    before.
 
     By the firing records these are the messages that later firings took: partners of a join, the beginning of a batch,
     samples. Without records, the last message before `stamp` on each stream that is only sampled.

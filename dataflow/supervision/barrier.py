@@ -34,6 +34,8 @@ class Barrier:
             status.first = first if status.first is None else min(first, status.first)
         if steps is not None:
             status.steps = max(steps, status.steps or 0)
+        if self.run.release is None:  # others may be sending probes already, so it may see one before it is told to
+            process.unseen = self.run.takes(process)
 
     def tick(self) -> bool:
         """Goes on as far as possible; True when every edge is proven."""
@@ -53,7 +55,7 @@ class Barrier:
         return False
 
     def _missing(self, process: Supervised) -> bool:
-        """Whether a process is not ready, or does not see all of its edges."""
+        """Tells whether a process is not ready, or does not see all of its edges."""
         return process.life is not Life.PROBING or bool(process.unseen)
 
     def _probe(self, process: Supervised) -> None:
@@ -61,7 +63,6 @@ class Barrier:
         if process.life is not Life.READY:
             return
         process.take(Step.PROBE, run.steady)
-        process.unseen = run.takes(process)
         if process.attempt:
             expect_probes(run, process)
         run.send(process, "probe")
@@ -78,7 +79,7 @@ class Barrier:
 def expect_probes(run: RunState, process: Supervised) -> None:
     """Tells the consumers of a process that took another's place that its streams are to be proven again."""
     tell_consumers(run, process, absent=False)
-    made = set(process.host.publish)
+    made = set(process.plan.publish)
     for other in run.processes.values():
         if other is not process and other.reachable and other.life not in ON_ITS_WAY - {Life.PROBING}:
             other.unseen |= made & run.takes(other)
@@ -86,7 +87,7 @@ def expect_probes(run: RunState, process: Supervised) -> None:
 
 def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
     """Tells who takes a process's streams that it is away, or that it is to be heard again."""
-    made = set(process.host.publish)
+    made = set(process.plan.publish)
     for other in run.processes.values():
         taken = made & run.takes(other)
         if other is process or not taken:

@@ -1,6 +1,6 @@
 """The end of a run: first the processes with operators leave, then the recorder and the like, then nobody is left.
 
-The sinks leave last: hosts hand over firing records when they leave, and a sink is told how the run ended only when
+The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run ended only when
 nothing can go wrong with the others any more. Every step is bounded; who is late is killed.
 """
 
@@ -50,7 +50,7 @@ class Closing:
 
     @property
     def over(self) -> bool:
-        """Whether nobody is left; one that does not even die of a SIGKILL is not waited for."""
+        """Tells whether nobody is left; one that does not even die of a SIGKILL is not waited for."""
         left = [p for p in self.run.processes.values() if p.reachable]
         return all(p.life is Life.KILLED and self.run.steady - p.since > LEAVE_TIMEOUT for p in left)
 

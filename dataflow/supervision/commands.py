@@ -1,4 +1,4 @@
-"""What the supervisor's core wants done. The driver does it, in order; nothing here has an answer other than events."""
+"""Commands of the supervisor's core. The driver does it, in order; nothing here has an answer other than events."""
 
 from __future__ import annotations
 

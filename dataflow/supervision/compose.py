@@ -1,4 +1,4 @@
-"""What watches over which kind of run: here alone live runs and others part."""
+"""Composes the parts that watch over a run: here alone live runs and others part."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from dataflow.supervision.drain import DrainLimit
 from dataflow.supervision.heartbeats import Heartbeats
 from dataflow.supervision.lateness import Lateness
 from dataflow.supervision.part import Part
-from dataflow.supervision.plan import HostPlan, RunPlan
+from dataflow.supervision.plan import ProcessPlan, RunPlan
 from dataflow.supervision.planned_faults import PlannedFaults
 from dataflow.supervision.quiescence import LOST_AFTER, Quiescence
 from dataflow.supervision.remains import RemainsPart
@@ -23,9 +23,9 @@ from dataflow.supervision.stall import LiveStallWatch, StallWatch
 from dataflow.supervision.supervised import Supervised
 
 
-def core_of(plan: RunPlan, hosts: Mapping[str, HostPlan], configs: Mapping[str, Config]) -> Core:
+def core_of(plan: RunPlan, processes: Mapping[str, ProcessPlan], configs: Mapping[str, Config]) -> Core:
     """Returns the core that a plan needs."""
-    return (_live if plan.live else _lossless)(RunState(plan, hosts, configs))
+    return (_live if plan.live else _lossless)(RunState(plan, processes, configs))
 
 
 def _lossless(run: RunState) -> Core:

@@ -1,59 +1,72 @@
-"""What each process of a run is told to be: its kind and its configuration, as plain values."""
+"""Configurations of the processes of a run, as plain values."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from dataflow.supervision.plan import HostPlan, RunPlan
+from dataflow.supervision.plan import ProcessPlan, RunPlan
+from dataflow.supervision.rings import pairs_of
 
 Config = tuple[str, dict[str, Any]]
-"""Kind of process ("host" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
+"""Kind of process ("operators" or "sink"), and the fields of its `ProcessConfig` or `SinkConfig`."""
 
 
 def configurations(
-    plan: RunPlan, hosts: Mapping[str, HostPlan], endpoints: Mapping[str, str], secret: str
+    plan: RunPlan, processes: Mapping[str, ProcessPlan], endpoints: Mapping[str, str]
 ) -> dict[str, Config]:
     """Returns every process's configuration by label.
 
-    `endpoints` are those on which the processes listen, `secret` what the run's messages are sealed with.
+    `endpoints` are those on which the processes listen.
     """
-    first = next(iter(hosts))
+    first = next(iter(processes))
     configs: dict[str, Config] = {}
-    for label, host in hosts.items():
-        common = _common(plan, host, endpoints) | {"secret": secret}
-        if host.sink is None:
-            configs[label] = _host(plan, host, common, endpoints, label == first)
+    for label, process in processes.items():
+        common = _common(plan, process, processes)
+        if process.sink is None:
+            configs[label] = _operators(plan, process, common, endpoints, label == first)
+            pairs = pairs_of(plan.graph, processes)
+            configs[label][1]["rings_out"] = [
+                (plan.live and processes[taker].sink is None, list(keys))
+                for (maker, taker), keys in pairs.items()
+                if maker == label
+            ]
         else:
-            configs[label] = _sink(plan, host, common)
+            configs[label] = _sink(plan, process, common)
     return configs
 
 
-def _common(plan: RunPlan, host: HostPlan, endpoints: Mapping[str, str]) -> dict[str, Any]:
-    connect = [endpoints[up] for up in host.upstream]
-    return {"label": host.label, "graph": plan.graph.to_json(), "connect": connect, "live": plan.live}
+def _common(plan: RunPlan, process: ProcessPlan, processes: Mapping[str, ProcessPlan]) -> dict[str, Any]:
+    pairs = pairs_of(plan.graph, processes)
+    rings_in = [list(keys) for (_, consumer), keys in pairs.items() if consumer == process.label]
+    common = {
+        "label": process.label,
+        "graph": plan.graph.to_json(),
+        "live": plan.live,
+    }
+    return common | {"rings_in": rings_in}
 
 
-def _sink(plan: RunPlan, host: HostPlan, common: Mapping[str, Any]) -> Config:
+def _sink(plan: RunPlan, process: ProcessPlan, common: Mapping[str, Any]) -> Config:
     return "sink", {
         **common,
-        "kind": host.sink,
-        "streams": list(host.streams),
-        "firings": list(plan.graph.nodes) if host.sink == "record" else [],
-        "options": dict(host.options),
+        "kind": process.sink,
+        "streams": list(process.streams),
+        "firings": list(plan.graph.nodes) if process.sink == "record" else [],
+        "options": dict(process.options),
     }
 
 
-def _host(
-    plan: RunPlan, host: HostPlan, common: Mapping[str, Any], endpoints: Mapping[str, str], first: bool
+def _operators(
+    plan: RunPlan, process: ProcessPlan, common: Mapping[str, Any], endpoints: Mapping[str, str], first: bool
 ) -> Config:
-    return "host", {
+    return "operators", {
         **common,
-        "nodes": list(host.nodes),
-        "publish": dict(host.publish),
-        "subscribe": list(host.subscribe),
-        "listen": [endpoints[host.label], *(plan.graph.network.listen if first else ())],
-        "replay": _log(plan) if host.has_log else None,
+        "nodes": list(process.nodes),
+        "publish": dict(process.publish),
+        "subscribe": list(process.subscribe),
+        "listen": [endpoints[process.label], *(plan.graph.network.listen if first else ())],
+        "replay": _log(plan) if process.has_log else None,
         "window": list(plan.window),
         "rate": 1.0 if plan.live and plan.rate is None else plan.rate,
         "paranoid": plan.paranoid,

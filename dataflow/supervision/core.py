@@ -83,7 +83,7 @@ class Core:
             case HungUp(label):
                 self.run.processes[label].hung_up = self.run.steady
             case LeftBehind(label, processes):
-                self.run.note(f"host {label!r} left processes behind, which were killed: {', '.join(processes)}")
+                self.run.note(f"process {label!r} left processes behind, which were killed: {', '.join(processes)}")
             case Remained(label, remains):
                 for part in self._parts:
                     part.remained(self.run.processes[label], remains)

@@ -1,4 +1,4 @@
-"""What operators have done so far, by what their processes report: counts, drops by reason, waits."""
+"""Counts what operators have done so far, from what their processes report: counts, drops by reason, waits."""
 
 from __future__ import annotations
 

@@ -57,12 +57,12 @@ class LosslessCover(Cover):
             return
         self._covered = covered
         for process in run.processes.values():
-            if process.report is None and (process.host.has_log or run.sources(process)):
+            if process.report is None and (process.plan.has_log or run.sources(process)):
                 run.send(process, "covered", replaces=True, frontier=covered)
 
 
 class LiveCover(Cover):
-    """How far those are behind for whom sources wait (the window), and how far anybody is (the backlog).
+    """Says how far those are behind for whom sources wait (the window), and how far anybody is (the backlog).
 
     An operator does not count while its process is away or gives no sign of life. A new process owes nothing of what
     was given before it. One that is heard again begins its backlog anew, too, where its queue bounds what it has to
@@ -71,7 +71,7 @@ class LiveCover(Cover):
 
     def __init__(self, run: RunState) -> None:
         super().__init__(run)
-        self.flow = LiveFlow(run.graph, [host.nodes for host in run.hosts.values()])
+        self.flow = LiveFlow(run.graph, [process.nodes for process in run.processes.values()])
         self._told: dict[str, tuple[int, int]] = {}
         self._excused: dict[str, int] = {}  # operator → the stamp up to which it owes nothing
 

@@ -1,4 +1,4 @@
-"""What the supervisor's core is told: each event with the moment at which it happened."""
+"""Events that the supervisor's core is told, each with the moment at which it happened."""
 
 from __future__ import annotations
 

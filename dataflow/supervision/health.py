@@ -1,4 +1,5 @@
-"""How every operator of a running graph fares, from its counts: what `dataflow top` shows and the recording keeps."""
+"""Judges how every operator of a running graph fares, from its counts: what `dataflow top` shows and the recording
+keeps."""
 
 from __future__ import annotations
 

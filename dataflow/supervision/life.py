@@ -36,7 +36,7 @@ class Life(Enum):
 
 
 class Step(Enum):
-    """What changes a state. The process takes the first ones, the supervisor the others."""
+    """Steps that change a state. The process takes the first ones, the supervisor the others."""
 
     JOIN = "join"
     GET_READY = "get ready"
@@ -52,9 +52,6 @@ class Step(Enum):
     RESTART = "restart"
     GIVE_UP = "give up"
 
-
-_ALIVE = (Life.STARTING, Life.JOINED, Life.READY, Life.PROBING, Life.RUNNING, Life.ENDED)
-"""Those that take part, or are about to."""
 
 _ENDS = {Step.LEAVE: Life.LEAVING, Step.LEAVE_FAILED: Life.FAILED, Step.KILL: Life.KILLED, Step.DIE: Life.GONE}
 
@@ -73,7 +70,6 @@ TRANSITIONS: Mapping[Life, Mapping[Step, Life]] = {
     Life.AWAY: {Step.RESTART: Life.STARTING, Step.GIVE_UP: Life.GONE},
 }
 
-TAKES_PART = frozenset(_ALIVE)
 WORKS = frozenset({Life.RUNNING, Life.ENDED})
 ON_ITS_WAY = frozenset({Life.STARTING, Life.JOINED, Life.READY, Life.PROBING})
 HAS_PROCESS = frozenset(Life) - {Life.GONE, Life.AWAY}

@@ -9,15 +9,15 @@ from dataflow.sync import NEVER
 
 
 class LiveFlow:
-    """How far the sources have got, and how far that leaves others behind. Stamps and lags are ns of event time.
+    """Follows how far sources have got, and how far that leaves others behind. Stamps and lags are ns of event time.
 
     A source that stops leaves nobody behind: what is counted against an operator is what its sources have given.
     """
 
-    def __init__(self, graph: Graph, hosts: Iterable[Collection[str]]) -> None:
-        """`hosts` holds the operators of each process."""
+    def __init__(self, graph: Graph, processes: Iterable[Collection[str]]) -> None:
+        """`processes` holds the operators of each process."""
         self.upstream = sources_upstream(graph)
-        self.waited_for = waited_for(graph, hosts)
+        self.waited_for = waited_for(graph, processes)
         self._first: dict[str, int] = {}
         self._last: dict[str, int] = {}
 
@@ -28,12 +28,12 @@ class LiveFlow:
             self._last[source] = stamp
 
     def lag(self, source: str, done: int) -> int:
-        """How far one that has done everything up to `done` is behind a source."""
+        """Tells how far one that has done everything up to `done` is behind a source."""
         last = self._last.get(source)
         return 0 if last is None else max(0, last - max(done, self._first[source] - 1))
 
     def lags(self, operator: str, done: int) -> tuple[int, int]:
-        """How far an operator is behind the last and the foremost of its sources."""
+        """Tells how far an operator is behind the last and the foremost of its sources."""
         found = [self.lag(source, done) for source in self.upstream[operator]]
         return min(found, default=0), max(found, default=0)
 
@@ -60,15 +60,16 @@ def sources_upstream(graph: Graph) -> dict[str, frozenset[str]]:
     return {name: frozenset(sources) for name, sources in found.items()}
 
 
-def waited_for(graph: Graph, hosts: Iterable[Collection[str]]) -> frozenset[str]:
+def waited_for(graph: Graph, processes: Iterable[Collection[str]]) -> frozenset[str]:
     """The operators for which sources wait: those that drop nothing, unless one that does is upstream or in the same
     process, since then they can be no faster than it."""
     operators = {name for name, node in graph.nodes.items() if not node.source}
-    together = [operators.intersection(host) for host in hosts]
+    together = [operators.intersection(process) for process in processes]
     makers = _makers(graph)
     free = {name for name in operators if graph.nodes[name].live.queue != "block"}
     while True:
-        more = free.union(*(host for host in together if host & free), *({n} for n in operators if makers[n] & free))
+        beside = [others for others in together if others & free]
+        more = free.union(*beside, *({n} for n in operators if makers[n] & free))
         if more == free:
             return frozenset(operators - free)
         free = more

@@ -17,6 +17,7 @@ from typing import Any
 import msgpack
 
 from dataflow.process.channel import QueuedChannel
+from dataflow.supervision.nursery_process import MORE, MOST_DESCRIPTORS, SPAWN
 
 LEAVE_WITHIN = 15.0
 WORDS_AT_ONCE = 65536
@@ -83,7 +84,7 @@ class Child:
 
     @property
     def dead(self) -> bool:
-        """Whether it has ended, for when nobody is left to tell."""
+        """Tells whether it has ended, for when nobody is left to tell."""
         return self._pidfd is not None and bool(select.select([self._pidfd], [], [], 0)[0])
 
     def close(self) -> list[str]:
@@ -143,7 +144,11 @@ class Nursery:
         channel = QueuedChannel()
         reading, writing = os.pipe()
         try:
-            socket.send_fds(self._socket, [b"s"], [channel.theirs, writing, *handed])
+            given = [channel.theirs, writing, *handed]
+            while len(given) > MOST_DESCRIPTORS:
+                socket.send_fds(self._socket, [MORE], given[:MOST_DESCRIPTORS])
+                given = given[MOST_DESCRIPTORS:]
+            socket.send_fds(self._socket, [SPAWN], given)
         except OSError as error:
             channel.close()
             os.close(reading)

@@ -1,11 +1,11 @@
-"""The nursery process: it has imported the runtime once and forks hosts from itself.
+"""The nursery: a process that has imported the runtime once and forks the others of a run from itself.
 
 Starting Python and importing the runtime takes half a second a process; forking takes milliseconds. The nursery is
-single-threaded, holds no session and no model, and runs with the environment that hosts need (thread counts, hash
+single-threaded, holds no session and no model, and runs with the environment that operators need (thread counts, hash
 seed). It ends when the supervisor does, and tells it how its children ended.
 
-What operators start must end with their host, also what has left its process group or session: each host is a subreaper
-(prctl(2)), so such a process becomes the host's child when its parent ends, and the nursery's when the host does.
+What operators start must end with their process, also what has left its process group or session: each operators'
+process is a subreaper (prctl(2)), which inherits such a descendant when its parent ends, as the nursery does in turn.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ import msgpack
 import psutil  # type: ignore[import-untyped]
 
 LEAVE_WITHIN = 12.0
-"""Seconds that hosts get after the supervisor is gone."""
+"""Seconds that its children get after the supervisor is gone."""
 DIE_WITHIN = 1.0
 MOST_DESCRIPTORS = 253
 """As many as one message on a Unix socket carries."""
+MORE, SPAWN = b"+", b"s"
+"""A request: descriptors, of which more follow, and the last ones for a process that is to be started."""
 PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
 
 _PR_SET_CHILD_SUBREAPER = 36
@@ -43,7 +45,7 @@ def _adopt_orphans() -> None:
         raise OSError(ctypes.get_errno(), "prctl(PR_SET_CHILD_SUBREAPER)")
 
 
-def _fork_host(descriptor: int, words: int, handed: Sequence[int], inherited: Iterable[int]) -> int:
+def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited: Iterable[int]) -> int:
     pid = os.fork()
     if pid:
         return pid
@@ -68,19 +70,24 @@ def _fork_host(descriptor: int, words: int, handed: Sequence[int], inherited: It
 def serve(connection: socket.socket) -> None:
     """Forks on request and reports ends, until the supervisor closes the connection."""
     children: dict[int, int] = {}  # pidfd → pid
+    descriptors: list[int] = []
     while True:
         readable, _, _ = select.select([connection.fileno(), *children], [], [])
         for pidfd in readable:
             if pidfd != connection.fileno():
                 _ended(connection, children, pidfd)
         if connection.fileno() in readable:
-            request, descriptors, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
+            request, given, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
             if not request:
                 break
+            descriptors += given
+            if request == MORE:
+                continue
             descriptor, words, *handed = descriptors
-            pid = _fork_host(descriptor, words, handed, [connection.fileno(), *children])
-            for given in descriptors:
-                os.close(given)
+            pid = _fork_process(descriptor, words, handed, [connection.fileno(), *children])
+            for each in descriptors:
+                os.close(each)
+            descriptors = []
             pidfd = os.pidfd_open(pid)
             children[pidfd] = pid
             _tell(connection, "spawned", pid, None, [pidfd])
@@ -88,7 +95,7 @@ def serve(connection: socket.socket) -> None:
 
 
 def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: int) -> None:
-    """Buries a host and everything that its operators have started."""
+    """Buries a process and everything that its operators have started."""
     pid = children.pop(pidfd)
     os.close(pidfd)
     with contextlib.suppress(ProcessLookupError, PermissionError):  # it is no group of its own yet
@@ -153,7 +160,7 @@ def _tell(connection: socket.socket, what: str, pid: int, fact: Any, descriptors
 
 
 def _outlive(children: dict[int, int]) -> None:
-    """The supervisor is gone: its hosts notice by themselves and leave; those that do not are killed."""
+    """The supervisor is gone: the children notice by themselves and leave; those that do not are killed."""
     deadline = time.monotonic() + LEAVE_WITHIN
     while children and (left := deadline - time.monotonic()) > 0:
         readable, _, _ = select.select(list(children), [], [], left)

@@ -1,4 +1,4 @@
-"""What is to be run, and where: the pure part of the supervisor."""
+"""Plans what is to be run, and where: the pure part of the supervisor."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.chaos.plan import Fault
-from dataflow.graph.model import Graph, Placement
+from dataflow.graph.model import Graph, Placement, current_placement
 from dataflow.names import firings_key
 
-LOG_HOST = "@log"
+LOG_PROCESS = "@log"
 RECORDER = "@recorder"
 VIEWER_FILE = "@view"
 
@@ -31,7 +31,7 @@ class LogPlan:
 class RunPlan:
     """One execution of a graph.
 
-    - `placement`: see `Graph.hosts`.
+    - `placement`: see `Graph.processes`.
     - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
     - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes
       into the recording.
@@ -41,7 +41,7 @@ class RunPlan:
     - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
     - `window`: messages and bytes that feeds may be ahead of the graph.
     - `paranoid`: re-digest inputs after each firing to catch operators that write into them.
-    - `start_timeout`, `stall_timeout`: seconds allowed for all hosts to become ready, and without any progress.
+    - `start_timeout`, `stall_timeout`: seconds allowed for all processes to become ready, and without any progress.
     """
 
     graph: Graph
@@ -60,38 +60,36 @@ class RunPlan:
     compression: str = "zstd"
     overwrite: bool = False
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "placement", current_placement(self.placement))
+
 
 @dataclass(frozen=True, slots=True)
-class HostPlan:
+class ProcessPlan:
     """One process: which operators it runs, what it sends to and takes from the others, and whom it connects to."""
 
     label: str
     nodes: tuple[str, ...]
     publish: Mapping[str, int]
     subscribe: tuple[str, ...]
-    upstream: tuple[str, ...]
     has_log: bool = False
     sink: str | None = None
     streams: tuple[str, ...] = ()
     options: Mapping[str, Any] = field(default_factory=dict)
 
-    @property
-    def has_feed(self) -> bool:
-        return self.sink is None
 
-
-def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
-    """The processes of a run, by label: hosts in graph order, then the recorder and the viewer file."""
+def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
+    """Returns the processes of a run by label: those of operators in graph order, the recorder, the viewer file."""
     graph = plan.graph
     replaced = {graph.streams[s].node for s in plan.log.streams} if plan.log is not None else set()
-    labels = {node: label for label, nodes in graph.hosts(plan.placement).items() for node in nodes}
+    labels = {node: label for label, nodes in graph.processes(plan.placement).items() for node in nodes}
     if plan.log is not None:
-        log_host = "all" if plan.placement == "one_host" else LOG_HOST
-        labels |= dict.fromkeys(replaced, log_host)
+        log_process = "all" if plan.placement == "one_process" else LOG_PROCESS
+        labels |= dict.fromkeys(replaced, log_process)
 
-    hosts: dict[str, list[str]] = {}
+    processes: dict[str, list[str]] = {}
     for node in graph.nodes:
-        hosts.setdefault(labels[node], []).append(node)
+        processes.setdefault(labels[node], []).append(node)
 
     streams = set(graph.streams)
     if plan.log is not None:
@@ -121,37 +119,31 @@ def host_plans(plan: RunPlan) -> dict[str, HostPlan]:
         for stream in taken:
             taken_in[stream].add(label)
 
-    plans: dict[str, HostPlan] = {}
-    for label, nodes in hosts.items():
+    plans: dict[str, ProcessPlan] = {}
+    for label, nodes in processes.items():
         publish = {
             s: len(taken_in[s] - {label}) for s in sorted(streams) if made_in[s] == label and taken_in[s] - {label}
         }
         if plan.record is not None:
             publish |= {firings_key(graph.namespace, node): 1 for node in nodes}
         subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
-        plans[label] = HostPlan(
+        plans[label] = ProcessPlan(
             label,
             tuple(node for node in nodes if node not in replaced),
             publish,
             subscribe,
-            tuple(sorted({made_in[s] for s in subscribe})),
             has_log=bool(replaced & set(nodes)),
         )
     for label, (kind, taken, chosen) in sinks.items():
-        upstream = {made_in[s] for s in taken}
-        if kind == "record":
-            upstream |= set(hosts)
-        plans[label] = HostPlan(
-            label, (), {}, (), tuple(sorted(upstream)), sink=kind, streams=tuple(sorted(taken)), options=chosen
-        )
+        plans[label] = ProcessPlan(label, (), {}, (), sink=kind, streams=tuple(sorted(taken)), options=chosen)
     return plans
 
 
-def taken_keys(graph: Graph, host: HostPlan) -> set[str]:
+def taken_keys(graph: Graph, process: ProcessPlan) -> set[str]:
     """Returns the keys that a process takes: on each it must have seen a probe before sources are released."""
-    if host.sink is None:
-        return set(host.subscribe)
-    keys = set(host.streams)
-    if host.sink == "record":
+    if process.sink is None:
+        return set(process.subscribe)
+    keys = set(process.streams)
+    if process.sink == "record":
         keys |= {firings_key(graph.namespace, node) for node in graph.nodes}
     return keys

@@ -27,7 +27,7 @@ MAX_WINDOW_DOUBLINGS = 12
 
 
 class Verdict(Enum):
-    """What the answers of one round show."""
+    """Holds what the answers of one round show."""
 
     MOVING = "moving"
     SETTLED = "settled"

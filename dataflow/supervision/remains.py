@@ -1,4 +1,4 @@
-"""What processes of a live run left when they ended: firing records for the recorder, and where others go on."""
+"""Remains of processes of a live run that have ended: firing records for the recorder, and where others go on."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ def plan_replay(
     start: float | None = None,
     end: float | None = None,
 ) -> LogPlan:
-    """Which recorded streams stand in for which operators: the sources, or those that `replaced` names.
+    """Tells which recorded streams stand in for which operators: the sources, or those that `replaced` names.
 
     `start`, `end`: seconds from the recording's first message. Raises `ReplayError`.
     """

@@ -39,7 +39,7 @@ class OperatorCounts:
 
 @dataclass(slots=True)
 class Status:
-    """What a progress display needs; updated in place while the graph runs."""
+    """Holds what a progress display needs; updated in place while the graph runs."""
 
     phase: str = "starting"
     waiting: tuple[str, ...] = ()
@@ -50,7 +50,7 @@ class Status:
     """By operator, how many messages were dropped by (input, reason); a source's input is ""."""
     waits: dict[str, Counter[tuple[str, str]]] = field(default_factory=dict)
     """By operator and (input, "timeout" or "late"): waits that were given up, and messages that came late."""
-    host_of: dict[str, str] = field(default_factory=dict)
+    process_of: dict[str, str] = field(default_factory=dict)
     first: int | None = None
     steps: int | None = None
     notes: list[str] = field(default_factory=list)
@@ -95,7 +95,7 @@ class RunReport:
 
 
 class RunFailed(RuntimeError):
-    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the host's last words.
+    """The run ended early. `str()` is the first cause; `details` the operator's traceback or the process's last words.
 
     `interrupted`: it was asked to end.
     """
@@ -108,5 +108,5 @@ class RunFailed(RuntimeError):
 
     @property
     def internal(self) -> bool:
-        """Whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
+        """Tells whether `details` is a traceback of the runtime's own code, which says nothing about an operator."""
         return self.operator is None and self.details.startswith("Traceback")

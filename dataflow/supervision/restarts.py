@@ -17,6 +17,7 @@ from dataflow.supervision.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.part import Part
 from dataflow.supervision.remains import RemainsPart
 from dataflow.supervision.report import RunFailed
+from dataflow.supervision.rings import pairs_of
 from dataflow.supervision.run_state import Phase, RunState
 from dataflow.supervision.supervised import Supervised
 
@@ -27,7 +28,7 @@ class RestartPolicy(Part):
     """No process is started again: the first death ends the run."""
 
     def may_restart(self, process: Supervised) -> bool:
-        """Whether the policy of a process allows any restart at all."""
+        """Tells whether the policy of a process allows any restart at all."""
         return False
 
     def grant(self, process: Supervised) -> bool:
@@ -50,6 +51,7 @@ class LiveRestarts(RestartPolicy):
         super().__init__(run)
         self._remains = remains
         self._tell = tell
+        self._pairs = tuple(pairs_of(run.graph, {label: process.plan for label, process in run.processes.items()}))
         self._attempts: dict[str, Restarts] = {}
         self._ended_streams: dict[str, str] = {}
 
@@ -84,6 +86,7 @@ class LiveRestarts(RestartPolicy):
         if run.release is not None:
             self._remains.hand_over(process.nodes)
         tell_consumers(run, process, absent=True)
+        self._tell_producers(process)
         self._tell("away", process)
         run.event(
             "restart",
@@ -91,6 +94,13 @@ class LiveRestarts(RestartPolicy):
             operators=list(process.nodes),
             cause=how,
         )
+
+    def _tell_producers(self, process: Supervised) -> None:
+        """Tells those that a process takes from that what they send is for nobody now."""
+        for label, producer in self.run.processes.items():
+            consumers = [consumer for maker, consumer in self._pairs if maker == label]
+            if process.label in consumers:
+                self.run.send(producer, "gone", ring=consumers.index(process.label))
 
     def tick(self) -> None:
         for process in self.run.processes.values():
@@ -133,7 +143,7 @@ class LiveRestarts(RestartPolicy):
             run.kill(process, f"was not ready again within {run.plan.start_timeout:g} s")
 
     def _unproven(self, process: Supervised) -> set[str]:
-        made = set(process.host.publish)
+        made = set(process.plan.publish)
         others = (p for p in self.run.processes.values() if p is not process and p.reachable)
         return {stream for other in others for stream in other.unseen & made}
 
@@ -144,7 +154,7 @@ class LiveRestarts(RestartPolicy):
         if unproven:
             run.note(f"{process.describe()} goes on without: {', '.join(sorted(unproven))}")
         run.send(process, "go", first=run.release.first, at=run.release.at.wall)
-        taken = set(process.host.subscribe)
+        taken = set(process.plan.subscribe)
         for reason in sorted(set(self._ended_streams.values())):
             over = sorted(s for s in taken if self._ended_streams.get(s) == reason)
             run.send(process, "ended_elsewhere", streams=over, reason=reason)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from dataflow.firing import seeding
@@ -18,6 +16,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
+from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport, Status
@@ -59,12 +58,12 @@ def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunRepor
     if plan.record is not None:
         plan = replace(plan, metadata=_metadata(plan, mode))
     supervisor = Supervisor(plan)
-    with _interrupts(supervisor.stop), _watching(supervisor, watch):
+    with interrupts(supervisor.stop), _watching(supervisor, watch):
         return supervisor.run()
 
 
 def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
-    placed = {node: label for label, nodes in plan.graph.hosts(plan.placement).items() for node in nodes}
+    placed = {node: label for label, nodes in plan.graph.processes(plan.placement).items() for node in nodes}
     run_facts = {
         "mode": mode,
         "started": str(time.time_ns()),
@@ -72,33 +71,10 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         "seed": str(plan.graph.seed),
         seeding.FACT: str(seeding.VERSION),
         "threads": str(plan.graph.threads),
-        **{f"host of {node}": label for node, label in placed.items()},
+        **{f"process of {node}": label for node, label in placed.items()},
     }
     facts = machine_facts(environment(plan.graph.threads))
     return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}
-
-
-@contextmanager
-def _interrupts(stop: Callable[[], None]) -> Iterator[None]:
-    """Ctrl-C, SIGTERM and SIGHUP call `stop` while the graph runs (in the main thread; elsewhere they are left alone).
-
-    One that was ignored when this program began stays ignored: that is how `nohup` and background jobs ask for it.
-    """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        stop()
-
-    asking = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    heeded = [number for number in asking if signal.getsignal(number) is not signal.SIG_IGN]
-    before = {number: signal.signal(number, handle) for number in heeded}
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @contextmanager

@@ -1,4 +1,5 @@
-"""What all parts of the supervisor's core share: the processes, the status, the time, and the commands to be given."""
+"""State that all parts of the supervisor's core share: the processes, the status, the time, and the commands to be
+given."""
 
 from __future__ import annotations
 
@@ -11,13 +12,13 @@ from typing import Any
 from dataflow.supervision.commands import Command, Send, Signal, Spawn
 from dataflow.supervision.events import Moment
 from dataflow.supervision.life import WORKS, Life, Step
-from dataflow.supervision.plan import HostPlan, RunPlan, taken_keys
+from dataflow.supervision.plan import ProcessPlan, RunPlan, taken_keys
 from dataflow.supervision.report import OperatorCounts, Status
 from dataflow.supervision.supervised import Supervised
 
 
 class Phase(Enum):
-    """How far a run is; it only goes forward."""
+    """Phases of a run, which only goes forward."""
 
     STARTING = "starting"
     RUNNING = "running"
@@ -28,7 +29,7 @@ class Phase(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Release:
-    """When sources were released, and the stamp that then was now (None: unknown)."""
+    """Release of the sources: its moment, and the stamp that then was now (None: unknown)."""
 
     first: int | None
     at: Moment
@@ -38,20 +39,20 @@ class RunState:
     """The run as far as it is known. Parts read it, and act through its methods."""
 
     def __init__(
-        self, plan: RunPlan, hosts: Mapping[str, HostPlan], configs: Mapping[str, tuple[str, dict[str, Any]]]
+        self, plan: RunPlan, plans: Mapping[str, ProcessPlan], configs: Mapping[str, tuple[str, dict[str, Any]]]
     ) -> None:
-        self.plan, self.hosts, self.configs = plan, hosts, configs
+        self.plan, self.configs = plan, configs
         self.graph = plan.graph
-        self.processes = {label: Supervised(host) for label, host in hosts.items()}
+        self.processes = {label: Supervised(one) for label, one in plans.items()}
         self.status = Status()
         self.now = Moment(0.0, 0.0)
         self.release: Release | None = None
         self._phase = Phase.STARTING
         self._commands: list[Command] = []
         for label, process in self.processes.items():
-            for node in process.nodes or ((label,) if process.is_sink or process.host.has_log else ()):
+            for node in process.nodes or ((label,) if process.is_sink or process.plan.has_log else ()):
                 self.status.operators[node] = OperatorCounts()
-                self.status.host_of[node] = label
+                self.status.process_of[node] = label
 
     # Phase and time
 
@@ -68,7 +69,7 @@ class RunState:
 
     @property
     def under_way(self) -> bool:
-        """Whether sources are released and nothing is being closed yet."""
+        """Tells whether sources are released and nothing is being closed yet."""
         return self._phase in (Phase.RUNNING, Phase.STOPPING)
 
     @property
@@ -100,7 +101,7 @@ class RunState:
 
     def takes(self, process: Supervised) -> set[str]:
         """Returns the keys that a process takes from others."""
-        return taken_keys(self.graph, process.host)
+        return taken_keys(self.graph, process.plan)
 
     def last_words(self) -> str:
         lines = [f"[{p.label}] {line}" for p in self.processes.values() for line in list(p.words)[-5:]]
@@ -147,7 +148,7 @@ class RunState:
 
     def tell_recorder(self, kind: str, /, **fields: Any) -> None:
         for process in self.processes.values():
-            if process.host.sink == "record":
+            if process.plan.sink == "record":
                 self.send(process, kind, **fields)
 
     def event(self, name: str, text: str, /, **data: Any) -> None:

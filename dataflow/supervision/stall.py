@@ -68,7 +68,7 @@ class StallWatch(Part):
         if due <= self.run.plan.stall_timeout:
             return ""
         rate = 1.0 if self.run.plan.rate is None else self.run.plan.rate
-        return f"; the next message of host {label!r} is due in {how_long(due)} at rate {rate:g}"
+        return f"; the next message of process {label!r} is due in {how_long(due)} at rate {rate:g}"
 
 
 class LiveStallWatch(StallWatch):
@@ -78,6 +78,9 @@ class LiveStallWatch(StallWatch):
     def __init__(self, run: RunState, quiescence: Quiescence) -> None:
         super().__init__(run, quiescence)
         self._signs: dict[str, float] = {}
+        graph = run.graph
+        self._flowing = {s for node in graph.sources() for s in node.outputs.values() if not graph.streams[s].static}
+        """The streams of sources that have not ended."""
 
     def released(self) -> None:
         super().released()
@@ -90,6 +93,8 @@ class LiveStallWatch(StallWatch):
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         super().said(process, kind, fields)
         self._signs[process.label] = self.run.steady
+        if kind == "stream_ended":
+            self._flowing.discard(fields["stream"])
 
     def _stuck(self) -> list[Supervised]:
         """Returns those who are at a call for as long as nothing has happened."""
@@ -98,6 +103,9 @@ class LiveStallWatch(StallWatch):
 
     def tick(self) -> None:
         super().tick()
+        if not self._flowing and (stuck := self._stuck()):  # however busy a timer is
+            names = "; ".join(p.at_work() for p in stuck)
+            raise RunFailed(f"all sources have ended, and a call does not: {names}", self.run.last_words())
         now, timeout = self.run.steady, self.run.plan.stall_timeout
         for process in list(self.run.working()):
             silence = now - self._signs.get(process.label, now)
@@ -105,5 +113,5 @@ class LiveStallWatch(StallWatch):
                 words = self.run.last_words()
                 self.run.kill(process)
                 raise RunFailed(f"{process.describe()} gave no sign of life for {silence:.0f} s", words)
-            if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # hosts give one by themselves
+            if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # operators' processes give one
                 self.run.send(process, "poll", replaces=True, round=NO_ROUND)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dataflow.supervision.life import HAS_PROCESS, Life, Step, after
-from dataflow.supervision.plan import HostPlan
+from dataflow.supervision.plan import ProcessPlan
 from dataflow.sync import FOREVER, NEVER
 
 WORDS_KEPT = 50
@@ -17,7 +17,7 @@ WORDS_KEPT = 50
 class Supervised:
     """State and news of one process. `since`: when it came into its state (steady s)."""
 
-    host: HostPlan
+    plan: ProcessPlan
     since: float = 0.0
     life: Life = Life.STARTING
     attempt: int = 0
@@ -41,15 +41,15 @@ class Supervised:
 
     @property
     def label(self) -> str:
-        return self.host.label
+        return self.plan.label
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        return self.host.nodes
+        return self.plan.nodes
 
     @property
     def is_sink(self) -> bool:
-        return self.host.sink is not None
+        return self.plan.sink is not None
 
     @property
     def reachable(self) -> bool:
@@ -73,10 +73,10 @@ class Supervised:
 
     def describe(self) -> str:
         what = ", ".join(self.nodes)
-        return f"host {self.label!r}" + (f" (operators {what})" if what and what != self.label else "")
+        return f"process {self.label!r}" + (f" (operators {what})" if what and what != self.label else "")
 
     def at_work(self) -> str:
-        """Returns such as "host 'camera', camera at stamp 5 for 3 s"."""
+        """Returns such as "process 'camera', camera at stamp 5 for 3 s"."""
         if self.work is None:
             return self.describe()
         operator, stamp, seconds = self.work

@@ -21,10 +21,11 @@ from dataflow.supervision import commands, events
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
-from dataflow.supervision.plan import RunPlan, host_plans
+from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
+from dataflow.supervision.rings import Rings, pairs_of
 from dataflow.supervision.words import Words
-from dataflow.transport import new_secret, registry, reserve_endpoints
+from dataflow.transport import registry, reserve_endpoints
 
 TICK = 0.05
 NOT_READING_AFTER = 1.0
@@ -44,10 +45,10 @@ class Supervisor:
 
     def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
         self.plan = plan
-        self._hosts = host_plans(plan)
-        self._reserved = reserve_endpoints(len(self._hosts))
-        self._endpoints = dict(zip(self._hosts, self._reserved.endpoints, strict=True))
-        self.core = core_of(plan, self._hosts, configurations(plan, self._hosts, self._endpoints, new_secret()))
+        self._processes = process_plans(plan)
+        self._reserved = reserve_endpoints(len(self._processes))
+        self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
+        self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or _print
         self._children: dict[str, Child] = {}
         self._boxes: dict[str, int] = {}
@@ -80,6 +81,8 @@ class Supervisor:
             stack.callback(self._close_pipe)
             stack.callback(self._reserved.close)
             stack.enter_context(self._announced)
+            self._rings = self._make_rings()
+            stack.callback(self._rings.close)
             self._words = Words(self._on_output)
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
@@ -90,6 +93,12 @@ class Supervisor:
             raise over.failure
         assert over.report is not None
         return over.report
+
+    def _make_rings(self) -> Rings:
+        try:
+            return Rings(list(self._processes), pairs_of(self.plan.graph, self._processes))
+        except OSError as error:
+            raise RunFailed(f"cannot link the processes: {error}; raise the limit of open files (ulimit -n)") from error
 
     def _start_nursery(self) -> Nursery:
         try:
@@ -180,7 +189,7 @@ class Supervisor:
             return
         try:
             nodes = self.plan.graph.nodes
-            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._hosts[label].nodes})
+            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._processes[label].nodes})
         finally:
             os.close(box)
         self._feed(events.Remained(label, remains))
@@ -259,7 +268,7 @@ class Supervisor:
     def _spawn(self, label: str) -> None:
         try:
             box = self._make_box(label)
-            child = self._nursery.spawn(box)
+            child = self._nursery.spawn((*self._rings.handed(label), *box))
         except (NurseryFailed, OSError) as failure:
             self._feed(events.Aborted(str(failure)))
             return
@@ -270,7 +279,7 @@ class Supervisor:
 
     def _make_box(self, label: str) -> tuple[int, ...]:
         """Makes what a process writes its firing records to, where another one may take its place."""
-        if not self.plan.live or self._hosts[label].sink is not None:
+        if not self.plan.live or self._processes[label].sink is not None:
             return ()
         self._boxes[label] = make_black_box()
         return (self._boxes[label],)

@@ -1,4 +1,5 @@
-"""When operators fire: stamps, frontiers and the aligner. Pure: no clock, no thread, no I/O."""
+"""Event time: stamps, frontiers, and the aligner that decides when operators fire. Pure: no clock, no thread, no
+I/O."""
 
 from dataflow.sync.aligner import Aligner, StreamEnd
 from dataflow.sync.demand import Cycle, Edge, stuck_cycle
@@ -15,7 +16,7 @@ from dataflow.sync.entries import (
     Waiting,
 )
 from dataflow.sync.recorded import RecordedAligner
-from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, messages_of, refs_of
+from dataflow.sync.refs import FiringInputs, InputRef, MessageRef, RunRef, input_refs, messages_of, refs_of
 from dataflow.sync.spec import AlignSpec, BatchSpec, SampledSpec, TriggerSpec
 from dataflow.sync.stamps import FOREVER, NEVER, format_duration, format_stamp, parse_duration, trail
 
@@ -47,6 +48,7 @@ __all__ = [
     "Waiting",
     "format_duration",
     "format_stamp",
+    "input_refs",
     "messages_of",
     "parse_duration",
     "refs_of",

@@ -44,7 +44,7 @@ _NO_NAMES: frozenset[str] = frozenset()
 
 
 class StreamEnd(NamedTuple):
-    """How a stream ended: its final stamp (None if it carried and promised nothing) and why."""
+    """End of a stream: its final stamp (None if it carried and promised nothing) and why."""
 
     final_stamp: int | None
     reason: str
@@ -90,6 +90,7 @@ class Aligner:
         self._triggered = False  # whether a trigger candidate lies there
         self._ticked = False  # whether a tick lies there
         self._ready = False  # whether that is all known
+        self._settled = False  # whether these say what is so: nothing has changed since
         self._decided = NEVER  # everything at or below is decided, or has been promised downstream
         self._last_firing = NEVER
         self._finished = False
@@ -100,6 +101,7 @@ class Aligner:
         """Everything before `stamp` was decided elsewhere, ticks included. To be called before the first `push`;
         messages from before may still be pushed, as partners, samples and parts of batches of what is to come."""
         self._decided = stamp - 1
+        self._settled = False
         if self._ticks is not None:
             self._ticks.begin_at(stamp)
 
@@ -110,7 +112,7 @@ class Aligner:
 
         Raises StreamOrderError if the stream had promised that there would be no such message.
         """
-        state = self._stream(stream)
+        state = self._streams.get(stream) or self._stream(stream)
         if entry.incarnation > state.incarnation and entry.stamp < FOREVER:
             self.reset(stream, entry.incarnation)
         if not entry.stream:
@@ -119,16 +121,20 @@ class Aligner:
             for lane in state.lanes:
                 self._drop_log.entry(lane, entry, "late")
             return
+        self._settled = False
         frontier = entry.stamp
         if state.static:
             self.ends[stream] = StreamEnd(None, "static")
             frontier = FOREVER
         for lane in state.lanes:
-            if lane.role == "trigger":
-                self._push_trigger(lane, entry)
-            else:
+            if lane.role != "trigger":
                 self._push_context(lane, entry)
-            lane.raise_frontier(frontier)
+            elif entry.stamp > lane.frontier:
+                lane.entries.append(entry)
+            else:
+                self._push_forced(lane, entry)
+            if frontier > lane.frontier:
+                lane.frontier = frontier
 
     def advance(self, stream: str, frontier: int) -> None:
         """The stream promises: no later message has a stamp at or below `frontier`. Never takes one back.
@@ -137,6 +143,7 @@ class Aligner:
         """
         state = self._stream(stream)
         if state.advance(frontier):
+            self._settled = False
             for lane in state.lanes:
                 lane.raise_frontier(frontier)
 
@@ -151,6 +158,7 @@ class Aligner:
         if state.ended:
             return
         state.end(final_stamp)
+        self._settled = False
         self.ends[stream] = StreamEnd(state.final, reason)
         for lane in state.lanes:
             lane.raise_frontier(FOREVER)
@@ -164,11 +172,12 @@ class Aligner:
         """
         state = self._stream(stream)
         state.reset(incarnation)
+        self._settled = False
         self.ends.pop(stream, None)
         for lane in state.lanes:
             lane.reopen(self._decided)
 
-    # What the host decides when it will not wait
+    # What the process decides when it will not wait
 
     def force(self, input: str, frontier: int) -> bool:
         """Pretends that the streams of `input`, but for static ones, have promised `frontier`; False when that is no
@@ -179,6 +188,7 @@ class Aligner:
         moved = [lane for lane in self._lanes[input] if not lane.state.static and frontier > lane.frontier]
         for lane in moved:
             lane.frontier = frontier
+            self._settled = False
         return bool(moved)
 
     def owed_ticks(self) -> tuple[int, int, int]:
@@ -261,6 +271,7 @@ class Aligner:
                 if not batch.knows(stamp):
                     return None
             firing = self._fire(stamp)
+            self._settled = False
             self._decided = stamp
             if firing is not None:
                 self._last_firing = stamp
@@ -288,39 +299,44 @@ class Aligner:
             self._decided = frontier
         return self._decided
 
-    @property
-    def next_undecided(self) -> int | None:
-        """The first stamp of a trigger or tick that is not decided; None if there is none yet."""
-        if self._finished:
-            return None
-        self._settle()
-        return self._undecided()
+    def idle_frontier(self) -> int:
+        """The output frontier, where no firing is held back and none is left: nothing will come before somebody says
+        more. NEVER where `poll` is to be asked."""
+        if not self._settled:
+            self._settle()
+        if self._stamp is not None or not self._settled or self._triggers.bound == FOREVER:
+            return NEVER
+        return self.output_frontier()
 
     def ended(self) -> bool:
-        """Whether `poll` has returned the `finish` firing, and will return no other."""
+        """Tells whether `poll` has returned the `finish` firing, and will return no other."""
         return self._finished
 
     def final_stamp(self) -> int | None:
-        """What the operator's own streams end with, unless they emitted later: known once `ended`."""
+        """Returns what the operator's own streams end with, unless they emitted later: known once `ended`."""
         return self._finish_stamp() - 1 if self._finished else None
 
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
-        """How many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
+        """Tells how many messages (and ticks, whose input is `TICK`) were dropped so far, by (input, reason)."""
         return self._drop_log.counts
 
     @property
     def late(self) -> Mapping[str, int]:
-        """How many messages came after what needed them was decided, by input. Triggers among them are dropped as
+        """Tells how many messages came after what needed them was decided, by input. Triggers among them are dropped as
         `late`; Sampled and Batch messages still serve the firings to come."""
         return self._drop_log.late
+
+    def has_drops(self) -> bool:
+        """Tells whether there is a drop that was not taken."""
+        return self._drop_log.pending
 
     def take_drops(self) -> list[Drop]:
         """The drops since this was last asked, at most the last `KEPT`."""
         return self._drop_log.take()
 
     def take_unlisted(self) -> Mapping[tuple[str, str], int]:
-        """How many drops were too many to be kept since this was last asked, by (input, reason)."""
+        """Tells how many drops were too many to be kept since this was last asked, by (input, reason)."""
         return self._drop_log.take_unlisted()
 
     def buffered(self) -> dict[str, int]:
@@ -331,11 +347,14 @@ class Aligner:
 
     def _settle(self) -> None:
         """Finds the first undecided stamp, and whether triggers and ticks there are known."""
+        if self._settled:
+            return
         triggers = self._triggers
         triggers.settle()
         candidate = triggers.stamp
         ticks = self._ticks
-        if ticks is None:
+        if ticks is None:  # else what is known of ticks depends on what is decided, too
+            self._settled = True
             self._stamp, self._triggered, self._ready = candidate, candidate is not None, triggers.ready
             return
         ticks.settle(self._decided)
@@ -363,6 +382,9 @@ class Aligner:
 
     def _fire(self, stamp: int) -> Firing | None:
         """The firing at a decided stamp, or None if a required Sampled input is absent: a drop instead."""
+        if not self._sampled and not self._batches:
+            inputs = self._triggers.take() if self._triggered else self._triggers.absent()
+            return Firing(stamp, "fire" if self._triggered else "tick", self._ticked, inputs, _NO_NAMES, _NO_NAMES)
         context: dict[str, InputValue] = {}
         stale: list[str] = []
         late: list[str] = []
@@ -399,7 +421,7 @@ class Aligner:
             self._drop_log.tick(stamp, reason, because)
 
     def _exhausted(self) -> bool:
-        """Whether nothing is left but the finish."""
+        """Tells whether nothing is left but the finish."""
         over = self._stamp is None and self._triggers.bound == FOREVER
         return over and (self._ticks is None or self._ticks.stamp == FOREVER)
 
@@ -436,8 +458,9 @@ class Aligner:
             raise KeyError(f"stream {name!r} feeds no input; those that do: {', '.join(self._streams)}")
         return state
 
-    def _push_trigger(self, lane: Lane, entry: Entry) -> None:
-        if entry.stamp <= lane.frontier and entry.stamp <= max(self._decided, self._triggers.decided):
+    def _push_forced(self, lane: Lane, entry: Entry) -> None:
+        """Takes a trigger message that lies below a forced frontier."""
+        if entry.stamp <= max(self._decided, self._triggers.decided):
             self._drop_log.entry(lane, entry, "late")
         else:
             lane.entries.append(entry)

@@ -1,4 +1,4 @@
-"""What the aligner dropped: counted, and the last ones one by one."""
+"""Messages that the aligner dropped: counted, and the last ones one by one."""
 
 from __future__ import annotations
 
@@ -54,6 +54,11 @@ class DropLog:
             oldest = self._events.popleft()
             self._unlisted[oldest.input, oldest.reason] += 1
 
+    @property
+    def pending(self) -> bool:
+        """Tells whether there is a drop that was not taken."""
+        return bool(self._events or self._unlisted)
+
     def take(self) -> list[Drop]:
         """The drops since this was last asked, but for those that were too many."""
         events = list(self._events)
@@ -61,7 +66,7 @@ class DropLog:
         return events
 
     def take_unlisted(self) -> dict[tuple[str, str], int]:
-        """How many drops since this was last asked were too many to be kept, by (input, reason)."""
+        """Tells how many drops since this was last asked were too many to be kept, by (input, reason)."""
         unlisted = dict(self._unlisted)
         self._unlisted.clear()
         return unlisted

@@ -1,4 +1,8 @@
-"""What goes into an aligner and what comes out: entries, firings and drops."""
+"""Inputs and outputs of an aligner: entries, firings and drops.
+
+Nobody changes them. Those that are made for every message are not frozen all the same: it would make them cost three
+times as much.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +27,7 @@ class StreamOrderError(ValueError):
         self.stream, self.problem = stream, problem
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class Entry:
     """A message as the aligner sees it. Its identity is (stream, incarnation, seq); `value` is only carried.
 
@@ -42,7 +46,7 @@ InputValue = Entry | None | tuple[Entry, ...] | Mapping[str, Entry]
 """An entry or None; of a Batch a tuple; of a `many` trigger or Sampled a map from stream to entry."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Firing:
     """One call of `process()` (or of `finish()`): a stamp plus the exact messages given to each input.
 

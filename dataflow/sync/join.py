@@ -17,7 +17,7 @@ from dataflow.sync.stamps import FOREVER, NEVER
 
 
 class _Unknown:
-    """What is needed before a partner can be named: on the other input, or on the anchor."""
+    """Holds what is needed before a partner can be named: on the other input, or on the anchor."""
 
     __slots__ = ("anchor", "other")
 
@@ -105,7 +105,7 @@ class Join:
         return (min(heads), {self._anchor.input: min(heads) + self._tolerance}) if heads else None
 
     def _match(self, stamp: int) -> bool:
-        """Whether the anchor at `stamp` matches or still may; leaves what is known in `_partners`."""
+        """Tells whether the anchor at `stamp` matches or still may; leaves what is known in `_partners`."""
         self._partners = []
         for lane in self._others:
             partner = self._partner(lane, stamp)

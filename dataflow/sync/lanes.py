@@ -16,7 +16,7 @@ PRUNE_AT = 32
 
 
 class StreamState:
-    """What a stream has said about itself, whatever inputs it feeds, and whether it keeps to it."""
+    """Holds what a stream has said about itself, whatever inputs it feeds, and whether it keeps to it."""
 
     __slots__ = (
         "ended",
@@ -133,7 +133,7 @@ class Lane:
 
     @property
     def reach(self) -> int:
-        """How far the stream is known to go: its final stamp once it ended, else its frontier."""
+        """Tells how far the stream is known to go: its final stamp once it ended, else its frontier."""
         if not self.state.ended:
             return self.frontier
         return NEVER if self.state.final is None else self.state.final

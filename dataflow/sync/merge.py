@@ -15,6 +15,7 @@ class Merge:
 
     def __init__(self, triggers: Sequence[TriggerSpec], lanes: Sequence[Lane], drop: DropEntry) -> None:
         self._lanes = tuple(lanes)
+        self._only = lanes[0] if len(lanes) == 1 else None
         self._many = frozenset(trigger.name for trigger in triggers if trigger.many)
         self._names = tuple(trigger.name for trigger in triggers)
         self._drop = drop
@@ -28,6 +29,12 @@ class Merge:
         """The last trigger stamp decided."""
 
     def settle(self) -> None:
+        lane = self._only
+        if lane is not None:
+            self.bound = lane.frontier
+            self.stamp = lane.entries[0].stamp if lane.entries else None
+            self.ready = self.stamp is not None and self.stamp <= self.bound
+            return
         stamp = bound = FOREVER
         for lane in self._lanes:
             if lane.entries and (head := lane.entries[0].stamp) < stamp:
@@ -40,6 +47,11 @@ class Merge:
 
     def take(self) -> dict[str, InputValue]:
         """The values of the triggers at `stamp`, which is thereby decided."""
+        lane = self._only
+        if lane is not None:
+            entry = lane.entries.popleft()
+            self.decided = entry.stamp
+            return {lane.input: {lane.state.name: entry} if self._many else entry}
         values = self.absent()
         for lane, entry in self._pop():
             present = values[lane.input]

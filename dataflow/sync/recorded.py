@@ -55,7 +55,7 @@ class RecordedAligner:
         return Firing(record.stamp, record.kind, record.tick, inputs, record.stale, record.late)
 
     def ended(self) -> bool:
-        """Whether every recorded firing has been returned."""
+        """Tells whether every recorded firing has been returned."""
         return self._place >= len(self._records)
 
     def missing(self) -> MessageRef | None:

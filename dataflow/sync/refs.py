@@ -1,4 +1,7 @@
-"""A firing by reference: which messages each input had, without their content. Firing records embed this."""
+"""A firing by reference: which messages each input had, without their content. Firing records embed this.
+
+Nobody changes a reference; those to one message, made for every firing, are not frozen all the same (see `entries`).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from dataclasses import dataclass, field
 from dataflow.sync.entries import Entry, Firing, FiringKind, InputValue
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, unsafe_hash=True)
 class MessageRef:
     """One message: its stream, the stream's incarnation, and its number there."""
 
@@ -62,8 +65,15 @@ class FiringInputs:
 
 def refs_of(firing: Firing) -> FiringInputs:
     """`firing` by reference. Its entries must name their stream, as those that come out of an aligner do."""
-    inputs = {name: _ref(value) for name, value in firing.inputs.items()}
-    return FiringInputs(firing.stamp, firing.kind, firing.tick, inputs, firing.stale, firing.late)
+    return FiringInputs(firing.stamp, firing.kind, firing.tick, input_refs(firing), firing.stale, firing.late)
+
+
+def input_refs(firing: Firing) -> dict[str, InputRef]:
+    """The inputs of a firing by reference."""
+    return {
+        name: MessageRef(value.stream, value.incarnation, value.seq) if value.__class__ is Entry else _ref(value)
+        for name, value in firing.inputs.items()
+    }
 
 
 def _ref(value: InputValue) -> InputRef:

@@ -1,4 +1,4 @@
-"""What an operator waits for: the declaration from which an aligner is built.
+"""Specifies what an operator waits for: the declaration from which an aligner is built.
 
 A *stream* is named by its key. An input is usually fed by one stream; with `many` it is fed by any number of
 them (a wildcard) and its value is kept per stream. Durations are nanoseconds.
@@ -128,7 +128,7 @@ class AlignSpec:
 
     @property
     def joins(self) -> bool:
-        """Whether triggers have to meet: a join of two or more."""
+        """Tells whether triggers have to meet: a join of two or more."""
         return self.mode == "join" and len(self.triggers) > 1
 
     @property

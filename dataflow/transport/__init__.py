@@ -1,12 +1,17 @@
-"""Envelope codec and the Zenoh bus between hosts."""
+"""Envelope codec, links between processes of one machine, and the Zenoh bus to everything outside."""
 
 from dataflow.transport.bus import Bus, Token
 from dataflow.transport.codec import decode, decode_head, encode, encode_parts
+from dataflow.transport.counters import Counters
 from dataflow.transport.envelope import DecodeError, Envelope, Head, Kind, Limits
+from dataflow.transport.fanout import Fanout
+from dataflow.transport.links import Incoming, Outgoing
 from dataflow.transport.network import NetworkConfig, NetworkError
+from dataflow.transport.outside import OutsidePublisher
 from dataflow.transport.publisher import BusError, StreamPublisher
 from dataflow.transport.registry import RegistryError, RunningGraph, register, running
-from dataflow.transport.seal import new_secret
+from dataflow.transport.ring import make_ring
+from dataflow.transport.shared import PoolReader, make_board
 from dataflow.transport.sockets import Reservation, reserve_endpoints
 from dataflow.transport.tap_client import TapClient, TapMessage
 from dataflow.transport.tap_server import TapServer
@@ -15,13 +20,19 @@ from dataflow.transport.taps import TapWindow
 __all__ = [
     "Bus",
     "BusError",
+    "Counters",
     "DecodeError",
     "Envelope",
+    "Fanout",
     "Head",
+    "Incoming",
     "Kind",
     "Limits",
     "NetworkConfig",
     "NetworkError",
+    "Outgoing",
+    "OutsidePublisher",
+    "PoolReader",
     "RegistryError",
     "Reservation",
     "RunningGraph",
@@ -35,7 +46,8 @@ __all__ = [
     "decode_head",
     "encode",
     "encode_parts",
-    "new_secret",
+    "make_board",
+    "make_ring",
     "register",
     "reserve_endpoints",
     "running",

@@ -1,52 +1,35 @@
-"""The bus: one Zenoh session of one process, with exactly the operations that streams need.
+"""The bus: one Zenoh session of one process, for what comes from outside the run and goes there.
 
-Callbacks run on Zenoh's threads. They must only append to a queue: a callback that waits stalls every stream of the
-process.
+Callbacks run on Zenoh's threads. They must only append to a queue: a callback that waits stalls all of them.
 """
 
 from __future__ import annotations
 
 import contextlib
-import os
 import signal
-import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, Self
 
 import zenoh
 
-from dataflow.transport.codec import encode_head
 from dataflow.transport.counters import Counters
-from dataflow.transport.envelope import Buffer, DecodeError, Envelope
-from dataflow.transport.keys import RUNTIME, shared_key, static_key, stream_of_static
+from dataflow.transport.keys import static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
-from dataflow.transport.pool import BoardReader, SharedPool
-from dataflow.transport.publisher import BusError, Sharing, StreamPublisher, undeclare
-from dataflow.transport.seal import Seal
-from dataflow.transport.shared import SUPPORTED, Board, PoolReader, SharedMemoryError, is_reference, machine
+from dataflow.transport.publisher import BusError, StreamPublisher, undeclare
 
 CLOSE_WITHIN = 20.0
-MAPPED_WITHIN = 1.0
-
-Receive = Callable[[Buffer], object]
 
 
 class Token:
     """A declaration that lasts until `close` (or the end of the bus)."""
 
-    def __init__(self, *declared: Any, board: Board | None = None) -> None:
+    def __init__(self, declared: Any) -> None:
         self._declared = declared
-        self._board = board
 
     def close(self) -> None:
-        for declared in self._declared:
-            undeclare(declared)
-        if self._board is not None:
-            self._board.close()
-            self._board = None
+        undeclare(self._declared)
 
     def __enter__(self) -> Self:
         return self
@@ -90,102 +73,22 @@ class Bus:
         self.id = str(self.session.zid())
         self.counted = Counters()
         self._lock = threading.Lock()
-        self._pool: SharedPool | None = None
-        self._pools = PoolReader()
-        self._shares = self.config.shared_memory and SUPPORTED
         self._tokens: list[Token] = []
         self._declared: dict[str, zenoh.Queryable[None]] = {}
         self._static: dict[str, bytes] = {}
-        self._told: set[str] = set()
         self._closed = False
 
     # Streams
 
-    def publisher(self, stream: str, *, consumers: int = 0) -> StreamPublisher:
-        """Declares a publisher of the key `stream`: reliable, blocking, in order.
-
-        `consumers` is the number of subscriptions to the stream (`subscribe` calls) in all other hosts, if known: when
-        all of them are on this machine, large messages go through shared memory. 0: nothing is shared.
-        """
+    def publisher(self, stream: str) -> StreamPublisher:
+        """Declares a publisher of the key `stream`: reliable, blocking, in order."""
         publisher = self.session.declare_publisher(
             stream,
             congestion_control=zenoh.CongestionControl.BLOCK,
             reliability=zenoh.Reliability.RELIABLE,
             express=True,
         )
-        sharing = None
-        if consumers and self._can_share(stream):
-            sharing = Sharing(self.session, stream, consumers, self.counted, self._share)
-        seal = Seal(self.config.secret, stream)
-        return StreamPublisher(stream, publisher, seal, self.counted, sharing, self.config.blocked)
-
-    def subscribe(self, stream: str, receive: Receive) -> Token:
-        """Calls `receive(payload)` for all that processes of this run publish on a key, in each publisher's order.
-
-        What others publish there is dropped and counted as `foreign`, before anything in it is looked at. `payload` is
-        read-only and stays valid for as long as anything refers to it; `decode` makes views of it, which may lie in
-        the publisher's shared memory. Runs on Zenoh's thread: only append to a queue.
-        """
-        board, declared = self._offer_sharing(stream)
-        seal = Seal(self.config.secret, stream)
-
-        def on_sample(sample: zenoh.Sample) -> None:
-            received = bytes(sample.payload)
-            attached = sample.attachment
-            if attached is None or not seal.fits(received, bytes(attached)):
-                self._drop_foreign(stream)
-                return
-            payload = self._resolve(received, board) if board is not None and is_reference(received) else received
-            self.counted.moved("received", len(payload))
-            receive(payload)
-
-        subscriber = self.session.declare_subscriber(stream, zenoh.handlers.Callback(on_sample, indirect=False))
-        return self._keep(Token(subscriber, *declared, board=board))
-
-    def _drop_foreign(self, stream: str) -> None:
-        self.counted.add("foreign")
-        with self._lock:
-            told = stream in self._told
-            self._told.add(stream)
-        if not told:
-            print(
-                f"dropped a message on {stream!r} that no process of this run published (and count those that follow)",
-                file=sys.stderr,
-            )
-
-    def _offer_sharing(self, stream: str) -> tuple[Board | None, tuple[Any, ...]]:
-        """Tells the stream's publisher, before it can see the subscription, that we can read shared memory."""
-        if not self._can_share(stream):
-            return None, ()
-        board = Board()
-        name = shared_key(stream, machine(), str(os.getpid()), str(board.descriptor), self.id)
-        return board, (self.session.liveliness().declare_token(name),)
-
-    def _can_share(self, stream: str) -> bool:
-        """Shared memory is for streams, not for the runtime's own keys."""
-        return self._shares and stream.count("/") >= 2 and f"/{RUNTIME}/" not in stream
-
-    def _resolve(self, payload: bytes, board: Board) -> Buffer:
-        """Returns the envelope that a reference stands for; the reference, which `decode` refuses, when it is lost."""
-        try:
-            return self._pools.resolve(payload, board)
-        except (SharedMemoryError, DecodeError):
-            self.counted.add("unresolved")
-            return payload
-
-    def _share(
-        self, envelope: Envelope, parts: list[Buffer], size: int, claims: tuple[BoardReader, ...]
-    ) -> bytes | None:
-        """Puts an envelope into the pool for `claims`; returns its reference, or None without room (counted)."""
-        with self._lock:
-            if self._pool is None:
-                self._pool = SharedPool(self.config.pool_bytes)
-            block = self._pool.write(parts, size, claims)
-            if block is None:
-                self.counted.add("shared_full")
-                return None
-            self.counted.moved("shared", size)
-            return self._pool.reference(encode_head(envelope), block, size)
+        return StreamPublisher(stream, publisher, self.counted, self.config.blocked)
 
     def _keep(self, token: Token) -> Token:
         """A declaration lasts until it is closed, also when the caller does not keep its token."""
@@ -212,12 +115,11 @@ class Bus:
             return tuple(stream_of_static(key) for key in self._static)
 
     def _answer_static(self, stream: str) -> Callable[[zenoh.Query], None]:
-        key, seal = static_key(stream), Seal(self.config.secret, stream)
+        key = static_key(stream)
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                envelope = self._static[key]
-                query.reply(key, envelope, attachment=seal.of(envelope))
+                query.reply(key, self._static[key])
 
         return answer
 
@@ -225,39 +127,17 @@ class Bus:
         """Returns the encoded messages of the static streams that match a stream key expression, by stream.
 
         Waits at most `timeout` seconds; a process that does not answer within it is left out. For tools: whoever is
-        connected may have answered. Processes of the run use `fetch_statics`.
+        connected may have answered.
         """
         wanted = zenoh.KeyExpr.autocanonize(expression)
-        return {
-            stream: payload
-            for stream, payload, _ in self._static_replies(namespace, timeout)
-            if wanted.intersects(zenoh.KeyExpr(stream))
-        }
-
-    def fetch_statics(self, namespace: str, timeout: float = 2.0) -> dict[str, bytes]:
-        """Returns the encoded messages of the static streams that processes of this run hold, by stream."""
-        found = {}
-        for stream, payload, seal in self._static_replies(namespace, timeout):
-            if Seal(self.config.secret, stream).fits(payload, seal):
-                found[stream] = payload
-            else:
-                self._drop_foreign(stream)
-        return found
-
-    def _static_replies(self, namespace: str, timeout: float) -> Iterator[tuple[str, bytes, bytes]]:
-        """Yields stream, message and seal of each answer."""
         replies = self.session.get(
             static_key(f"{namespace}/**"),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout,
         )
-        for reply in replies:
-            sample = reply.ok
-            if sample is not None:
-                attached = sample.attachment
-                seal = b"" if attached is None else bytes(attached)
-                yield stream_of_static(str(sample.key_expr)), bytes(sample.payload), seal
+        samples = ((stream_of_static(str(r.ok.key_expr)), r.ok) for r in replies if r.ok is not None)
+        return {stream: bytes(s.payload) for stream, s in samples if wanted.intersects(zenoh.KeyExpr(stream))}
 
     # Requests
 
@@ -302,7 +182,6 @@ class Bus:
             if self._closed:
                 return
             self._closed = True
-        self._wait_until_mapped()
         closer = threading.Thread(target=self.session.close, name="bus close", daemon=True)
         closer.start()
         closer.join(CLOSE_WITHIN)
@@ -310,19 +189,6 @@ class Bus:
             raise BusError(f"Zenoh did not close within {CLOSE_WITHIN:g} s")
         for token in self._tokens:
             token.close()
-        if self._pool is not None:
-            self._pool.close()
-
-    def _wait_until_mapped(self) -> None:
-        """Gives consumers that were just sent their first reference the time to map the pool before it goes."""
-        if self._pool is None:
-            return
-        base, end = self._pool.base, time.monotonic() + MAPPED_WITHIN
-        waiting = self._pool.consumers()
-        while waiting and time.monotonic() < end:
-            waiting = {c for c in waiting if not c.mapped(base)}
-            if waiting:
-                time.sleep(0.002)
 
     def __enter__(self) -> Self:
         return self

@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, Final
 
 import msgpack
 import numpy as np
 import numpy.typing as npt
 
-from dataflow.messages.base import ArrayField, Message, MessageError, ScalarField, message_type
+from dataflow.messages.base import ArrayField, Message, MessageError, message_type
+from dataflow.transport.body import Body, short, where
 from dataflow.transport.envelope import (
     ALIGNMENT,
     DEFAULT_LIMITS,
@@ -35,9 +37,12 @@ TypeOf = Callable[[str], type[Message]]
 
 _INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
 _PADDING = bytes(ALIGNMENT)
-_NIL = 0xC0
 _HEAD_FIELDS: Final = 6
-_KINDS: Final = frozenset(Kind)
+_KINDS: Final = {int(kind): kind for kind in Kind}
+_SMALL_BODY: Final = 4096
+_SMALL_ARRAY: Final = 64
+"""Bytes of a body, and elements of an array in it, up to which it is decoded as a whole: then a hostile one, whose
+arrays claim lengths that they do not have, costs less than a megabyte."""
 
 
 def encode_head(envelope: Envelope) -> bytes:
@@ -103,10 +108,10 @@ def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS, types: TypeOf = mess
     head, body_start, body_bytes = _head(view, limits)
     body_end = body_start + body_bytes
     if head.kind is Kind.REFERENCE:
-        raise DecodeError(f"{_where(head)}: it lies in shared memory that could not be opened here")
+        raise DecodeError(f"{where(head)}: it lies in shared memory that could not be opened here")
     if head.kind is not Kind.MESSAGE:
         if body_bytes or len(view) != body_end:
-            raise DecodeError(f"{_where(head)}: {len(view) - body_start} bytes after the head, expected none")
+            raise DecodeError(f"{where(head)}: {len(view) - body_start} bytes after the head, expected none")
         message = None
     else:
         message = _message(view, head, body_start, body_end, limits, types)
@@ -120,6 +125,15 @@ def _bytes_view(buffer: Buffer) -> memoryview:
         raise DecodeError(f"an envelope is contiguous bytes, got {type(buffer).__name__}") from None
 
 
+def _unpacking(**limits: int) -> Callable[[Any], Any]:
+    """A decoder of msgpack without maps, extensions and binary data."""
+    return partial(msgpack.unpackb, raw=False, use_list=False, max_map_len=0, max_ext_len=0, max_bin_len=0, **limits)
+
+
+_unpack_body = _unpacking(max_array_len=_SMALL_ARRAY)
+_head_unpackers: dict[int, Callable[[Any], Any]] = {}
+
+
 def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
     """The head, where the body starts and how long it is."""
     if len(view) < PRELUDE.size:
@@ -131,53 +145,63 @@ def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
         raise DecodeError(f"prelude: version {version}, this decoder knows {VERSION}")
     if kind not in _KINDS:
         raise DecodeError(f"prelude: kind {kind}, known are {', '.join(f'{k.value} ({k.name})' for k in Kind)}")
-    for name, size, most in (("head", head_bytes, limits.head_bytes), ("body", body_bytes, limits.body_bytes)):
-        if size > most:
-            raise DecodeError(f"prelude: {name} of {size} bytes, at most {most} are accepted")
+    if head_bytes > limits.head_bytes or body_bytes > limits.body_bytes:
+        for name, size, most in (("head", head_bytes, limits.head_bytes), ("body", body_bytes, limits.body_bytes)):
+            if size > most:
+                raise DecodeError(f"prelude: {name} of {size} bytes, at most {most} are accepted")
     body_start = PRELUDE.size + head_bytes
     if body_start + body_bytes > len(view):
         raise DecodeError(
             f"prelude: head and body of {head_bytes} + {body_bytes} bytes, but only {len(view) - PRELUDE.size} follow"
         )
     try:
-        values = msgpack.unpackb(
-            view[PRELUDE.size : body_start],
-            raw=False,
-            use_list=False,
-            max_array_len=_HEAD_FIELDS,
-            max_map_len=0,
-            max_ext_len=0,
-            max_bin_len=0,
-            max_str_len=limits.string_bytes,
-        )
+        unpack = _head_unpackers.get(limits.string_bytes)
+        if unpack is None:
+            unpack = _unpacking(max_array_len=_HEAD_FIELDS, max_str_len=limits.string_bytes)
+            _head_unpackers[limits.string_bytes] = unpack
+        values = unpack(view[PRELUDE.size : body_start])
     except Exception as error:  # msgpack raises a dozen types for malformed input
-        raise DecodeError(f"head: not msgpack as specified: {_short(error)}") from None
+        raise DecodeError(f"head: not msgpack as specified: {short(error)}") from None
     if type(values) is not tuple or len(values) != _HEAD_FIELDS:
-        raise DecodeError(f"head: expected an array of {_HEAD_FIELDS}, got {_short(values)}")
+        raise DecodeError(f"head: expected an array of {_HEAD_FIELDS}, got {short(values)}")
     stream, incarnation, seq, stamp, wall, reason = values
     if type(stream) is not str or type(reason) is not str or not stream:
         raise DecodeError("head: stream (not empty) and reason must be strings")
-    for name, value, least in (
-        ("incarnation", incarnation, 0),
-        ("seq", seq, 0),
-        ("stamp", stamp, _INT64_MIN),
-        ("wall", wall, _INT64_MIN),
+    if not (
+        type(incarnation) is type(seq) is type(stamp) is type(wall) is int
+        and 0 <= incarnation <= _INT64_MAX
+        and 0 <= seq <= _INT64_MAX
+        and _INT64_MIN <= stamp <= _INT64_MAX
+        and _INT64_MIN <= wall <= _INT64_MAX
     ):
+        raise _out_of_range(
+            incarnation=(incarnation, 0), seq=(seq, 0), stamp=(stamp, _INT64_MIN), wall=(wall, _INT64_MIN)
+        )
+    return Head(_KINDS[kind], stream, incarnation, seq, stamp, wall, reason), body_start, body_bytes
+
+
+def _out_of_range(**numbers: tuple[Any, int]) -> DecodeError:
+    """The error for the first of some numbers, each with its least value, that is no such number."""
+    for name, (value, least) in numbers.items():
         if type(value) is not int or not least <= value <= _INT64_MAX:
-            raise DecodeError(f"head: {name} must be an integer from {least} to {_INT64_MAX}, got {_short(value)}")
-    return Head(Kind(kind), stream, incarnation, seq, stamp, wall, reason), body_start, body_bytes
+            return DecodeError(f"head: {name} must be an integer from {least} to {_INT64_MAX}, got {short(value)}")
+    raise AssertionError(f"all of {numbers} are in range")
 
 
 def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits, types: TypeOf) -> Message:
-    body = _Body(view[start:end], head, limits)
+    if end - start <= min(_SMALL_BODY, limits.string_bytes) and limits.strings >= _SMALL_ARRAY:
+        found = _small_message(view, head, start, end, limits, types)
+        if found is not None:
+            return found
+    body = Body(view[start:end], head, limits)
     body.array("body", 3)
     schema = body.value("schema")
     if type(schema) is not str:
-        raise DecodeError(f"{_where(head)}: schema must be a string, got {_short(schema)}")
+        raise DecodeError(f"{where(head)}: schema must be a string, got {short(schema)}")
     try:
         cls = types(schema)
     except MessageError as error:
-        raise DecodeError(f"{_where(head)}: {_short(error)}") from None
+        raise DecodeError(f"{where(head)}: {short(error)}") from None
     body.array("header", len(cls.SCALARS))
     scalars = [body.scalar(spec) for spec in cls.SCALARS]
     body.array("array descriptors", len(cls.ARRAYS))
@@ -193,21 +217,53 @@ def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits,
         if size:
             offset += -offset % ALIGNMENT
         if offset - end + size > limits.payload_bytes:
-            raise DecodeError(f"{_where(head)}: {spec.name} ends past {limits.payload_bytes} payload bytes, the limit")
+            raise DecodeError(f"{where(head)}: {spec.name} ends past {limits.payload_bytes} payload bytes, the limit")
         if offset + size > len(view):
             raise DecodeError(
-                f"{_where(head)}: {spec.name} {dtype.name}{list(shape)} needs {size} bytes at {offset}, "
+                f"{where(head)}: {spec.name} {dtype.name}{list(shape)} needs {size} bytes at {offset}, "
                 f"but the envelope has {len(view)}"
             )
         arrays.append(_array(view, head, spec, dtype, shape, offset, size))
         offset += size
     body.finish()
     if offset != len(view):
-        raise DecodeError(f"{_where(head)}: {len(view) - offset} bytes after the last array, expected none")
+        raise DecodeError(f"{where(head)}: {len(view) - offset} bytes after the last array, expected none")
     try:
         return cls.from_parts(head.stamp, scalars, arrays)
     except Exception as error:  # MessageError, and whatever a type's own checks meet in values nobody foresaw
-        raise DecodeError(f"{_where(head)}: {type(error).__name__}: {_short(error)}") from None
+        raise DecodeError(f"{where(head)}: {type(error).__name__}: {short(error)}") from None
+
+
+def _small_message(view: memoryview, head: Head, start: int, end: int, limits: Limits, types: TypeOf) -> Message | None:
+    """The message with a small body, decoded as a whole; None where anything is not as it should be, or rare."""
+    try:
+        schema, header, described = _unpack_body(view[start:end])
+        cls = types(schema)
+        made = cls.compiled()
+        arrays: list[npt.NDArray[Any] | None] = []
+        offset = end
+        for dtypes, description in zip(made.dtypes, described, strict=True):
+            if description is None:
+                arrays.append(None)
+                continue
+            code, shape = description
+            dtype = dtypes[code]
+            size = dtype.itemsize
+            for extent in shape:
+                if type(extent) is not int or extent <= 0:
+                    return None
+                size *= extent
+            offset += -offset % ALIGNMENT
+            if dtype.kind == "b" or size > limits.payload_bytes - (offset - end) or len(shape) > limits.dimensions:
+                return None
+            arrays.append(np.ndarray(shape, dtype, view, offset))  # raises where it does not fit
+            offset += size
+        if offset != len(view) or type(header) is not tuple:
+            return None
+        message = cls.__new__(cls)
+        return message if made.adopt(message, head.stamp, header, arrays) else None
+    except Exception:  # whatever it is, the general way finds it, and says what is wrong and where
+        return None
 
 
 def _array(
@@ -222,94 +278,8 @@ def _array(
     try:
         data: npt.NDArray[Any] = np.ndarray(shape, dtype, view, offset) if size else np.empty(shape, dtype)
     except ValueError as error:
-        raise DecodeError(f"{_where(head)}: {spec.name} {dtype.name}{list(shape)}: {_short(error)}") from None
+        raise DecodeError(f"{where(head)}: {spec.name} {dtype.name}{list(shape)}: {short(error)}") from None
     data.flags.writeable = False
     if dtype.kind == "b" and size and int(data.view(np.uint8).max()) > 1:
-        raise DecodeError(f"{_where(head)}: {spec.name} holds a bool that is neither 0 nor 1")
+        raise DecodeError(f"{where(head)}: {spec.name} holds a bool that is neither 0 nor 1")
     return data
-
-
-class _Body:
-    """Reads the body value by value, so that a hostile one cannot make the decoder nest or allocate.
-
-    msgpack allocates an array for the length that its header claims; here only array headers are read, and the
-    elements one by one, with nested arrays forbidden.
-    """
-
-    def __init__(self, data: memoryview, head: Head, limits: Limits) -> None:
-        self._data = data
-        self._head = head
-        self._limits = limits
-        self._unpacker = msgpack.Unpacker(
-            raw=False,
-            max_buffer_size=max(len(data), 1),
-            read_size=max(len(data), 1),
-            max_array_len=0,
-            max_map_len=0,
-            max_ext_len=0,
-            max_bin_len=0,
-            max_str_len=limits.string_bytes,
-        )
-        self._unpacker.feed(data)
-
-    def array(self, name: str, expected: int | None, most: int = 0) -> int:
-        """The length of the array that starts here; it must be `expected`, or, where that is None, at most `most`."""
-        try:
-            length: int = self._unpacker.read_array_header()
-        except Exception as error:  # msgpack raises a dozen types for malformed input
-            raise self._error(f"{name}: expected an array: {_short(error)}") from None
-        if expected is not None and length != expected:
-            raise self._error(f"{name}: expected {expected} elements, got {length}")
-        if expected is None and length > most:
-            raise self._error(f"{name}: {length} elements, at most {most} are accepted")
-        return length
-
-    def value(self, name: str) -> Any:
-        """The next scalar (nil, bool, int, float or str)."""
-        try:
-            return self._unpacker.unpack()
-        except Exception as error:  # msgpack raises a dozen types for malformed input
-            raise self._error(f"{name}: {_short(error)}") from None
-
-    def scalar(self, spec: ScalarField) -> Any:
-        if spec.kind != "strs" or self._nil():
-            return self.value(spec.name)
-        return tuple([self.value(spec.name) for _ in range(self.array(spec.name, None, self._limits.strings))])
-
-    def descriptor(self, spec: ArrayField) -> tuple[np.dtype[Any], tuple[int, ...]] | None:
-        if self._nil():
-            self.value(spec.name)
-            return None
-        self.array(spec.name, 2)
-        code = self.value(spec.name)
-        dtype = next((d for d in spec.dtypes if d.str == code), None)
-        if dtype is None:
-            known = " or ".join(repr(d.str) for d in spec.dtypes)
-            raise self._error(f"{spec.name}: dtype must be {known}, got {_short(code)}")
-        shape = tuple([self.value(spec.name) for _ in range(self.array(spec.name, None, self._limits.dimensions))])
-        for extent in shape:
-            if type(extent) is not int or not 0 <= extent <= self._limits.payload_bytes:
-                raise self._error(f"{spec.name}: shape {_short(shape)} is not one of integers from 0")
-        return dtype, shape
-
-    def finish(self) -> None:
-        rest = len(self._data) - self._unpacker.tell()
-        if rest:
-            raise self._error(f"body: {rest} bytes after the array descriptors, expected none")
-
-    def _nil(self) -> bool:
-        position = self._unpacker.tell()
-        return bool(position < len(self._data) and self._data[position] == _NIL)
-
-    def _error(self, text: str) -> DecodeError:
-        return DecodeError(f"{_where(self._head)}: {text}")
-
-
-def _where(head: Head) -> str:
-    return f"{head.kind.name} {head.seq} of {head.stream[:80]!r}"
-
-
-def _short(value: object) -> str:
-    text = str(value) if isinstance(value, Exception) else repr(value)
-    text = text or type(value).__name__
-    return text if len(text) <= 200 else text[:200] + "…"

@@ -22,7 +22,7 @@ class DecodeError(ValueError):
 
 
 class Kind(IntEnum):
-    """What an envelope says about its stream."""
+    """Kinds of statements that an envelope makes about its stream."""
 
     MESSAGE = 1
     """A message; `stamp` is the message's. It implies the frontier `stamp`."""
@@ -39,7 +39,7 @@ class Kind(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """What a decoder accepts at most. Anything larger is a `DecodeError` before memory is taken for it."""
+    """Limits of a decoder. Anything larger is a `DecodeError` before memory is taken for it."""
 
     head_bytes: int = 4096
     body_bytes: int = 1 << 20
@@ -52,9 +52,9 @@ class Limits:
 DEFAULT_LIMITS: Final = Limits()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Head:
-    """What every envelope says before its content: enough for rates, lag and routing."""
+    """Holds what every envelope says before its content: enough for rates, lag and routing."""
 
     kind: Kind
     stream: str
@@ -66,9 +66,9 @@ class Head:
     reason: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Envelope:
-    """One thing that happens on a stream.
+    """One thing that happens on a stream. Nobody changes it (it is not frozen: one is made for every message).
 
     `stamp` is the message's stamp, the frontier, or the final stamp (ns since the epoch), by `kind`. `wall` is the wall
     time of the publication (ns), for showing lag only.

@@ -15,7 +15,7 @@ def runtime_key(namespace: str, *chunks: str) -> str:
 
 
 def static_key(stream: str) -> str:
-    """Where the static stream `stream` (or those that match an expression) is answered to late joiners."""
+    """Tells where the static stream `stream` (or those that match an expression) is answered to late joiners."""
     return f"{stream}/{RUNTIME}/static"
 
 
@@ -25,17 +25,12 @@ def stream_of_static(key: str) -> str:
 
 
 def statics_key(namespace: str, bus: str) -> str:
-    """Where a process answers which static streams it holds; `*` for all processes."""
+    """Tells where a process answers which static streams it holds; `*` for all processes."""
     return runtime_key(namespace, "statics", bus)
 
 
-def shared_key(stream: str, machine: str, pid: str, descriptor: str, bus: str) -> str:
-    """The liveliness token of a consumer of `stream` that can read shared memory."""
-    return "/".join((stream, RUNTIME, "shm", machine, pid, descriptor, bus))
-
-
 def tap_key(namespace: str, tap: str, stream: str) -> str:
-    """Where the copies of `stream` for one tap travel."""
+    """Tells where the copies of `stream` for one tap travel."""
     return runtime_key(namespace, "tap", tap, stream.removeprefix(f"{namespace}/"))
 
 

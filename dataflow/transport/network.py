@@ -1,4 +1,5 @@
-"""Where a bus listens and connects, and how that becomes a Zenoh configuration. This machine only unless told so."""
+"""Addresses on which a bus listens and connects, and the Zenoh configuration made of them. This machine only unless
+told so."""
 
 from __future__ import annotations
 
@@ -21,24 +22,19 @@ class NetworkError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class NetworkConfig:
-    """How one process takes part in the network.
+    """Configuration of one process's part in the network.
 
     `listen` and `connect` are Zenoh endpoints such as `"unixsock-stream//run/user/1000/a"` or `"tcp/127.0.0.1:7447"`.
     Peers that are not up yet are tried again in the background until the bus is closed. An endpoint beyond this machine
     is refused in `listen` unless `exposed` is set: it stands for "the graph's `network:` section says so".
-    `shared_memory` lets large messages between processes of one machine go through shared memory, in a pool of
-    `pool_bytes` for each publishing process. `secret` is the run's (`seal.new_secret`): buses with another one neither
-    take our publications nor we theirs. `blocked`: seconds that a publication waits for a subscriber that takes
+    `blocked`: seconds that a publication waits for a subscriber that takes
     nothing; then its link is closed, and it misses messages until it has connected again. `zenoh` holds further
     settings of Zenoh's own configuration by path: `{"transport/link/tls": {...}, "access_control": {}}`.
     """
 
     listen: tuple[str, ...] = ()
     connect: tuple[str, ...] = ()
-    shared_memory: bool = True
     exposed: bool = False
-    pool_bytes: int = 256 << 20
-    secret: str = field(default="", repr=False)
     blocked: float = 30.0
     zenoh: Mapping[str, Any] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""The publisher's side of shared memory: a pool of blocks, and what its consumers have released.
+"""The producer's side of shared memory: a pool of blocks, and what its consumers have released.
 
 Blocks are cut from the pool best-fit and come back to it, merged with their neighbours, when it is used up: so no size
 of message can keep the pool from the others for longer than its messages are held.
@@ -15,19 +15,9 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 import msgpack
-import psutil  # type: ignore[import-untyped]
 
 from dataflow.transport.envelope import MAGIC, PRELUDE, VERSION, Buffer, Kind
-from dataflow.transport.shared import (
-    BOARD_BYTES,
-    BOARD_NAME,
-    POOL_NAME,
-    SLOTS,
-    SharedMemoryError,
-    make_memory,
-    open_memory,
-    protect,
-)
+from dataflow.transport.shared import POOL_NAME, SLOTS, make_memory, protect
 
 SCAN_AT_MOST: Final = 16
 _SMALLEST: Final = 64 << 10
@@ -41,37 +31,6 @@ class Claim(Protocol):
 
     def mapped(self, base: int) -> bool:
         """Returns whether the consumer has mapped the pool whose generations begin at `base` (or has ended)."""
-
-
-class BoardReader:
-    """A consumer as its publisher sees it: what it has released, and whether its process still runs."""
-
-    def __init__(self, pid: int, descriptor: int, key: str) -> None:
-        """Opens the consumer's board; raises `SharedMemoryError` when that cannot be done."""
-        self.key = key
-        self.lost = False
-        """Set when its liveliness token is gone: then its process is asked for."""
-        try:
-            self._process = psutil.Process(pid)
-        except psutil.Error as error:
-            raise SharedMemoryError(f"board of process {pid}: {error}") from error
-        memory = open_memory(pid, descriptor, BOARD_NAME)
-        if len(memory) != BOARD_BYTES:
-            raise SharedMemoryError(f"board of process {pid}: {len(memory)} bytes, expected {BOARD_BYTES}")
-        self._cells = memoryview(memory).cast("Q")
-
-    def released(self, slot: int, generation: int) -> bool:
-        return self._cells[slot] == generation or (self.lost and not self._runs())
-
-    def mapped(self, base: int) -> bool:
-        """Returns whether the consumer has mapped the pool whose generations begin at `base` (or has ended)."""
-        return self._cells[SLOTS] == base or not self._runs()
-
-    def _runs(self) -> bool:
-        try:
-            return bool(self._process.is_running() and self._process.status() != psutil.STATUS_ZOMBIE)
-        except psutil.NoSuchProcess:
-            return False
 
 
 @dataclass(slots=True, eq=False)
@@ -89,7 +48,7 @@ class Block:
 
 
 class SharedPool:
-    """The blocks of one publishing process. Not thread-safe: the bus holds its lock around every call."""
+    """The blocks of one producing process. Not thread-safe."""
 
     def __init__(self, size: int) -> None:
         """Makes the memory, of which pages are taken as they are first used; raises `SharedMemoryError`."""
@@ -127,6 +86,11 @@ class SharedPool:
             (self.id, self.base, os.getpid(), self._descriptor, block.offset, size, block.slot, block.generation)
         )
         return PRELUDE.pack(MAGIC, VERSION, Kind.REFERENCE, len(head), len(body)) + head + body
+
+    def free(self) -> int:
+        """Returns how many bytes belong to nobody now."""
+        released = sum(b.capacity for blocks in self._out.values() for b in blocks if b.free())
+        return released + sum(length for _, length in self._gaps)
 
     def consumers(self) -> set[Claim]:
         """Returns those who hold blocks."""

@@ -31,9 +31,9 @@ class RegistryError(RuntimeError):
 class RunningGraph:
     """A graph that runs on this machine.
 
-    `endpoints` are the Zenoh endpoints of all its hosts, sockets that only this user can open: a tool connects to every
-    one. `started` is the wall time
-    (seconds since the epoch) at which the graph was registered. `graph` is the resolved graph as JSON values.
+    `endpoints` are the Zenoh endpoints of all its processes, sockets that only this user can open: a tool connects to
+    every one. `started` is the wall time (seconds since the epoch) at which the graph was registered. `graph` is the
+    resolved graph as JSON values.
     """
 
     name: str

@@ -1,10 +1,9 @@
-"""Shared memory between hosts of one machine: a large envelope is written once, and every consumer reads it in place.
+"""Shared memory between processes of one machine: a large envelope is written once, every consumer reads it in place.
 
-The memory is anonymous (memfd), so nothing is left behind however a process ends. A publisher owns a pool of blocks;
-what travels on the stream is a reference to one. A consumer maps the pool read-only, and notes on a *board*, memory of
-its own that the publisher reads, which block it no longer uses: every byte has one writer, and a block is used again
-only when all its consumers have released it (or their processes have ended). Linux only; elsewhere envelopes travel
-whole.
+The memory is anonymous (memfd), so nothing is left behind however a process ends. A producer owns a pool of blocks;
+what travels on the link is a reference to one. A consumer maps the pool read-only, and notes on the link's *board*,
+memory that only it writes to, which block it no longer uses: every byte has one writer, and a block is used again only
+when all its consumers have released it (or their processes have ended).
 """
 
 from __future__ import annotations
@@ -12,11 +11,7 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
-import secrets
-import sys
-import threading
 import weakref
-from pathlib import Path
 from typing import Any, Final
 
 import msgpack
@@ -24,7 +19,6 @@ import numpy as np
 
 from dataflow.transport.envelope import MAGIC, PRELUDE, DecodeError, Kind
 
-SUPPORTED: Final = sys.platform == "linux" and hasattr(os, "memfd_create")
 THRESHOLD: Final = 32 << 10
 """Envelopes of fewer bytes travel whole: below it a reference is not faster (benchmarks/transport.md)."""
 
@@ -32,18 +26,10 @@ SLOTS: Final = 4096
 BOARD_BYTES: Final = 8 * (SLOTS + 1)
 _SEAL_FUTURE_WRITE: Final = 0x0010  # Linux 5.1; not in Python 3.11's fcntl
 POOL_NAME: Final = "dataflow-pool-"
-BOARD_NAME: Final = "dataflow-board-"
 
 
 class SharedMemoryError(RuntimeError):
     """A pool or board that cannot be made or opened: says which and why."""
-
-
-def machine() -> str:
-    """Names this machine, process namespace and user: processes with equal names can share memory."""
-    boot = Path("/proc/sys/kernel/random/boot_id").read_text().strip()
-    namespace = os.readlink("/proc/self/ns/pid").strip("pid:[]")
-    return f"{boot}.{namespace}.{os.getuid()}"
 
 
 def make_memory(name: str, size: int) -> int:
@@ -85,14 +71,19 @@ def open_memory(pid: int, descriptor: int, name: str) -> mmap.mmap:
         raise SharedMemoryError(f"cannot open the shared memory {path}: {error}") from error
 
 
-class Board:
-    """What one subscription has released. Written here only, read by the publisher."""
+def make_board() -> int:
+    """Makes the memory in which a consumer says which blocks of its producer's pool it has released."""
+    descriptor = os.memfd_create("board")
+    os.ftruncate(descriptor, BOARD_BYTES)
+    return descriptor
 
-    def __init__(self) -> None:
-        """Makes the memory; raises `SharedMemoryError`."""
-        self.descriptor = make_memory(BOARD_NAME + secrets.token_hex(4), BOARD_BYTES)
-        self._cells = memoryview(mmap.mmap(self.descriptor, BOARD_BYTES)).cast("Q")
-        protect(self.descriptor)
+
+class Board:
+    """Holds what the consumer at the end of a link has released. Written here only, read by the producer."""
+
+    def __init__(self, descriptor: int) -> None:
+        """Maps the memory that was handed down."""
+        self._cells = memoryview(mmap.mmap(descriptor, BOARD_BYTES)).cast("Q")
         self._base = 0
         self._pool: mmap.mmap | None = None
 
@@ -106,22 +97,16 @@ class Board:
         if base == self._base:
             self._cells[slot] = generation
 
-    def close(self) -> None:
-        """Ends the sharing; what is still held is noted in memory that the publisher has mapped."""
-        self._pool = None
-        os.close(self.descriptor)
-
 
 class PoolReader:
     """The pools of other processes, mapped on first use.
 
-    A mapping lasts as long as a subscription's board or a view of a message refers to it: one whose publisher was
-    replaced goes with the last message from it. Thread-safe.
+    A mapping lasts as long as a link's board or a view of a message refers to it: one whose producer was replaced goes
+    with the last message from it.
     """
 
     def __init__(self) -> None:
         self._pools: weakref.WeakValueDictionary[str, mmap.mmap] = weakref.WeakValueDictionary()
-        self._lock = threading.Lock()
 
     def resolve(self, payload: bytes, board: Board) -> memoryview:
         """Returns the envelope that a reference stands for, in place and read-only.
@@ -141,15 +126,14 @@ class PoolReader:
         return block.data
 
     def _map(self, pool_id: str, pid: int, descriptor: int) -> mmap.mmap:
-        with self._lock:
-            found = self._pools.get(pool_id)
-            if found is None:
-                found = self._pools[pool_id] = open_memory(pid, descriptor, POOL_NAME + pool_id)
-            return found
+        found = self._pools.get(pool_id)
+        if found is None:
+            found = self._pools[pool_id] = open_memory(pid, descriptor, POOL_NAME + pool_id)
+        return found
 
 
 def is_reference(payload: bytes) -> bool:
-    """Whether the payload is an envelope that stands for one in shared memory."""
+    """Tells whether the payload is an envelope that stands for one in shared memory."""
     return len(payload) >= PRELUDE.size and payload[:4] == MAGIC and payload[5] == Kind.REFERENCE
 
 

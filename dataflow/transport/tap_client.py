@@ -21,9 +21,9 @@ from dataflow.transport.codec import TypeOf, decode, decode_head
 from dataflow.transport.envelope import DEFAULT_LIMITS, Envelope, Head, Limits
 from dataflow.transport.keys import runtime_key, statics_key, stream_of_tap
 from dataflow.transport.publisher import undeclare
-from dataflow.transport.taps import ACKNOWLEDGEMENT, ATTACHMENT, MAX_EXPRESSIONS, TapWindow, host_text
+from dataflow.transport.taps import ACKNOWLEDGEMENT, ATTACHMENT, MAX_EXPRESSIONS, TapWindow, process_text
 
-MAX_HOSTS = 1024
+MAX_PROCESSES = 1024
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class TapMessage:
 
 @dataclass(slots=True)
 class _Origin:
-    """What a tap knows of one host: its counts as received, as taken, and as acknowledged."""
+    """State of one process, as a tap knows it: its counts as received, as taken, and as acknowledged."""
 
     epoch: int = 0
     received: tuple[int, int] = (0, 0)
@@ -58,7 +58,7 @@ class TapClient:
     """The tool's side: receives copies of the streams that match `expressions` (stream key expressions).
 
     The latest static messages that match come first. What is not taken is not acknowledged, so at most `window` waits
-    here for each host, however slow the tool is.
+    here for each process, however slow the tool is.
     """
 
     def __init__(
@@ -105,7 +105,7 @@ class TapClient:
 
     @property
     def skipped(self) -> int:
-        """Messages that the hosts left out, as far as they have said."""
+        """Messages that the processes left out, as far as they have said."""
         with self._arrived:
             return sum(o.skipped for o in self._origins.values())
 
@@ -121,8 +121,8 @@ class TapClient:
                     if left <= 0 or self._closed:
                         return None
                     self._arrived.wait(left)
-                stream, payload, host, counts, epoch = self._queue.popleft()
-                acks = self._taken(host, counts, epoch)
+                stream, payload, process, counts, epoch = self._queue.popleft()
+                acks = self._taken(process, counts, epoch)
             for key, ack in acks:
                 self._bus.session.put(key, ack, congestion_control=zenoh.CongestionControl.DROP, express=True)
             if stream:
@@ -169,17 +169,19 @@ class TapClient:
     def _on_sample(self, sample: zenoh.Sample) -> None:
         attached = sample.attachment
         try:
-            host, epoch, messages, nbytes, skipped = ATTACHMENT.unpack(bytes(attached) if attached is not None else b"")
+            process, epoch, messages, nbytes, skipped = ATTACHMENT.unpack(
+                bytes(attached) if attached is not None else b""
+            )
         except struct.error:
             self.refused += 1
             return
         key = str(sample.key_expr)
         payload = bytes(sample.payload)
         with self._arrived:
-            if host not in self._origins and len(self._origins) >= MAX_HOSTS:
+            if process not in self._origins and len(self._origins) >= MAX_PROCESSES:
                 self.refused += 1
                 return
-            origin = self._origins.setdefault(host, _Origin())
+            origin = self._origins.setdefault(process, _Origin())
             if epoch != origin.epoch:
                 origin.epoch, origin.received, origin.taken, origin.acked = epoch, (0, 0), (0, 0), (0, 0)
             if payload and not self._fits(origin, messages, nbytes):
@@ -187,28 +189,28 @@ class TapClient:
                 return
             origin.received, origin.skipped = (messages, nbytes), skipped
             stream = stream_of_tap(self._namespace, self.id, key) if payload else ""
-            self._queue.append((stream, payload, host, (messages, nbytes), epoch))
+            self._queue.append((stream, payload, process, (messages, nbytes), epoch))
             self._arrived.notify()
 
     def _fits(self, origin: _Origin, messages: int, nbytes: int) -> bool:
-        """Whether a host keeps to the window: a single message may exceed it in bytes."""
+        """Tells whether a process keeps to the window: a single message may exceed it in bytes."""
         if messages - origin.acked[0] > self.window.messages:
             return False
         return nbytes - origin.acked[1] <= self.window.bytes or messages - origin.acked[0] == 1
 
-    def _taken(self, host: bytes, counts: tuple[int, int], epoch: int) -> list[tuple[str, bytes]]:
+    def _taken(self, process: bytes, counts: tuple[int, int], epoch: int) -> list[tuple[str, bytes]]:
         """Notes that a message was taken; returns the acknowledgements that are due (key, payload)."""
-        origin = self._origins[host]
+        origin = self._origins[process]
         if origin.epoch == epoch:
             origin.taken = counts
         due = []
         for other, state in self._origins.items():
             messages, nbytes = state.taken[0] - state.acked[0], state.taken[1] - state.acked[1]
-            sync = counts == state.acked and other == host
+            sync = counts == state.acked and other == process
             enough = messages * 4 >= self.window.messages or nbytes * 4 >= self.window.bytes
             if sync or (messages and (enough or not self._queue)):
                 state.acked = state.taken
-                key = runtime_key(self._namespace, "ack", host_text(other), self.id)
+                key = runtime_key(self._namespace, "ack", process_text(other), self.id)
                 due.append((key, ACKNOWLEDGEMENT.pack(state.epoch, *state.taken)))
         return due
 

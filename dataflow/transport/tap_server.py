@@ -19,7 +19,7 @@ from dataflow.transport.codec import encode
 from dataflow.transport.envelope import Envelope
 from dataflow.transport.keys import runtime_key, statics_key, tap_key
 from dataflow.transport.publisher import undeclare
-from dataflow.transport.taps import ACKNOWLEDGEMENT, ATTACHMENT, TapWindow, host_bytes, read_spec
+from dataflow.transport.taps import ACKNOWLEDGEMENT, ATTACHMENT, TapWindow, process_bytes, read_spec
 
 SYNC_EVERY = 0.5
 SPEC_WITHIN = 10.0
@@ -49,7 +49,7 @@ class _Copy:
 
 @dataclass(slots=True)
 class _Tap:
-    """What a host knows of one tap. Counts are cumulative."""
+    """State of one tap, as a process knows it. Counts are cumulative."""
 
     id: str
     expressions: tuple[zenoh.KeyExpr, ...]
@@ -103,12 +103,12 @@ class _Tap:
             self.acked_messages, self.acked_bytes = messages, nbytes
             self.quiet_since = time.monotonic()
 
-    def attachment(self, host: bytes) -> bytes:
-        return ATTACHMENT.pack(host, self.epoch, self.sent_messages, self.sent_bytes, self.skipped)
+    def attachment(self, process: bytes) -> bytes:
+        return ATTACHMENT.pack(process, self.epoch, self.sent_messages, self.sent_bytes, self.skipped)
 
 
 class TapServer:
-    """The host's side: knows the taps of its namespace and sends them copies of what the host publishes.
+    """The process's side: knows the taps of its namespace and sends them copies of what the process publishes.
 
     `active` is False while there is no tap: publishers look at it before they call `offer`.
     """
@@ -117,7 +117,7 @@ class TapServer:
         self.active = False
         self._bus = bus
         self._namespace = namespace
-        self._host = host_bytes(bus.id)
+        self._process = process_bytes(bus.id)
         self._taps: dict[str, _Tap] = {}
         self._epochs = itertools.count(1)
         self._wake = threading.Condition()
@@ -256,11 +256,11 @@ class TapServer:
             found = tap.next()
             if found is not None:
                 stream, copy = found
-                due.append((tap_key(self._namespace, tap.id, stream), copy, tap.attachment(self._host)))
+                due.append((tap_key(self._namespace, tap.id, stream), copy, tap.attachment(self._process)))
                 self._sent += 1
             elif tap.sent_messages > tap.acked_messages and now - tap.quiet_since >= SYNC_EVERY:
                 tap.quiet_since = now
-                due.append((runtime_key(self._namespace, "tap", tap.id), None, tap.attachment(self._host)))
+                due.append((runtime_key(self._namespace, "tap", tap.id), None, tap.attachment(self._process)))
         return due
 
     def _put(self, key: str, payload: bytes, attachment: bytes) -> None:

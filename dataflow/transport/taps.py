@@ -20,13 +20,13 @@ MAX_WINDOW_MESSAGES: Final = 1 << 16
 MAX_WINDOW_BYTES: Final = 1 << 30
 SPEC_BYTES: Final = 1 << 16
 
-ATTACHMENT: Final = struct.Struct("<16sIQQQ")  # host, epoch, messages, bytes, skipped
+ATTACHMENT: Final = struct.Struct("<16sIQQQ")  # process, epoch, messages, bytes, skipped
 ACKNOWLEDGEMENT: Final = struct.Struct("<IQQ")  # epoch, messages, bytes
 
 
 @dataclass(frozen=True, slots=True)
 class TapWindow:
-    """How much may be under way from one host to a tap, unacknowledged. It bounds the tap's memory."""
+    """Says how much may be under way from one process to a tap, unacknowledged. It bounds the tap's memory."""
 
     messages: int = 64
     bytes: int = 16 << 20
@@ -51,11 +51,11 @@ def read_spec(data: bytes) -> tuple[tuple[zenoh.KeyExpr, ...], TapWindow]:
         raise ValueError(f"tap request: {error}") from None
 
 
-def host_bytes(bus_id: str) -> bytes:
+def process_bytes(bus_id: str) -> bytes:
     """Returns a bus id (hexadecimal, up to 16 bytes) as 16 bytes."""
     return bytes.fromhex(bus_id.zfill(32))
 
 
-def host_text(host: bytes) -> str:
-    """Returns the bus id that `host_bytes` made."""
-    return host.hex().lstrip("0")
+def process_text(process: bytes) -> str:
+    """Returns the bus id that `process_bytes` made."""
+    return process.hex().lstrip("0")

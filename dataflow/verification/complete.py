@@ -52,7 +52,7 @@ class Completion:
 
     @property
     def stored(self) -> bool:
-        """Whether there is a file: everything that was made again is as recorded."""
+        """Tells whether there is a file: everything that was made again is as recorded."""
         return not any(v.first for v in self.operators)
 
     @property

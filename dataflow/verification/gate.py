@@ -11,15 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from dataflow.graph import GraphError
 from dataflow.graph.model import Graph
-from dataflow.messages import MessageError
-from dataflow.operator import ParameterError
-from dataflow.recording import Recording, RecordingError
+from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
-from dataflow.records.firing import FiringRecordError
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.supervision.report import RunFailed
+from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.report import StandIn, VerifyReport
 
 FORMAT = 1
@@ -235,7 +232,7 @@ def check(
         if failure.interrupted:
             raise
         return could_not(str(failure), failure.details, internal=failure.internal)
-    except (RecordingError, ReplayError, FiringRecordError, GraphError, MessageError, ParameterError, OSError) as error:
+    except WRONG_INPUT as error:
         return could_not(str(error).strip())
     except (
         Exception
@@ -304,7 +301,7 @@ def _judged_stand_ins(report: VerifyReport, stand_ins: Iterable[StandIn]) -> Ite
 
 
 def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | None:
-    """What an operator made here, where that is not what was recorded."""
+    """Returns what an operator made here, where that is not what was recorded."""
     first = verification.first
     if first is None or report.verdict(verification) == "within tolerance":
         return None
@@ -317,7 +314,7 @@ def outcome_of(report: VerifyReport, verification: Verification) -> Outcome | No
 
 
 def _led_astray(operator: str, unexpected: Collection[str], producers: Mapping[str, frozenset[str]]) -> bool:
-    """Whether an operator depends on an unexpected one that does not in turn depend on it."""
+    """Tells whether an operator depends on an unexpected one that does not in turn depend on it."""
     return any(
         other != operator and operator not in _upstream(other, producers)
         for other in _upstream(operator, producers) & set(unexpected)

@@ -1,4 +1,4 @@
-"""What a process and its workers hand to each other: plain values and firing records, in anonymous files.
+"""Letters between a process and its workers: plain values and firing records, in anonymous files.
 
 Nobody waits for a reader here, as with a socket: a worker that hangs holds up nobody.
 """

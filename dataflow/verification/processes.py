@@ -13,14 +13,15 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
-from types import FrameType, TracebackType
+from types import TracebackType
 from typing import IO, Any, Self
 
 from dataflow.firing.threads import environment
 from dataflow.process.channel import Channel, ChannelClosed, ready
+from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.report import OperatorCounts, RunFailed, Status
 from dataflow.supervision.run import Watch
 from dataflow.verification.board import Board
@@ -44,6 +45,10 @@ class Call:
     operators: tuple[str, ...] = ()
 
 
+Workers = Callable[..., list[Any]]
+"""Answers calls as `call_workers` does, with its options."""
+
+
 def call_workers(
     calls: Sequence[Call],
     *,
@@ -62,7 +67,8 @@ def call_workers(
     """
     status = Status(phase="starting", started=time.time())
     with ExitStack() as stack:
-        interrupted = stack.enter_context(_interrupts())
+        interrupted = threading.Event()
+        stack.enter_context(interrupts(interrupted.set))
         workers: list[_Worker] = []
         for number, call in enumerate(calls, start=1):
             words = stack.enter_context(tempfile.TemporaryFile())
@@ -89,7 +95,7 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
             status.phase = "running"
         for name in worker.call.operators:
             c = worker.board.counts(name)
-            status.host_of[name] = f"worker {worker.number}"
+            status.process_of[name] = f"worker {worker.number}"
             status.operators[name] = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
     return status
 
@@ -187,23 +193,3 @@ class _Worker:
         os.close(self._letter)
         self.channel.close()
         self.board.close()
-
-
-@contextmanager
-def _interrupts() -> Iterator[threading.Event]:
-    """The event that Ctrl-C, SIGTERM and SIGHUP set meanwhile; a signal that is ignored stays so."""
-    asked = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        asked.set()
-
-    mine = [n for n in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP) if signal.getsignal(n) != signal.SIG_IGN]
-    before = {number: signal.signal(number, handle) for number in mine}
-    try:
-        yield asked
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

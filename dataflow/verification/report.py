@@ -130,7 +130,7 @@ class VerifyReport:
         return "within tolerance" if compared.tolerated else "culprit" if compared.own else "downstream"
 
     def repeats(self, operator: str) -> bool | None:
-        """Whether a culprit differed twice alike; None where it was not run twice."""
+        """Tells whether a culprit differed twice alike; None where it was not run twice."""
         return self.repeated.get(operator)
 
     def as_json(self) -> dict[str, Any]:

@@ -26,14 +26,14 @@ from dataflow.verification import part, partition
 from dataflow.verification.compare import OutputComparison
 from dataflow.verification.ledger import COMPLETE, Ledger, read_ledger
 from dataflow.verification.letters import shared_records
-from dataflow.verification.processes import Call, Locate, call_workers
+from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.stored import StoredStream
 
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """What is to be verified, and what the recording says of it: all that was read before any worker starts."""
+    """Holds what is to be verified, and what the recording says of it: all that was read before any worker starts."""
 
     path: Path
     graph: Graph
@@ -61,7 +61,7 @@ def verify(
     jobs: int | None = None,
     stall_timeout: float = 120.0,
     watch: Watch | None = None,
-    placement: object = None,
+    workers: Workers = call_workers,
 ) -> VerifyReport:
     """Re-executes a recording by its firing records and compares.
 
@@ -73,8 +73,7 @@ def verify(
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
     `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
-    `stall_timeout`: seconds allowed without progress. `placement` is deprecated: "one_host" means
-    one job, anything else nothing.
+    `stall_timeout`: seconds allowed without progress. `workers`: what makes the calls.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
     began = time.monotonic()
@@ -82,8 +81,6 @@ def verify(
         raise ReplayError(f"tolerance {tolerance}: expected a finite number, 0 or more")
     if jobs is not None and jobs < 1:
         raise ReplayError(f"{jobs} jobs: expected 1 or more")
-    if placement == "one_host":
-        jobs = 1
     task = _prepare(path, graph, first, only, start, jobs)
     options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
     with shared_records(task.log) as (descriptor, batches):
@@ -104,9 +101,9 @@ def verify(
             )
             for one in task.parts
         ]
-        answers = call_workers(calls, **options)
+        answers = workers(calls, **options)
         report = _report(task, answers, tolerance, start)
-        repeated = _repeat(task, report, request, options)
+        repeated = _repeat(task, report, request, options, workers)
     return replace(report, repeated=repeated, total=time.monotonic() - began)
 
 
@@ -149,7 +146,7 @@ def _prepare(
 
 
 def _accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -> bool:
-    """Whether the records of a node can be held against its streams.
+    """Tells whether the records of a node can be held against its streams.
 
     Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
     jumped: its records count one incarnation, its messages several.
@@ -253,7 +250,7 @@ def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn
 
 
 def _repeat(
-    task: _Task, report: VerifyReport, request: Mapping[str, Any], options: Mapping[str, Any]
+    task: _Task, report: VerifyReport, request: Mapping[str, Any], options: Mapping[str, Any], workers: Workers
 ) -> Mapping[str, bool]:
     """Runs the culprits once more, to the first difference of each: did they differ alike?"""
     culprits = report.culprits
@@ -268,7 +265,7 @@ def _repeat(
         for one in task.parts
         if not set(culprits).isdisjoint(one.operators)
     ]
-    again = {name: first for answer in call_workers(calls, **options) for name, first in answer.items()}
+    again = {name: first for answer in workers(calls, **options) for name, first in answer.items()}
     before = {v.operator: v.first for v in report.operators if v.first is not None}
     return {name: again[name] == [before[name].incarnation, before[name].index, before[name].got] for name in culprits}
 

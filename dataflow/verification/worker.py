@@ -17,6 +17,7 @@ import traceback
 
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.verification.board import Board
+from dataflow.verification.errors import WRONG_INPUT
 from dataflow.verification.letters import read_letter, write_letter
 
 FAILED = 1
@@ -37,7 +38,8 @@ def main(descriptor: int, letter: int, board: int) -> int:
         answer = {"value": function(fields["request"], Board(board, fields["operators"]))}
         kind = "returned"
     except BaseException as error:
-        text = getattr(error, "traceback", None) or "".join(traceback.format_exception(error))
+        text = "" if isinstance(error, WRONG_INPUT) else "".join(traceback.format_exception(error))
+        text = getattr(error, "traceback", None) or text
         summary = str(error) or type(error).__name__
         kind, code = "failed", FAILED
         answer = {"summary": summary, "traceback": text, "operator": getattr(error, "operator", None)}

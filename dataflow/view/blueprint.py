@@ -1,4 +1,4 @@
-"""What the viewer shows, derived from the streams: one world, cameras with overlays, scene graph, plots, log."""
+"""Derives the layout of the viewer from the streams: one world, cameras with overlays, scene graph, plots, log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Where a visualiser draws: one stream's entity, at one stamp; and the registry of visualisers by message class."""
+"""The canvas on which a visualiser draws: one stream's entity, at one stamp; and the registry of visualisers by message
+class."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ class Canvas:
 
     @property
     def static(self) -> bool:
-        """Whether the message holds for all time."""
+        """Tells whether the message holds for all time."""
         return self.stream in self.scene.layout.static
 
     @property

@@ -85,7 +85,7 @@ class _Sighting:
 
 
 class FrameTree:
-    """Which frame hangs where. Every method returns the changes to draw, in order; none: nothing changed."""
+    """Tree of frames. Every method returns the changes to draw, in order; none: nothing changed."""
 
     def __init__(self) -> None:
         self.root: str | None = None
@@ -142,7 +142,7 @@ class FrameTree:
         return {child: edge.parent for child, edge in self._edges.items() if edge.assumed}
 
     def reason(self, frame: str) -> str:
-        """Which streams an assumed place was worked out from; empty where it is the parent's origin."""
+        """Tells which streams an assumed place was worked out from; empty where it is the parent's origin."""
         edge = self._edges.get(frame)
         return edge.owner if edge is not None and edge.assumed else ""
 
@@ -204,7 +204,7 @@ class FrameTree:
         return [*changes, Attach(lower, upper, T, assumed=True)]
 
     def _is_blind(self, frame: str) -> bool:
-        """Whether `frame` hangs where it does only because it had to hang somewhere."""
+        """Tells whether `frame` hangs where it does only because it had to hang somewhere."""
         edge = self._edges.get(frame)
         return edge is not None and edge.assumed and not edge.owner
 
@@ -223,6 +223,6 @@ class FrameTree:
 
 
 def _preference(frame: str) -> int:
-    """How much a frame is the one to draw everything in: 0 is best. Prefixes (`robot1/map`) do not count."""
+    """Tells how much a frame is the one to draw everything in: 0 is best. Prefixes (`robot1/map`) do not count."""
     name = frame.rsplit("/", 1)[-1]
     return ROOTS.index(name) if name in ROOTS else len(ROOTS)

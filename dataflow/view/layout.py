@@ -1,4 +1,4 @@
-"""What belongs to what: which calibration to which image, which detections over which image. Pure."""
+"""Relates streams to each other: which calibration to which image, which detections over which image. Pure."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Camera:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """How the streams of a viewer hang together.
+    """Relations between the streams of a viewer.
 
     - `streams`: the streams shown, sorted, with their types.
     - `cameras`: every image stream; colour before depth, then by name.
@@ -94,7 +94,7 @@ def plane_name(stream: str) -> str:
 
 
 def is_truth(stream: str) -> bool:
-    """Whether a stream's name says that it is ground truth (`truth`, `ground_truth`, `gt`)."""
+    """Tells whether a stream's name says that it is ground truth (`truth`, `ground_truth`, `gt`)."""
     return bool(_TRUTH & set(_words(stream)))
 
 
@@ -165,7 +165,7 @@ def _common(a: str, b: str) -> list[str]:
 
 
 def _likeness(a: str, b: str) -> tuple[int, int]:
-    """How much two names share: words, then leading letters."""
+    """Tells how much two names share: words, then leading letters."""
     words_a, words_b = set(_words(a)), set(_words(b))
     prefix = next((i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b)))
     return len(words_a & words_b), prefix

@@ -40,7 +40,7 @@ def executable() -> Path:
 
 
 def display_problem() -> str | None:
-    """Why no window can be opened here, or None."""
+    """Tells why no window can be opened here, or None."""
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         return "there is no display (neither DISPLAY nor WAYLAND_DISPLAY is set)"
     return None
@@ -86,7 +86,7 @@ def stop(child: subprocess.Popen[bytes]) -> None:
 
 
 def listening(port: int, host: str = LOOPBACK, timeout: float = 1.0) -> bool:
-    """Whether somebody accepts connections there."""
+    """Tells whether somebody accepts connections there."""
     try:
         with socket.create_connection((host, port), timeout):
             return True

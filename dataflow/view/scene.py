@@ -1,4 +1,4 @@
-"""What a viewer remembers between messages: frames, ends of trails, what it said already, where to look from."""
+"""Memory of a viewer between messages: frames, ends of trails, what it said already, where to look from."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import rerun as rr
 from dataflow.messages.geometry import split_matrix
 from dataflow.view import colors
 from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
-from dataflow.view.layout import COLOR, DEPTH, Layout, is_truth
+from dataflow.view.layout import Layout, is_truth
 
 Vector = npt.NDArray[np.float64]
 
@@ -38,7 +38,7 @@ ASSUMPTION_GRACE = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class ViewOptions:
-    """How much is shown, and at what price in memory.
+    """Bounds on what is shown, and with it on memory.
 
     - `jpeg_quality`: raw colour images are sent as JPEG of this quality, None: as they are (20 times the memory).
     - `compress_depth`: depth is sent as 16-bit PNG in steps of 1 mm (coarser only beyond 65 m) instead of float32.
@@ -62,7 +62,7 @@ class ViewOptions:
 
 @dataclass(frozen=True, slots=True)
 class Outlook:
-    """Where to look from, in the drawing frame: metres. `up` is a unit vector along an axis."""
+    """A viewpoint in the drawing frame, metres. `up` is a unit vector along an axis."""
 
     up: Vector
     position: Vector | None = None
@@ -96,7 +96,7 @@ class SceneState:
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
 
     def changed(self, entity: str, key: str, value: object) -> bool:
-        """Whether `value` differs from what was last remembered under (entity, key); remembers it."""
+        """Tells whether `value` differs from what was last remembered under (entity, key); remembers it."""
         if self.remembered.get((entity, key), self) == value:
             return False
         self.remembered[entity, key] = value
@@ -195,7 +195,7 @@ class SceneState:
         self._rows[frame] = at, given and not static
 
     def doubts(self, stamp: int) -> list[str]:
-        """What to tell people about frames that nobody placed for a while; each once."""
+        """Returns what to tell people about frames that nobody placed for a while; each once."""
         words = []
         assumed = self.tree.assumed() if self._waiting else {}
         for frame, since in list(self._waiting.items()):
@@ -234,7 +234,7 @@ class SceneState:
             self._around.append(p @ T[:3, :3].T + T[:3, 3])
 
     def outlook(self) -> Outlook:
-        """Where to look from, so that what is seen is in view.
+        """Chooses the viewpoint from which everything seen is in view.
 
         From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
         place is in view, since the robot will drive about in it. Up is +z (REP 103), unless the root is itself like an
@@ -264,10 +264,6 @@ class SceneState:
             return Outlook(up, middle - level * (0.97 * size) + up * (1.05 * size) + side * (0.4 * size), middle)
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
-
-    def image_streams(self) -> tuple[str, ...]:
-        """Every stream of images, colour and depth."""
-        return self.layout.of_type(*COLOR, *DEPTH)
 
 
 def frame_entity(frame: str) -> str:

@@ -1,4 +1,4 @@
-"""Where visualised messages go: a window, a running viewer, a browser or a file.
+"""Sinks of visualised messages: a window, a running viewer, a browser or a file.
 
 `ViewerSink.log` never waits for a viewer unless it is asked to. Rerun's own `log` does: when a viewer stalls, its
 channels fill and the calling thread stands still. So a thread of the sink's own talks to Rerun, behind a queue that is
@@ -62,7 +62,7 @@ class Serve:
 
     @property
     def url(self) -> str:
-        """What to open in the browser."""
+        """Returns what to open in the browser."""
         data = quote(f"rerun+http://{LOOPBACK}:{self.grpc_port}/proxy", safe="")
         return f"http://{LOOPBACK}:{self.web_port}/?url={data}"
 
@@ -92,7 +92,7 @@ def parse_target(text: str) -> Target:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """How much may wait for the viewer: messages and bytes of arrays."""
+    """Bounds on what may wait for the viewer: messages and bytes of arrays."""
 
     messages: int = 500
     bytes: int = 64 << 20
@@ -100,7 +100,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class SinkStatistics:
-    """What became of the messages: drawn, dropped because the viewer was too slow, failed to draw."""
+    """Counts of messages: drawn, dropped because the viewer was too slow, failed to draw."""
 
     drawn: int
     dropped: int
@@ -209,16 +209,12 @@ class ViewerSink:
             self._tell("", "slow", "the viewer is too slow: some messages are not shown (the oldest are dropped)")
         return True
 
-    def is_static(self, stream: str) -> bool:
-        """Whether the stream's one message holds for all time."""
-        return stream in self._scene.layout.static
-
     def statistics(self) -> SinkStatistics:
-        """What became of the messages so far."""
+        """Returns what became of the messages so far."""
         return SinkStatistics(self._counts["drawn"], self._counts["dropped"], self._counts["failed"])
 
     def backlog(self) -> int:
-        """How many messages wait to be drawn."""
+        """Tells how many messages wait to be drawn."""
         with self._waiting.changed:
             return len(self._waiting.static) + len(self._waiting.messages)
 
@@ -245,7 +241,7 @@ class ViewerSink:
         self.close()
 
     def _full(self, size: int) -> bool:
-        """Whether another message of `size` bytes is too much; one message alone never is."""
+        """Tells whether another message of `size` bytes is too much; one message alone never is."""
         waiting = self._waiting
         return bool(waiting.messages) and (
             len(waiting.messages) >= self._bounds.messages or waiting.bytes + size > self._bounds.bytes

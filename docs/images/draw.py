@@ -229,7 +229,7 @@ def processes() -> str:
         drawing.line(x + 75, 390, x + 75, 430, GREEN, arrow=True)
         drawing.text(x + 75, 448, words, anchor="middle")
     drawing.line(60, 300, 760, 300, INK, width=5)
-    drawing.text(60, 324, "Zenoh and shared memory", size=13)
+    drawing.text(60, 324, "rings in shared memory", size=13)
     drawing.text(60, 342, "every edge lossless, in order", FAINT, size=12)
     for x in places.values():
         drawing.line(x + 75, 260, x + 75, 298, arrow=True)

@@ -1,8 +1,9 @@
 """Operators that make and change point clouds."""
 
 from operators.cloud.cloud_builder import CloudBuilder
+from operators.cloud.cloud_colorizer import CloudColorizer
 from operators.cloud.cloud_filter import CloudFilter
 from operators.cloud.clusterer import Clusterer
 from operators.cloud.plane_segmenter import PlaneSegmenter
 
-__all__ = ["CloudBuilder", "CloudFilter", "Clusterer", "PlaneSegmenter"]
+__all__ = ["CloudBuilder", "CloudColorizer", "CloudFilter", "Clusterer", "PlaneSegmenter"]

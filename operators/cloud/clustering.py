@@ -65,7 +65,7 @@ def _numbered(labels: Labels) -> Labels:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """What is known of one cluster. `T` (4, 4) maps its box's axes, z along up, to the cloud's frame; `size` (3,)."""
+    """Facts about one cluster. `T` (4, 4) maps its box's axes, z along up, to the cloud's frame; `size` (3,)."""
 
     centroid: Array
     lower: Array

@@ -1,4 +1,4 @@
-"""Which way is up for a cloud, and how high its sensor is."""
+"""Finds the vertical of a cloud, and the height of its sensor."""
 
 from __future__ import annotations
 

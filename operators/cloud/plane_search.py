@@ -30,7 +30,7 @@ _ELECTORATE = 2000  # so many points are enough to tell the best of the samples;
 
 @dataclass(frozen=True)
 class Search:
-    """How planes are looked for. Lengths in metres, angles in radians."""
+    """Settings of the search for planes. Lengths in metres, angles in radians."""
 
     voxel: float
     """Side of the voxels whose means stand for the cloud."""

@@ -1,4 +1,4 @@
-"""What a plane is to a robot indoors: floor, wall, table, ceiling or something else."""
+"""Classifies planes as a robot indoors sees them: floor, wall, table, ceiling or something else."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SURFACES = ("floor", "wall", "table", "ceiling", "other")
 
 @dataclass(frozen=True)
 class Rules:
-    """What makes a surface what it is. Lengths in metres."""
+    """Holds what makes a surface what it is. Lengths in metres."""
 
     table_heights: tuple[float, float]
     """Of a table's top above the floor."""

@@ -82,7 +82,7 @@ def _decoded(message: CompressedImage | CompressedDepth, flags: int, max_pixels:
 
 
 def _is_whole(data: bytes) -> bool:
-    """Whether a PNG, JPEG or WebP file goes on to its end mark or its declared length."""
+    """Tells whether a PNG, JPEG or WebP file goes on to its end mark or its declared length."""
     if data.startswith(b"\x89PNG"):
         return data.rstrip(b"\0").endswith(b"IEND\xaeB`\x82")
     if data.startswith(b"\xff\xd8"):

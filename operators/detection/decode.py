@@ -1,4 +1,4 @@
-"""What detector networks put out, turned into scored boxes in the pixels of the network's input.
+"""Decodes the output of detector networks into scored boxes in the pixels of the network's input.
 
 A layout says how an image becomes the network's input (colour order, fit) and how its output is read.
 """

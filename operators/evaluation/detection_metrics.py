@@ -19,7 +19,7 @@ from operators.evaluation.views import check_names, check_view, listed
 
 @dataclass(frozen=True, eq=False)
 class _Objects:
-    """What scoring needs of a message: boxes (N, 4) in pixels, class names, scores, which objects are ignored."""
+    """Holds what scoring needs of a message: boxes (N, 4) in pixels, class names, scores, which objects are ignored."""
 
     size: NDArray[np.float64]
     boxes: NDArray[np.float64]

@@ -20,7 +20,7 @@ _AREA_RANGE = (0.0, 1e10)
 
 @dataclass(frozen=True, eq=False)
 class ScoredFrame:
-    """What is in an image and what was found: boxes (N, 4) as corners in pixels of one image, class names (N,)."""
+    """Truth and detections of one image: boxes (N, 4) as corners in pixels of one image, class names (N,)."""
 
     truth_boxes: NDArray[np.float64]
     truth_labels: tuple[str, ...]
@@ -32,7 +32,7 @@ class ScoredFrame:
 
 @dataclass(frozen=True)
 class ClassScore:
-    """How one class was found. APs are None where the truth has no object that counts.
+    """Scores of one class. APs are None where the truth has no object that counts.
 
     `hits` and `false_alarms` count the detections at the operating point; those on ignored objects are neither.
     """

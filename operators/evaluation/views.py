@@ -1,4 +1,4 @@
-"""Whether a result and its truth can be compared: same camera, same picture, classes matched by name."""
+"""Checks that a result and its truth can be compared: same camera, same picture, classes matched by name."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known before anything is measured.
+    """Holds what is known before anything is measured.
 
     `position` and `heading` (rad), with standard deviations; without a heading, every one is as likely. Standard
     deviations of the biases; limits on the readings' standard deviations below which the body rests; the standard

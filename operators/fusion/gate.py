@@ -1,4 +1,5 @@
-"""Whether a measurement is believed: a chi-square gate that neither locks out a sensor nor falls for one outlier.
+"""Decides whether a measurement is believed: a chi-square gate that neither locks out a sensor nor falls for one
+outlier.
 
 A measurement that does not fit is refused. So is, until another agrees with it, one that fits only because the filter
 knows much less than the sensor (after an outage, an outlier fits as well). When refused measurements agree with each
@@ -49,7 +50,7 @@ class Doubt:
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """What became of a sensor's measurements."""
+    """Counts of a sensor's measurements by their fate."""
 
     used: int = 0
     widened: int = 0

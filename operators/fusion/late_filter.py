@@ -43,7 +43,7 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What a sensor said about a time (ns), with covariance (M, M)."""
+    """Holds what a sensor said about a time (ns), with covariance (M, M)."""
 
     time: int
     sensor: str

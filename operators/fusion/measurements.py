@@ -1,4 +1,4 @@
-"""What sensors say of an inertial body: residual and Jacobian of each kind of measurement.
+"""Measurement models of an inertial body: residual and Jacobian of each kind of measurement.
 
 A residual is measurement - prediction, to first order Jacobian @ error. `rate` is the gyroscope's reading of the time.
 """

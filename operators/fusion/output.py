@@ -1,4 +1,4 @@
-"""What the fusion says: the pose of the base with its covariance, and the health of the sensors."""
+"""Output of the fusion: the pose of the base with its covariance, and the health of the sensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the messages of a sensor measure: from types, frames and covariances to measurements of the body."""
+"""Interprets the messages of a sensor: from types, frames and covariances to measurements of the body."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _I3 = np.eye(3)
 
 
 class SensorSettings(BaseModel):
-    """What a stream is used for and how far it is believed."""
+    """Holds what a stream is used for and how far it is believed."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -94,7 +94,8 @@ class Unusable(Exception):
 
 @dataclass
 class Surroundings:
-    """What measurements are related to: places of sensors on the body, the world's frame, origin and landmarks."""
+    """Holds what measurements are related to: places of sensors on the body, the world's frame, origin and
+    landmarks."""
 
     place: Callable[[str], Array]
     world_frame: str

@@ -18,6 +18,7 @@ from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.surface import DepthNoise, Surface
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
+SLACK = 0.02  # metres along a ray that a tilted or rough surface makes up within one patch
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,12 +29,31 @@ class Normal:
     b: Vector  # (6,) gradient
     seen: int  # measurements that could be compared
     inliers: int  # of these, within three sigmas
+    median: float | None  # squared residual in the median, in units of sigma; None without any
 
 
 class Term(Protocol):
     """A set of measurements of the camera's pose."""
 
     def linearise(self, T_world_camera: Matrix) -> Normal: ...
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """How far a pose may still be off before it is refined: standard deviations, metres and radians."""
+
+    translation: float = 1.0
+    rotation: float = 1.0
+
+    @staticmethod
+    def of(covariance: Matrix) -> "Freedom":
+        """Returns the largest standard deviations that a covariance (6, 6) has in any direction."""
+        translation, rotation = (np.linalg.eigvalsh(part)[-1] for part in (covariance[:3, :3], covariance[3:, 3:]))
+        return Freedom(float(np.sqrt(translation)), float(np.sqrt(rotation)))
+
+    def variance(self, z: Vector) -> Vector:
+        """Returns how far it moves a point at a depth, squared metres."""
+        return self.translation**2 + (self.rotation * z) ** 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,34 +64,30 @@ class PlaneTerm:
     reference: Surface
     T_reference_world: Matrix
     noise: DepthNoise
-    gate: float  # metres beyond which a point is taken to see another surface
+    scale: float  # of that noise, as learnt
+    freedom: Freedom  # a point farther off than it allows is taken to see something else
+    gate: float  # metres; the same, whatever the freedom
     strength: float  # of the information: neighbouring depths err together
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
         T = self.T_reference_world @ T_world_camera
-        R, K = T[:3, :3], self.reference.K
-        h, w = self.reference.inverse_depth.shape
-        q = self.points @ R.T + T[:3, 3]
-        z = q[:, 2]
-        ahead = np.maximum(z, 0.05)
-        u = np.rint(q[:, 0] / ahead * K[0, 0] + K[0, 2])
-        v = np.rint(q[:, 1] / ahead * K[1, 1] + K[1, 2])
-        inside = np.flatnonzero((z > 0.05) & (u >= 0) & (v >= 0) & (u < w) & (v < h))
-        planes = self.reference.planes[(v[inside] * w + u[inside]).astype(np.int64)]
+        R = T[:3, :3]
+        inside, cells, q = self._meet(T)
+        planes = self.reference.planes[cells]
         known = planes[:, 3] != 0
-        inside, planes = inside[known], planes[known].astype(np.float64)
-        normals, q = planes[:, :3], q[inside]
+        inside, planes, q = inside[known], planes[known].astype(np.float64), q[known]
+        normals = planes[:, :3]
         r = np.einsum("ij,ij->i", normals, q) - planes[:, 3]
-        near = np.abs(r) < self.gate
-        seen = len(r)
-        if not near.any():
-            return Normal(np.zeros((6, 6)), np.zeros(6), seen, 0)
-        inside, normals, q, r = inside[near], normals[near], q[near], r[near]
         # Both depths err along their rays; the distance sees that error's part along the normal.
         along = np.abs(np.einsum("ij,ij->i", normals, q)) / q[:, 2]
-        sigma = np.sqrt(2.0) * self.noise.sigma(q[:, 2]) * along
-        e2 = (r / sigma) ** 2
-        weight = self.strength / (sigma**2 * (1.0 + e2 / CAUCHY**2))
+        variance = 2.0 * (self.scale * self.noise.sigma(q[:, 2]) * along) ** 2
+        near = r * r < np.minimum(9.0 * (variance + self.freedom.variance(q[:, 2])), self.gate**2)
+        seen = len(r)
+        if not near.any():
+            return Normal(np.zeros((6, 6)), np.zeros(6), seen, 0, None)
+        inside, normals, r, variance = inside[near], normals[near], r[near], variance[near]
+        e2 = r * r / variance
+        weight = self.strength / (variance * (1.0 + e2 / CAUCHY**2))
         m = normals @ R
         p = self.points[inside]
         J = np.empty((len(r), 6))
@@ -80,7 +96,29 @@ class PlaneTerm:
         J[:, 4] = p[:, 2] * m[:, 0] - p[:, 0] * m[:, 2]
         J[:, 5] = p[:, 0] * m[:, 1] - p[:, 1] * m[:, 0]
         JW = J.T * weight
-        return Normal(JW @ J, JW @ r, seen, int(np.count_nonzero(e2 < 9.0)))
+        return Normal(JW @ J, JW @ r, seen, int(np.count_nonzero(e2 < 9.0)), float(np.median(e2)))
+
+    def compare(self, T_world_camera: Matrix) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Returns the indices (M,) of points that meet the reference, which lie before it, and which on it."""
+        inside, cells, q = self._meet(self.T_reference_world @ T_world_camera)
+        inverse = self.reference.inverse_depth.ravel()[cells]
+        known = inverse > 0
+        inside, z = inside[known], q[known, 2]
+        nearer = 1.0 / inverse[known] - z
+        variance = 2.0 * (self.scale * self.noise.sigma(z)) ** 2 + self.freedom.variance(z)
+        width = 3.0 * np.sqrt(variance) + SLACK
+        return inside, nearer > width, np.abs(nearer) <= width
+
+    def _meet(self, T_reference_camera: Matrix) -> tuple[NDArray[np.int64], NDArray[np.int64], Points]:
+        """Returns which points (M,) fall into the reference's grid, in which cells (M,), and where (M, 3) they are."""
+        K, (h, w) = self.reference.K, self.reference.inverse_depth.shape
+        q = self.points @ T_reference_camera[:3, :3].T + T_reference_camera[:3, 3]
+        z = q[:, 2]
+        ahead = np.maximum(z, 0.05)
+        u = np.rint(q[:, 0] / ahead * K[0, 0] + K[0, 2])
+        v = np.rint(q[:, 1] / ahead * K[1, 1] + K[1, 2])
+        inside = np.flatnonzero((z > 0.05) & (u >= 0) & (v >= 0) & (u < w) & (v < h))
+        return inside, (v[inside] * w + u[inside]).astype(np.int64), q[inside]
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,12 +137,13 @@ class PixelTerm:
         p = self.points_world @ T[:3, :3].T + T[:3, 3]
         r = project(p, self.K_color) - self.pixels
         e2 = np.einsum("ij,ij->i", r, r) / self.sigma**2
-        weight = np.where(p[:, 2] > 0.05, self.strength / (self.sigma**2 * (1.0 + e2 / CAUCHY**2)), 0.0)
+        weight = self.strength / (self.sigma**2 * (1.0 + e2 / CAUCHY**2))
+        weight[p[:, 2] <= 0.05] = 0.0
         J = reprojection_jacobian(p, self.K_color, self.T_color_depth)
         JW = J.transpose(2, 0, 1) * weight[:, None]
         H = np.tensordot(JW, J, axes=((1, 2), (0, 1)))
         b = np.tensordot(JW, r, axes=((1, 2), (0, 1)))
-        return Normal(H, b, len(r), int(np.count_nonzero(e2 < 9.0)))
+        return Normal(H, b, len(r), int(np.count_nonzero(e2 < 9.0)), float(np.median(e2)) if len(r) else None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +155,7 @@ class PriorTerm:
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
         x = se3.log(invert(self.T_world_camera) @ T_world_camera)
-        return Normal(self.information, self.information @ x, 0, 0)
+        return Normal(self.information, self.information @ x, 0, 0, None)
 
 
 def reprojection_jacobian(points_color: Points, K: Matrix, T_color_depth: Matrix) -> NDArray[np.float64]:

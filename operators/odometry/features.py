@@ -1,4 +1,4 @@
-"""Sparse features: spread corners, their Lucas-Kanade tracks, and ORB matches where tracking cannot reach."""
+"""Sparse features: spread corners and their Lucas-Kanade tracks."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
 Pixels = NDArray[np.float64]
+Pixels32 = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 LK_WINDOW = (15, 15)
@@ -13,10 +14,21 @@ LK_LEVELS = 3
 LK_STOP = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 20, 0.02)
 
 
-def detect_corners(gray: Gray, count: int) -> Pixels:
-    """At most count corners (N, 2), spread over the image. Shi and Tomasi, "Good features to track", 1994."""
+def detect_corners(gray: Gray, count: int, taken: Pixels | None = None) -> Pixels:
+    """Finds corners (N, 2), spread over the image and apart from those taken, at most count with them.
+
+    Shi and Tomasi, "Good features to track", 1994.
+    """
     spacing = max(3.0, 0.6 * float(np.sqrt(gray.size / count)))
-    corners = cv2.goodFeaturesToTrack(gray, count, qualityLevel=0.005, minDistance=spacing, blockSize=5)
+    mask = None
+    if taken is not None and len(taken):
+        count -= len(taken)
+        if count <= 0:
+            return np.zeros((0, 2))
+        mask = np.full(gray.shape, 255, np.uint8)
+        for x, y in np.rint(taken).astype(int).tolist():
+            cv2.circle(mask, (x, y), int(spacing), 0, -1)
+    corners = cv2.goodFeaturesToTrack(gray, count, 0.005, spacing, mask=mask, blockSize=5)
     return np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
@@ -47,23 +59,23 @@ def with_exposure_of(reference: Gray, gray: Gray) -> Gray:
     return np.asarray(cv2.LUT(gray, table), np.uint8)
 
 
-class OrbMatcher:
-    """Descriptors and mutual nearest matches. Rublee et al., "ORB", 2011."""
+def track_both_ways(a: Gray, b: Gray, pixels: Pixels, guess: Pixels, back: float) -> tuple[Pixels, Mask]:
+    """Follows pixels (N, 2) from image a to b and back again; those that return within `back` pixels are found."""
+    if not len(pixels):
+        return np.zeros((0, 2)), np.zeros(0, np.bool_)
+    height, width = b.shape
+    start = np.asarray(pixels, np.float32)
+    inside = (guess > -10).all(axis=1) & (guess[:, 0] < width + 10) & (guess[:, 1] < height + 10)
+    ends, found = _lucas_kanade(a, b, start, np.where(inside[:, None], guess, pixels).astype(np.float32))
+    again, found_back = _lucas_kanade(b, a, ends, start)
+    good = found & found_back & (np.abs(again - start).max(axis=1) < back)
+    good &= (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
+    return ends.astype(np.float64), np.asarray(good, np.bool_)
 
-    def __init__(self, count: int = 1000) -> None:
-        self._orb = cv2.ORB.create(count, scaleFactor=1.2, nlevels=8, edgeThreshold=15, patchSize=31, fastThreshold=7)
-        self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
 
-    def describe(self, gray: Gray) -> tuple[Pixels, NDArray[np.uint8]]:
-        """Pixels (N, 2) and their descriptors (N, 32)."""
-        points, descriptors = self._orb.detectAndCompute(gray, None)
-        if descriptors is None:
-            return np.zeros((0, 2)), np.zeros((0, 32), np.uint8)
-        return np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.uint8)
-
-    def match(self, descriptors_a: NDArray[np.uint8], descriptors_b: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Pairs of indices (M, 2) that are each other's nearest and near."""
-        if len(descriptors_a) == 0 or len(descriptors_b) == 0:
-            return np.zeros((0, 2), np.int64)
-        matches = self._matcher.match(descriptors_a, descriptors_b)
-        return np.array([(m.queryIdx, m.trainIdx) for m in matches if m.distance < 64], np.int64).reshape(-1, 2)
+def _lucas_kanade(a: Gray, b: Gray, pixels: Pixels32, guess: Pixels32) -> tuple[Pixels32, Mask]:
+    ends, found, _ = cv2.calcOpticalFlowPyrLK(
+        a, b, pixels, guess.copy(), winSize=LK_WINDOW, maxLevel=LK_LEVELS,
+        criteria=LK_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
+    )  # fmt: skip
+    return np.asarray(ends, np.float32), np.asarray(found.ravel() > 0, np.bool_)

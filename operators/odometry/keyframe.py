@@ -10,6 +10,7 @@ from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import Pixels, Points
 from operators.geometry.se3 import Matrix
 from operators.odometry.features import Gray
+from operators.odometry.recognition import Description, describe
 from operators.odometry.surface import Surface
 
 
@@ -24,8 +25,8 @@ class Keyframe:
     surface: Surface
     pixels: Pixels  # (N, 2) corners in the working colour image
     points: Points  # (N, 3) the same corners in this view's depth camera
-    orb_points: Points  # (M, 3)
-    orb_descriptors: NDArray[np.uint8]  # (M, 32)
+    ages: NDArray[np.int64]  # (N,) keyframes that have confirmed each corner's point
+    segment: int = 0  # maps begun before this one after a loss; two segments share no known motion
 
     @cached_property
     def points_world(self) -> Points:
@@ -35,9 +36,19 @@ class Keyframe:
     def T_camera_world(self) -> Matrix:
         return invert(self.T_world_camera)
 
+    @cached_property
+    def description(self) -> Description:
+        """Its descriptors, made when a lost camera first asks for them."""
+        return describe(self.gray)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing can be measured against it."""
+        return len(self.points) < 6 and self.surface.coverage < 0.05
+
 
 def view_distance(T_a: Matrix, T_b: Matrix, depth: float) -> float:
-    """How differently two cameras see a scene at a depth: baseline / depth + angle between them, radians."""
+    """Returns how differently two cameras see a scene at a depth: baseline / depth + angle between them, radians."""
     T = invert(T_a) @ T_b
     cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
     return float(np.linalg.norm(T[:3, 3]) / depth + np.arccos(cosine))

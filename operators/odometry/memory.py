@@ -1,4 +1,4 @@
-"""What an odometry remembers, as plain values that an operator's snapshot may hold."""
+"""Memory of an odometry, as plain values that an operator's snapshot may hold."""
 
 from __future__ import annotations
 
@@ -6,10 +6,14 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
+import numpy as np
+
 from operators.odometry.keyframe import Keyframe
 from operators.odometry.motion import Motion
+from operators.odometry.noise import Noise
 from operators.odometry.rgbd_odometry import State
 from operators.odometry.surface import Surface
+from operators.odometry.watch import Watch
 
 
 def to_plain(state: State) -> dict[str, Any]:
@@ -19,19 +23,34 @@ def to_plain(state: State) -> dict[str, Any]:
         "covariance": state.covariance,
         "keyframes": [_fields_of(k) | {"surface": _fields_of(k.surface)} for k in state.keyframes],
         "shapes": None if state.shapes is None else [list(shape) for shape in state.shapes],
+        "noise": _fields_of(state.noise),
+        "watch": _fields_of(state.watch),
+        "recalls": state.recalls,
+        "apart_since": state.apart_since,
     }
 
 
 def from_plain(values: Mapping[str, Any]) -> State:
-    """Raises KeyError or TypeError for what `to_plain` did not make."""
+    """Raises KeyError or TypeError for what `to_plain` did not make, in this version or the one before it."""
     motion, shapes = values["motion"], values["shapes"]
     return State(
         motion=None if motion is None else Motion(**motion),
         covariance=values["covariance"],
-        keyframes=tuple(Keyframe(**{**k, "surface": Surface(**k["surface"])}) for k in values["keyframes"]),
+        keyframes=tuple(_keyframe(k) for k in values["keyframes"]),
         shapes=None if shapes is None else (tuple(shapes[0]), tuple(shapes[1])),
+        noise=Noise(**values.get("noise", {})),
+        watch=Watch(**values.get("watch", {})),
+        recalls=values.get("recalls", 0),
+        apart_since=values.get("apart_since"),
     )
 
 
-def _fields_of(value: Motion | Keyframe | Surface) -> dict[str, Any]:
+def _keyframe(values: Mapping[str, Any]) -> Keyframe:
+    """A keyframe of the former version had descriptors, and its corners no ages."""
+    names = {field.name for field in fields(Keyframe)}
+    known = {"ages": np.zeros(len(values["pixels"]), np.int64)} | {k: v for k, v in values.items() if k in names}
+    return Keyframe(**(known | {"surface": Surface(**values["surface"])}))
+
+
+def _fields_of(value: Motion | Keyframe | Surface | Noise | Watch) -> dict[str, Any]:
     return {field.name: getattr(value, field.name) for field in fields(value)}

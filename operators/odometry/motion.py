@@ -10,6 +10,8 @@ from operators.geometry.se3 import Matrix, Vector
 
 UNKNOWN_SPEED = 1.0  # m/s and rad/s: how fast a hand or a small robot may already move when first seen
 
+BRIEF = 0.15  # seconds without a measurement in which a velocity hardly changes
+
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -38,9 +40,11 @@ class Motion:
         )
 
     def measured(self, stamp: int, T_world_camera: Matrix) -> "Motion":
-        """After a measured pose. What was crossed blindly tells nothing of the velocity now."""
-        if self.blind_s > 0:
+        """Returns the motion after a measured pose. What was crossed blindly tells nothing of the velocity now."""
+        if self.blind_s > BRIEF:
             return Motion(stamp, T_world_camera, np.zeros(6))
+        if self.blind_s > 0:
+            return Motion(stamp, T_world_camera, self.velocity, fresh=self.fresh)
         velocity = se3.log(invert(self.T_world_camera) @ T_world_camera) / self._seconds(stamp)
         return Motion(stamp, T_world_camera, velocity, fresh=False)
 

@@ -36,14 +36,23 @@ class Surface:
 
     @staticmethod
     def from_depth(depth: Array32, K: Matrix, near: float, far: float, block: int) -> "Surface":
-        """Average block x block pixels of a (H, W) depth, metres; NaN or outside near..far is no return."""
-        h, w = depth.shape[0] // block, depth.shape[1] // block
-        depth = depth[: h * block, : w * block]
+        """Averages block x block pixels of a (H, W) depth, metres; NaN or outside near..far is no return.
+
+        Where returns are sparse, blocks are wider, so that each holds some.
+        """
         valid = cv2.inRange(depth, near, far)  # 255 or 0; a NaN compares false
+        density = _block_mean(valid / np.float32(255), max(depth.shape[1] // 16, 1), max(depth.shape[0] // 16, 1))
+        found = density[density > 0.02]
+        per_pixel = float(found.mean()) if found.size else 1.0
+        fewest = 0.25
+        while per_pixel * block * block < 2.5 and block < 16:
+            block, fewest = 2 * block, 0.02
+        h, w = depth.shape[0] // block, depth.shape[1] // block
+        depth, valid = depth[: h * block, : w * block], valid[: h * block, : w * block]
         inverse = np.zeros_like(depth)
         cv2.copyTo(cv2.divide(1.0, depth), valid, inverse)
         mean, square, share = (_block_mean(x, w, h) for x in (inverse, inverse * inverse, valid / np.float32(255)))
-        enough = share >= 0.5
+        enough = share >= fewest
         share[~enough] = 1.0
         mean /= share
         spread = square / share - mean * mean
@@ -92,6 +101,11 @@ class Surface:
         planes = np.stack([-a * scale, -b * scale, -c * scale, -scale], axis=-1)
         planes[bad] = 0.0
         return planes.reshape(h * w, 4)
+
+    @property
+    def depth(self) -> Array32:
+        """Depth of the patches (h, w), metres; 0 where there is none."""
+        return np.where(self.inverse_depth > 0, 1.0 / np.maximum(self.inverse_depth, 1e-6), 0).astype(np.float32)
 
     @property
     def coverage(self) -> float:

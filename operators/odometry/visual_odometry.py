@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dataflow.messages import CameraInfo, DepthImage, Image, Odometry, Transforms
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odometry, Transforms
 from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
-from operators.geometry.se3 import about_fixed_axes
 from operators.odometry.camera import RgbdCamera
+from operators.odometry.emission import outputs
 from operators.odometry.memory import from_plain, to_plain
-from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, State
+from operators.odometry.rgbd_odometry import RgbdOdometry, State
+from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import DepthNoise
 
 
@@ -28,8 +30,12 @@ class VisualOdometry(Operator):
     """Tracks an RGB-D camera by its features and its depth; the first frame's depth camera is the origin.
 
     The pose is that of the depth camera's optical frame, at every frame, also while nothing can be measured:
-    then it follows the motion so far and its covariance grows. The images need not be registered, but must be
-    free of lens distortion. Without `extrinsics` the two cameras are taken to coincide.
+    then it follows the motion so far and its covariance grows. `status` says at every frame what the pose rests on:
+    tracking, relocalised, predicted or lost, and why. A lost camera looks for its view among the keyframes; where it
+    sees something that is not among them for longer than `patience`, it begins a new map at the predicted pose, and
+    joins it to the old one when that is seen again. An image that is black or repeats the last one is not used. The
+    images need not be registered, but must be free of lens distortion. Without `extrinsics` the two cameras are
+    taken to coincide.
     """
 
     image: In[Image] = In(doc="colour or grey, of the same stamp")
@@ -40,6 +46,7 @@ class VisualOdometry(Operator):
         required=False, doc="holds the transform between the two cameras' frames, in either direction"
     )
     odometry: Out[Odometry] = Out(doc="the depth camera in the odometry frame, with covariance and velocity")
+    status: Out[Diagnostics] = Out(doc="tracking, relocalised, predicted or lost, with the reason; at every frame")
 
     odometry_frame: str = Param("odom", min_length=1, doc="name of the frame that the first depth camera defines")
     near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
@@ -52,12 +59,15 @@ class VisualOdometry(Operator):
     keyframe_distance: float = Param(
         0.1, gt=0, doc="change of view that makes a new keyframe: angle plus baseline over depth", unit="rad"
     )
-    keyframes: int = Param(12, ge=1, doc="keyframes remembered")
+    keyframes: int = Param(30, ge=1, doc="keyframes remembered")
     patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
-    give_up: float = Param(2.0, ge=0, doc="and until it begins anew at the predicted pose", unit="s")
+    give_up: float = Param(2.0, ge=0, doc="time in a new map until it counts as tracking although apart", unit="s")
 
     _tracker: _Tracker | None = None
     _restored: State | None = None
+
+    def setup(self) -> None:
+        self._frames: Counter[str] = Counter()
 
     def process(
         self,
@@ -66,20 +76,13 @@ class VisualOdometry(Operator):
         image_info: CameraInfo,
         depth_info: CameraInfo,
         extrinsics: Transforms | None = None,
-    ) -> Odometry:
+    ) -> dict[str, Any]:
         """Raises ValueError where an image does not fit its calibration, or no transform fits."""
         check_calibration("image", image, image_info)
         check_calibration("depth", depth, depth_info)
         result = self._tracking(image_info, depth_info, extrinsics).track(image.data, depth.data, depth.stamp)
-        return Odometry.from_matrix(
-            result.T_world_camera,
-            stamp=depth.stamp,
-            frame=self.odometry_frame,
-            child_frame=depth.frame,
-            linear=result.velocity[:3],
-            angular=result.velocity[3:],
-            pose_covariance=about_fixed_axes(result.covariance, result.T_world_camera),
-        )
+        self._frames[result.status.value] += 1
+        return outputs(result, self.odometry_frame, depth.frame)
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
@@ -88,11 +91,16 @@ class VisualOdometry(Operator):
     def snapshot(self) -> Mapping[str, Any]:
         """The motion and the keyframes."""
         state = self._restored if self._tracker is None else self._tracker.odometry.snapshot()
-        return {} if state is None else to_plain(state)
+        return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Taken up with the first frame, which brings the calibration."""
         self._restored = from_plain(state) if state else None
+        self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        """Returns the number of frames of each status."""
+        return dict(self._frames)
 
     def _tracking(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdOdometry:
         """The tracker, made once for each calibration."""
@@ -117,5 +125,5 @@ class VisualOdometry(Operator):
             keyframe_distance=self.keyframe_distance,
             keyframes=self.keyframes,
             patience_s=self.patience,
-            give_up_s=self.patience + self.give_up,
+            give_up_s=self.give_up,
         )

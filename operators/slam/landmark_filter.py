@@ -32,7 +32,7 @@ _J = np.array([[0.0, -1.0], [1.0, 0.0]])
 
 @dataclass(frozen=True)
 class Association:
-    """How sightings without identity are told apart.
+    """Rules by which sightings without identity are told apart.
 
     A sighting belongs to a landmark within `gate` (probability that a true pair passes); it is a new landmark beyond
     `new` of all; between the two it is ambiguous and ignored.
@@ -52,7 +52,7 @@ class Association:
 
 @dataclass
 class Counts:
-    """What became of sightings: `ambiguous` ones lie between a known landmark's gate and a new landmark."""
+    """Counts of sightings by their fate: `ambiguous` ones lie between a known landmark's gate and a new landmark."""
 
     matched: int = 0
     added: int = 0

@@ -2,9 +2,20 @@
 
 from operators.sources.broad_imu import BroadImu
 from operators.sources.euroc_imu import EurocImu
+from operators.sources.kitti_odometry import KittiOdometry
+from operators.sources.kitti_raw import KittiRaw
 from operators.sources.rgbd_folder import RgbdFolder
 from operators.sources.simulated_robot import SimulatedRobot
 from operators.sources.synthetic_rgbd import SyntheticRgbd
 from operators.sources.victoria_park import VictoriaPark
 
-__all__ = ["BroadImu", "EurocImu", "RgbdFolder", "SimulatedRobot", "SyntheticRgbd", "VictoriaPark"]
+__all__ = [
+    "BroadImu",
+    "EurocImu",
+    "KittiOdometry",
+    "KittiRaw",
+    "RgbdFolder",
+    "SimulatedRobot",
+    "SyntheticRgbd",
+    "VictoriaPark",
+]

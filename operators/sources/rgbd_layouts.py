@@ -1,4 +1,4 @@
-"""Where the files of an RGB-D dataset lie and what they mean: the 7-Scenes and TUM RGB-D layouts."""
+"""Files of RGB-D datasets and their meaning: the 7-Scenes and TUM RGB-D layouts."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ OBJECTS: tuple[Ball | Block, ...] = (
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """What a camera sees: `image` (H, W, 3) uint8 RGB, `depth` (H, W) metres along z, `surface` (H, W) index.
+    """View of a camera: `image` (H, W, 3) uint8 RGB, `depth` (H, W) metres along z, `surface` (H, W) index.
 
     Surfaces 0 to 5 are the room's sides, 6 onwards OBJECTS.
     """

@@ -19,7 +19,7 @@ GREY = 114
 
 @dataclass(frozen=True)
 class Variation:
-    """How much a training image may be changed; zero turns a change off.
+    """Strength of changes to a training image; zero turns a change off.
 
     `flip` is the probability of a mirror image, `scale` the largest factor of size (1.5: between 1/1.5 and 1.5),
     `shift` the share of the input by which the image moves at most, `color` the strength of changes of brightness,

@@ -1,18 +1,28 @@
-"""`dataflow train` and `dataflow evaluate`. What is heavy is imported when a command runs, so `--help` is quick."""
+"""`dataflow train`. Heavy packages are imported when a command runs, so `--help` is quick."""
 
 from __future__ import annotations
 
-import contextlib
 import json as jsonlib
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+
+from operators.training.console import (
+    Data,
+    Json,
+    SplitSeed,
+    err_console,
+    friendly,
+    out_console,
+    print_notes,
+    score_words,
+)
+from operators.training.evaluation import evaluate
 
 if TYPE_CHECKING:
     from torch import nn
@@ -20,32 +30,17 @@ if TYPE_CHECKING:
     from operators.training.backbone import Backbone as Extractor
     from operators.training.loop import Outcome, Settings, Task
 
-Sample = TypeVar("Sample")
-
-FAILED = 1
-_out, _err = Console(), Console(stderr=True)
 _LONGEST_SIDE, _MULTIPLE = 384, 32
+
+__all__ = ["evaluate", "train"]
 
 train = typer.Typer(
     name="train", help="Train the project's networks on your own data.", no_args_is_help=True, rich_markup_mode="rich"
 )
-evaluate = typer.Typer(
-    name="evaluate", help="Score a network file on labelled data.", no_args_is_help=True, rich_markup_mode="rich"
-)
-
-Data = Annotated[Path, typer.Argument(help="The data folder.", show_default=False)]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes through the training images.")]
 Batch = Annotated[int, typer.Option(min=1, help="Images a step.")]
 Rate = Annotated[float, typer.Option("--learning-rate", min=1e-7, help="Largest learning rate.")]
 Seed = Annotated[int, typer.Option(min=0, help="Decides everything random.")]
-SplitSeed = Annotated[
-    int | None,
-    typer.Option(
-        "--seed",
-        min=0,
-        help="Sets the validation images aside, where DATA names none. Default: the seed of the network's training.",
-    ),
-]
 Size = Annotated[
     str | None,
     typer.Option(metavar="WxH", help="Input size, multiples of 16. Default: by the images, longest side 384."),
@@ -79,8 +74,6 @@ Bfloat16 = Annotated[
     bool,
     typer.Option(help="Compute convolutions in bfloat16: twice as fast on processors that have it, slower on others."),
 ]
-Json = Annotated[bool, typer.Option("--json", help="Print the outcome as JSON.")]
-Weights = Annotated[Path, typer.Option("--weights", help="The network file (.onnx).", show_default=False)]
 
 
 @train.command("detector")
@@ -115,7 +108,7 @@ def train_detector(
     Writes the best epoch's network (.onnx), which the operator `operators.detection:CustomDetector` takes as `weights`,
     and a checkpoint (.pt) to resume from.
     """
-    with _friendly():
+    with friendly():
         _free(out, resume, overwrite)
         from operators.detection.custom.dataset import read_detection_data
         from operators.detection.custom.training import DetectorTask
@@ -167,7 +160,7 @@ def train_segmenter(
     json: Json = False,
 ) -> None:
     """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt."""
-    with _friendly():
+    with friendly():
         _free(out, resume, overwrite)
         from operators.segmentation.dataset import read_segmentation_data
         from operators.segmentation.training import SegmenterTask
@@ -220,7 +213,7 @@ def train_pair(
     Writes detector.onnx and segmenter.onnx of the best epoch, and a checkpoint (pair.pt) to resume from.
     `python -m operators.training.simulated_worlds DATA` renders such a folder.
     """
-    with _friendly():
+    with friendly():
         file = out / "pair.onnx"
         _free(file, resume, overwrite)
         from operators.detection.custom.dataset import read_detection_data
@@ -262,7 +255,7 @@ def quantize(
 
     Ranges are measured on training images of DATA; both files are then scored on its validation images.
     """
-    with _friendly():
+    with friendly():
         out = weights.with_suffix(".int8.onnx") if out is None else out
         if out.exists() and not overwrite:
             raise FileExistsError(f"{out} exists already: give --overwrite or another --out")
@@ -274,77 +267,9 @@ def quantize(
         return
     table = Table("file", "kB", "score", "ms an image", box=None)
     for file, scores in compared.items():
-        kilobytes, said = f"{Path(file).stat().st_size / 1000:.0f}", _said(scores, ("ap50", "ap", "miou"))
+        kilobytes, said = f"{Path(file).stat().st_size / 1000:.0f}", score_words(scores, ("ap50", "ap", "miou"))
         table.add_row(escape(file), kilobytes, said, f"{scores['ms']:.1f}")
-    _out.print(table)
-
-
-@evaluate.command("detector")
-def evaluate_detector(
-    data: Data,
-    weights: Weights,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Score on all images, not only those for validation.")
-    ] = False,
-    seed: SplitSeed = None,
-    json: Json = False,
-) -> None:
-    """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format."""
-    with _friendly():
-        from operators.detection.custom.assessment import assess
-        from operators.detection.custom.dataset import read_detection_data
-        from operators.weights import training_seed
-
-        read = read_detection_data(data, training_seed(weights) if seed is None else seed)
-        chosen = _every(read.training, read.validation) if everything else read.validation
-        _notes(read.notes, json)
-        assessed = assess(weights, read.classes, chosen)
-    if json:
-        typer.echo(jsonlib.dumps(assessed))
-        return
-    images = _scored(assessed["images"], len(_every(read.training, read.validation)), everything)
-    _out.print(f"{weights.name}: {images}, {assessed['objects']} objects", markup=False, soft_wrap=True)
-    table = Table("class", "AP50")
-    for name, value in assessed["per_class"].items():
-        table.add_row(escape(name), f"{value:.3f}")
-    table.add_section()
-    table.add_row("mean", f"{assessed['ap50']:.3f}")
-    _out.print(table)
-    _out.print(f"AP at 0.5 to 0.95: {assessed['ap']:.3f}; {assessed['ms']:.1f} ms an image")
-
-
-@evaluate.command("segmenter")
-def evaluate_segmenter(
-    data: Data,
-    weights: Weights,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Score on all images, not only those for validation.")
-    ] = False,
-    seed: SplitSeed = None,
-    json: Json = False,
-) -> None:
-    """Score a segmenter by its mean IoU on the validation images of a folder with images/, masks/ and classes.txt."""
-    with _friendly():
-        from operators.segmentation.assessment import assess
-        from operators.segmentation.dataset import read_segmentation_data
-        from operators.weights import training_seed
-
-        read = read_segmentation_data(data, training_seed(weights) if seed is None else seed)
-        chosen = _every(read.training, read.validation) if everything else read.validation
-        _notes(read.notes, json)
-        assessed = assess(weights, read.classes, chosen)
-    if json:
-        typer.echo(jsonlib.dumps(assessed))
-        return
-    images = _scored(assessed["images"], len(_every(read.training, read.validation)), everything)
-    _out.print(f"{weights.name}: {images}", markup=False, soft_wrap=True)
-    table = Table("class", "IoU")
-    for name, value in assessed["per_class"].items():
-        table.add_row(escape(name), f"{value:.3f}")
-    table.add_section()
-    table.add_row("mean", f"{assessed['miou']:.3f}")
-    _out.print(table)
-    _out.print(f"{assessed['ms']:.1f} ms an image")
+    out_console.print(table)
 
 
 def _run(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -> Outcome:
@@ -353,7 +278,7 @@ def _run(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -
 
     if quiet:
         return run(task, settings, out, resume=resume)
-    with TrainingBar(_err) as bar:
+    with TrainingBar(err_console) as bar:
         return run(task, settings, out, resume=resume, progress=bar)
 
 
@@ -371,28 +296,13 @@ def _prepare(
 def _tell(
     notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
 ) -> None:
-    _notes(notes, quiet)
+    print_notes(notes, quiet)
     if quiet:
         return
     named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
     counts = f"{training} images to train on, {validation} to score on"
     told = f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}"
-    _err.print(told, highlight=False, markup=False, soft_wrap=True)
-
-
-def _notes(notes: Sequence[str], quiet: bool) -> None:
-    for note in () if quiet else notes:
-        _err.print(f"[yellow]note:[/yellow] {escape(note)}", highlight=False, soft_wrap=True)
-
-
-def _every(training: Sequence[Sample], validation: Sequence[Sample]) -> tuple[Sample, ...]:
-    """All images of the data, each once."""
-    return tuple(dict.fromkeys((*training, *validation)))
-
-
-def _scored(count: int, total: int, everything: bool) -> str:
-    """Which of the `total` images are scored on."""
-    return f"all {total} images" if everything else f"{count} validation images of {total}"
+    err_console.print(told, highlight=False, markup=False, soft_wrap=True)
 
 
 def _finish(outcome: Outcome, operator: str, json: bool) -> None:
@@ -411,14 +321,10 @@ def _finish(outcome: Outcome, operator: str, json: bool) -> None:
             )
         )
         return
-    scores = _said(outcome.best, [name for name in outcome.best if name != "score"])
+    scores = score_words(outcome.best, [name for name in outcome.best if name != "score"])
     file = escape(str(outcome.file))
-    _out.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
-    _out.print(f"use it: `use: {operator}` with `params: {{weights: {file}}}`", highlight=False, soft_wrap=True)
-
-
-def _said(scores: Mapping[str, Any], names: Sequence[str]) -> str:
-    return ", ".join(f"{name} {scores[name]:.3f}" for name in names if name in scores)
+    out_console.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
+    out_console.print(f"use it: `use: {operator}` with `params: {{weights: {file}}}`", highlight=False, soft_wrap=True)
 
 
 def _size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
@@ -446,26 +352,3 @@ def _free(out: Path, resume: bool, overwrite: bool) -> None:
     there = [str(file) for file in (out, checkpoint) if file.exists()]
     if there and not (resume or overwrite):
         raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")
-
-
-@contextlib.contextmanager
-def _friendly() -> Iterator[None]:
-    """Errors that the user can mend become one line and exit code 1."""
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        if error.name not in _EXTRA:
-            raise
-        _fail(f"training needs the package {error.name!r}: pip install 'robot-dataflow[train]'")
-    except (ValueError, FileNotFoundError, FileExistsError, FloatingPointError) as error:
-        _fail(str(error))
-    except KeyboardInterrupt:
-        _fail("interrupted; go on with --resume", 130)
-
-
-_EXTRA: dict[str | None, Any] = dict.fromkeys(("torch", "onnx", "pycocotools"))
-
-
-def _fail(message: str, code: int = FAILED) -> None:
-    _err.print(f"[bold red]error:[/bold red] {escape(message)}", highlight=False, soft_wrap=True)
-    raise typer.Exit(code)

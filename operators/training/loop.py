@@ -26,7 +26,7 @@ _AHEAD = 3  # batches prepared ahead of the one in training
 
 
 class Task(Protocol):
-    """What is trained: a network with its data, its loss, its score and the form in which it is put to use."""
+    """A trainable task: a network with its data, its loss, its score and the form in which it is put to use."""
 
     @property
     def kind(self) -> str: ...
@@ -52,7 +52,7 @@ class Task(Protocol):
 
 @dataclass(frozen=True)
 class Settings:
-    """How to train. `threads` None means as torch chooses; `device` None means a GPU where there is one.
+    """Settings of a training. `threads` None means as torch chooses; `device` None means a GPU where there is one.
 
     `bfloat16` computes convolutions in half the bits: about twice as fast on processors that have it (avx512_bf16, amx,
     most GPUs), and much slower on others.
@@ -95,7 +95,8 @@ class Silent:
 
 @dataclass
 class Outcome:
-    """What training gave: the best epoch's scores, each epoch's record, the seconds spent (resumed parts included)."""
+    """Outcome of a training: the best epoch's scores, each epoch's record, the seconds spent (resumed parts
+    included)."""
 
     file: Path
     checkpoint: Path

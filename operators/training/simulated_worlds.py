@@ -24,7 +24,7 @@ from rich.progress import track
 from dataflow.messages import Detections2D, Image, SegmentationMap
 from operators.sources.simulated_robot import SimulatedRobot
 from operators.sources.simulator.classes import CLASSES, THINGS
-from operators.sources.simulator.worlds import NAMES
+from operators.sources.simulator.worlds import INDOOR
 
 VGA, QVGA = (640, 480), (320, 240)
 """Width and height of the images: of worlds with even seeds, of the others."""
@@ -77,7 +77,7 @@ def render(world: str, seed: int, frames: int, size: tuple[int, int], *, varied:
         robot.close()
 
 
-def worlds(first_seed: int, count: int, names: Sequence[str] = NAMES) -> list[tuple[str, int]]:
+def worlds(first_seed: int, count: int, names: Sequence[str] = INDOOR) -> list[tuple[str, int]]:
     """`count` worlds (name, seed), the kinds in turn."""
     return [(names[k % len(names)], first_seed + k) for k in range(count)]
 

@@ -28,7 +28,7 @@ class NetworkFileError(ModelError):
 
 
 def shipped(name: str) -> Path:
-    """Where the project's own network `name` lies."""
+    """Tells where the project's own network `name` lies."""
     return _FOLDER / name
 
 

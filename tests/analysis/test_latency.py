@@ -178,7 +178,7 @@ def test_the_command_prints_every_path_of_a_recording(tmp_path: Path, repository
     recording = tmp_path / "run.mcap"
     graph = repository / "graphs" / "synthetic_rgbd.yaml"
     runner = CliRunner()
-    arguments = ["run", str(graph), "--one-host", "--quiet", "--set", "camera.frames=5", "--record", str(recording)]
+    arguments = ["run", str(graph), "--one-process", "--quiet", "--set", "camera.frames=5", "--record", str(recording)]
     assert runner.invoke(app, arguments).exit_code == 0
     result = runner.invoke(app, ["latency", str(recording), "--json"])
     assert result.exit_code == 0, result.output

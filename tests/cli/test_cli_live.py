@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from dataflow.cli.live import _Rate
 from dataflow.client.attach import find_running
 from dataflow.graph import Graph, load_graph
 from dataflow.supervision.plan import RunPlan
@@ -22,7 +23,7 @@ class Background:
     """A run on a thread of its own, that commands can attach to, until it is told to stop."""
 
     def __init__(self, graph: Graph) -> None:
-        self.supervisor = Supervisor(RunPlan(graph, placement="one_host", window=(8, 1 << 20)))
+        self.supervisor = Supervisor(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
         self.thread = threading.Thread(target=self.supervisor.run)
         self.thread.start()
 
@@ -84,6 +85,23 @@ def test_echo_prints_fields_for_people(dataflow) -> None:
 
 
 @pytest.mark.usefixtures("running")
+def test_echo_prints_one_message_and_the_fields_that_are_asked_for(dataflow) -> None:
+    told = dataflow("echo", "left/fast", "--once", "--field", "vectors").stdout.splitlines()
+    assert told[0].startswith("test/left/fast  ")
+    assert [line.split()[0] for line in told[1:]] == ["vectors"]
+
+    line = json.loads(dataflow("echo", "left/fast", "--once", "-f", "vectors", "-f", "labels", "--json").stdout)
+    assert list(line) == ["stream", "type", "stamp", "labels", "vectors"]
+
+
+@pytest.mark.usefixtures("running")
+def test_echo_of_a_field_that_there_is_not_names_the_nearest(dataflow) -> None:
+    told = dataflow("echo", "left/fast", "--field", "vectrs", code=2).stderr
+    assert "FeatureVector, which has no field 'vectrs': did you mean 'vectors'?" in " ".join(told.split())
+    assert "--once is --count 1" in dataflow("echo", "--once", "-n", 3, code=2).stderr
+
+
+@pytest.mark.usefixtures("running")
 def test_echo_into_a_closed_pipe_is_quiet() -> None:
     echo = subprocess.Popen(
         [sys.executable, "-m", "dataflow.cli.main", "echo", "--json"], stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -115,6 +133,27 @@ def test_hz_knows_the_rate_by_stamp(dataflow) -> None:
     told = dataflow("hz", "left/*", "--seconds", 0.3).stdout
     assert "Hz by stamp" in told
     assert "left/fast" in told
+
+
+def test_rates_over_a_window_forget_what_came_before() -> None:
+    rate = _Rate()
+    for second in range(10):  # ten a second stamped, one a second by the clock, until the last two
+        rate.seen.append((float(second), second * 10**8, second, 100))
+    rate.seen.append((9.5, 10**9, 10, 100))
+
+    assert rate.row("s")["hz_clock"] == pytest.approx(10 / 9.5)
+    rate.forget_before(9.0)
+    assert rate.row("s")["hz_clock"] == pytest.approx(2.0)
+    assert rate.row("s")["messages"] == 11
+    rate.forget_before(100.0)
+    assert rate.row("s")["hz_clock"] is None
+
+
+@pytest.mark.usefixtures("running")
+def test_hz_takes_a_window(dataflow) -> None:
+    (row,) = json.loads(dataflow("hz", "left/fast", "--seconds", 0.5, "--window", 0.2, "--json").stdout)
+    assert row["hz_event"] == pytest.approx(100.0)
+    assert "--window 0" in dataflow("hz", "--window", 0, code=2).stderr
 
 
 def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, running: Background) -> None:

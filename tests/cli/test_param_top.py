@@ -17,7 +17,7 @@ from rich.console import Console
 
 from dataflow.cli.board import Board, Sample, heading, line, shown
 from dataflow.client.attach import find_running
-from dataflow.client.processes import HostStatus
+from dataflow.client.processes import ProcessStatus
 from dataflow.graph import load_graph, load_text
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
@@ -40,7 +40,7 @@ operators:
 
 
 class Background:
-    """A live run on a thread of its own, in a host each, until it is told to stop."""
+    """A live run on a thread of its own, in a process each, until it is told to stop."""
 
     def __init__(self, folder: Path) -> None:
         path = folder / "tunable.yaml"
@@ -129,12 +129,48 @@ def test_a_parameter_that_there_is_not_is_answered_with_the_nearest(dataflow) ->
     assert "did you mean 'factor'?" in dataflow("param", "get", "tuned.factr", code=2).stderr
 
 
+@pytest.mark.usefixtures("running")
+def test_values_are_dumped_as_yaml_and_loaded_again_as_far_as_they_differ(dataflow, tmp_path: Path) -> None:
+    file = tmp_path / "tuned.yaml"
+    before = dataflow("param", "get", "tuned.factor").stdout.strip()
+    assert dataflow("param", "dump").stdout == f'"tuned":\n  factor: {before}\n'
+    dataflow("param", "dump", file)
+    assert "exists; name another file" in dataflow("param", "dump", file, code=2).stderr
+    dataflow("param", "set", "tuned.factor", "4.5")
+
+    assert dataflow("param", "load", file).stdout == f"tuned.factor = {before}\n"
+    assert "already" in dataflow("param", "load", file).stderr
+    assert dataflow("param", "dump", file, "--all", "--overwrite").stdout == ""
+    assert "  period: 10000000\n" in file.read_text()
+    assert "already" in dataflow("param", "load", file).stderr
+
+
+@pytest.mark.usefixtures("running")
+@pytest.mark.parametrize(
+    ("text", "code", "told"),
+    [
+        ("tuned: {factr: 1}", 2, "'tuned' has no parameter 'factr': did you mean 'factor'?"),
+        ("tund: {factor: 1}", 2, "no operator 'tund' runs: did you mean 'tuned'?"),
+        ("tuned: 3", 2, "expected a mapping from operators to their parameters"),
+        ("tuned: {factor: 11}", 1, "less than or equal to 10"),
+        ("tuned: [", 2, "is no YAML value"),
+    ],
+)
+def test_a_file_with_a_fault_is_refused(dataflow, tmp_path: Path, text: str, code: int, told: str) -> None:
+    (tmp_path / "tuned.yaml").write_text(text)
+    before = dataflow("param", "get", "tuned.factor").stdout
+
+    assert told in " ".join(dataflow("param", "load", tmp_path / "tuned.yaml", code=code).stderr.split())
+
+    assert dataflow("param", "get", "tuned.factor").stdout == before
+
+
 def rows_of(outcome: Any) -> dict[str, dict[str, Any]]:
     return {row["operator"]: row for row in json.loads(outcome.stdout)["operators"]}
 
 
 @pytest.mark.usefixtures("running")
-def test_top_tells_rates_drops_load_and_hosts(dataflow) -> None:
+def test_top_tells_rates_drops_load_and_processes(dataflow) -> None:
     rows = rows_of(dataflow("top", "--json"))
 
     assert list(rows) == ["left", "tuned", "slow", "other"]
@@ -145,7 +181,7 @@ def test_top_tells_rates_drops_load_and_hosts(dataflow) -> None:
     assert rows["slow"]["load"] < 0.5  # it sleeps
     assert rows["slow"]["drop_rate"] > 5
     assert rows["tuned"]["restarts"] == 0
-    assert rows["other"]["host"] == "far"
+    assert rows["other"]["process"] == "far"
     assert 0 <= rows["tuned"]["lag"] < 1
 
 
@@ -170,8 +206,8 @@ def test_top_tells_the_latency_of_every_path_of_the_last_seconds(dataflow) -> No
     assert "costs most" in dataflow("top", "--once", "--every", "0.3").stdout
 
 
-def test_a_host_that_does_not_answer_is_shown_as_such_and_a_change_waits_for_it(dataflow, running: Background) -> None:
-    """The last test of the file but one: the host is stopped for a moment."""
+def test_a_process_that_does_not_answer_is_shown_so_and_a_change_waits_for_it(dataflow, running: Background) -> None:
+    """The last test of the file but one: the process is stopped for a moment."""
     process = running.process_of("tuned")
     process.send_signal(signal.SIGSTOP)
     try:
@@ -217,16 +253,16 @@ def graph_with(*names: str) -> Graph:
 
 
 def status(
-    host: str,
+    process: str,
     *,
     restarts: int = 0,
     ended: bool = False,
     waits: dict[str, dict[tuple[str, str], int]] | None = None,
     behind: dict[str, tuple[float, float]] | None = None,
     **counts: Counts,
-) -> HostStatus:
+) -> ProcessStatus:
     through = frozenset(counts if ended else ())
-    return HostStatus(host, counts, dict.fromkeys(counts, restarts), through, waits or {}, behind or {})
+    return ProcessStatus(process, counts, dict.fromkeys(counts, restarts), through, waits or {}, behind or {})
 
 
 def test_the_board_follows_operators_from_answer_to_answer() -> None:
@@ -243,13 +279,13 @@ def test_the_board_follows_operators_from_answer_to_answer() -> None:
     )
 
     camera, detector, planner = sample.rows
-    assert (camera.rate, camera.lag, camera.state, camera.host) == (15.0, 0.0, "running", "eyes")
+    assert (camera.rate, camera.lag, camera.state, camera.process) == (15.0, 0.0, "running", "eyes")
     assert (detector.rate, detector.load, detector.wall, detector.drop_rate) == (2.5, 0.5, 0.75, 3.0)
     assert (detector.lag, detector.state) == (2.0, "dropping")
-    assert (planner.state, planner.host, planner.lag) == ("no answer", "", None)
+    assert (planner.state, planner.process, planner.lag) == ("no answer", "", None)
 
 
-def test_the_board_keeps_the_last_counts_of_a_host_that_is_away_and_takes_up_its_successor() -> None:
+def test_the_board_keeps_the_last_counts_of_a_process_that_is_away_and_takes_up_its_successor() -> None:
     board = Board(graph_with("camera"))
     board.update([status("eyes", camera=(10, 10, 2, 0, 10**9, 0))], 1.0)
 
@@ -309,9 +345,9 @@ def test_the_table_fits_a_terminal_of_80_columns() -> None:
     names = ["robot", "front_camera/depth_decoder", "trajectory_score", "detector"]
     board = Board(graph_with(*names))
     counts = dict.fromkeys(names, (12345678, 1, 1234567, 10**9, 10**18, 10**9))
-    board.update([HostStatus("perception_host", counts, dict.fromkeys(names, 12), frozenset())], 1.0)
+    board.update([ProcessStatus("perception_process", counts, dict.fromkeys(names, 12), frozenset())], 1.0)
     more = {name: (12345999, 1, 1239999, 10**10, 10**18 - 10**9 * k, 10**10) for k, name in enumerate(names)}
-    sample = board.update([HostStatus("perception_host", more, dict.fromkeys(names, 12), frozenset())], 2.0)
+    sample = board.update([ProcessStatus("perception_process", more, dict.fromkeys(names, 12), frozenset())], 2.0)
 
     lines = printed(sample, 80)
 

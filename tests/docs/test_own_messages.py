@@ -88,7 +88,7 @@ def test_it_is_recorded_and_drawn(recorded: Path) -> None:
 
 def test_it_is_replayed_compared_and_verified(recorded: Path, graph: Graph) -> None:
     again = recorded.with_name("again.mcap")
-    replay(recorded, placement="one_host", record=again)
+    replay(recorded, placement="one_process", record=again)
     with Recording(recorded) as a, Recording(again) as b:
         assert diff(a, b).same
     assert verify(recorded).identical

@@ -39,8 +39,8 @@ def test_tree_names_processes_operators_ports_types_and_streams(graph: Graph) ->
     text = out.getvalue()
     for node in graph.nodes.values():
         assert re.search(rf"── {node.name}  {node.use}", text)
-    for host in graph.hosts():
-        assert f"process {host}" in text
+    for process in graph.processes():
+        assert f"process {process}" in text
     assert re.search(r"in +depth +In\[TestDepth\] <- camera/depth", text)
     assert re.search(r"in +map +Sampled\[TestCloud\] <- mapper/map", text)
     assert re.search(r"in +poses +Batch\[TestPose\] <- odometry/pose", text)

@@ -63,7 +63,7 @@ operators:
     use: parts/front.yaml
     inputs: {picture: eye/image}
     params: {rate: 5}
-    process: front_host
+    process: front_process
   odometry: {use: "graph_operators:Odometry", inputs: {image: eye/image, map: front/cloud}}
 """
 
@@ -103,14 +103,21 @@ def test_a_file_resolves_to_streams_parameters_and_policies(tmp_path: Path) -> N
     assert graph.nodes["cloud"].make().stride == 4  # type: ignore[attr-defined]
 
 
-def test_hosts_follow_process_labels_unless_overridden() -> None:
+def test_processes_follow_process_labels_unless_overridden() -> None:
     graph = load_text(RGBD)
-    assert graph.hosts() == {"camera": ("camera",), "vision": ("cloud", "detector")}
-    assert graph.hosts("one_host") == {"all": ("camera", "cloud", "detector")}
-    assert graph.hosts("host_each") == {"camera": ("camera",), "cloud": ("cloud",), "detector": ("detector",)}
-    assert graph.hosts({"camera": "vision"}) == {"vision": ("camera", "cloud", "detector")}
+    assert graph.processes() == {"camera": ("camera",), "vision": ("cloud", "detector")}
+    assert graph.processes("one_process") == {"all": ("camera", "cloud", "detector")}
+    assert graph.processes("process_each") == {"camera": ("camera",), "cloud": ("cloud",), "detector": ("detector",)}
+    assert graph.processes({"camera": "vision"}) == {"vision": ("camera", "cloud", "detector")}
     with pytest.raises(ValueError, match="camra"):
-        graph.hosts({"camra": "x"})
+        graph.processes({"camra": "x"})
+
+
+@pytest.mark.parametrize(("former", "now"), [("one_host", "one_process"), ("host_each", "process_each")])
+def test_former_names_of_placements_still_work_and_say_so(former: str, now: str) -> None:
+    graph = load_text(RGBD)
+    with pytest.warns(DeprecationWarning, match=f"{former!r} is now {now!r}"):
+        assert graph.processes(former) == graph.processes(now)
 
 
 @pytest.mark.parametrize(
@@ -178,10 +185,10 @@ operators:
 def test_references_also_serve_names_keys_and_policies() -> None:
     graph = load_text("""\
 graph: g
-params: {host: vision, from: camera/image, wait: 5ms, size: 3}
+params: {place: vision, from: camera/image, wait: 5ms, size: 3}
 operators:
   camera: {use: "graph_operators:Camera"}
-  log: {use: "graph_operators:Log", inputs: {images: ${from}}, process: ${host}, live: {wait: ${wait}, size: ${size}}}
+  log: {use: "graph_operators:Log", inputs: {images: ${from}}, process: ${place}, live: {wait: ${wait}, size: ${size}}}
 """)
     log = graph.nodes["log"]
     assert log.inputs["images"] == ("g/camera/image",)
@@ -213,7 +220,7 @@ def test_nested_graph_takes_inputs_and_parameters_and_exports_outputs(tmp_path: 
     assert graph.nodes["front/cloud"].params["stride"] == 6
     assert graph.nodes["odometry"].inputs["map"] == ("outer/front/cloud/cloud",)
     assert graph.aliases == {"outer/front/cloud": "outer/front/cloud/cloud"}
-    assert graph.hosts()["front_host"] == ("front/camera", "front/cloud")
+    assert graph.processes()["front_process"] == ("front/camera", "front/cloud")
     assert (graph.nodes["front/cloud"].file, graph.nodes["front/cloud"].line) == ("parts/front.yaml", 7)
 
 

@@ -195,3 +195,13 @@ def test_a_module_that_does_not_declare_the_type_is_named(folder: Path) -> None:
         import_type("empty_types:Glimmer", "Glimmer")
     with pytest.raises(MessageError, match=r"'absent_types:Glimmer', which cannot be imported: ModuleNotFoundError"):
         import_type("absent_types:Glimmer", "Glimmer")
+
+
+def test_dtypes_are_the_objects_that_numpy_has_for_them() -> None:
+    """Decoders make arrays of a field's dtype, and the quick way into a message tells dtypes by identity."""
+    for cls in message_types().values():
+        again = Declaration.from_json(Declaration.of(cls).to_json())
+        for field in (*cls.FIELDS, *again.fields):
+            for dtype in getattr(field, "dtypes", ()):
+                assert dtype is np.dtype(dtype.str)
+                assert np.array([0], dtype).dtype is np.frombuffer(bytes(8), dtype).dtype

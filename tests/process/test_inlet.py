@@ -16,7 +16,7 @@ from dataflow.transport import Envelope, Kind, encode
 class Inflow:
     """An inlet, and what came out of it."""
 
-    def __init__(self, *, live: bool = True, static: tuple[str, ...] = ()) -> None:
+    def __init__(self, *, live: bool = True, static: tuple[str, ...] = (), from_start: bool = False) -> None:
         self.delivered: list[tuple[Kind, int]] = []
         self.printed: list[str] = []
         self.channel = RecordedChannel()
@@ -27,6 +27,7 @@ class Inflow:
             lambda stream, envelope: self.delivered.append((envelope.kind, envelope.seq)),
             static=static,
             live=live,
+            from_start=from_start,
             complaints=Complaints(lambda: self.now, lambda line: self.printed.append(line) is None),
         )
 
@@ -74,6 +75,17 @@ def test_a_gap_is_an_event_in_a_live_run_and_a_failure_in_any_other() -> None:
 def test_the_loss_of_the_last_messages_is_noticed_too() -> None:
     with pytest.raises(StreamDamaged, match="number 1 was due, 3 came"):
         Inflow(live=False).take(message(0), frontier(3, 1020), end(3, 1020))
+
+
+def test_messages_that_are_lost_before_the_first_are_a_gap_for_who_was_there_from_the_start() -> None:
+    lossy, late = Inflow(from_start=True), Inflow()
+
+    for inflow in (lossy, late):
+        inflow.take(message(4), message(5))
+        assert inflow.delivered == [(Kind.MESSAGE, 4), (Kind.MESSAGE, 5)]
+
+    assert lossy.channel.of("gap") == [{"stream": STREAM, "first": 0, "following": 4}]
+    assert not late.channel.of("gap")
 
 
 def test_a_stream_that_goes_back_fails_a_run_that_is_not_live() -> None:

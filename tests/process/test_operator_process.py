@@ -43,10 +43,8 @@ class OneProcess:
         graph = load_text(GRAPH.replace("OPERATOR", operator))
         self.inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self.channel = RecordedChannel()
-        config = ProcessConfig(
-            "last", graph.to_json(), ["last"], {}, [STREAM], [], [], "secret", live=live, firings=True
-        )
-        self.process = OperatorProcess(config, self.channel, self.inbox, box)  # type: ignore[arg-type]
+        config = ProcessConfig("last", graph.to_json(), ["last"], {}, [STREAM], [], live=live, firings=True)
+        self.process = OperatorProcess(config, self.channel, self.inbox, box=box)  # type: ignore[arg-type]
         self.process.make()
         for runner in self.process.runners.all:
             runner.setup()
@@ -173,7 +171,7 @@ def test_records_that_were_lost_on_their_way_are_sent_again(monkeypatch: pytest.
     one = OneProcess(live=True, box=memory)
     sent: list[Any] = []
     key = firings_key("test", "last")
-    monkeypatch.setattr(one.process.outlet, "_send", lambda at, data: sent.append(data) if at == key else None)
+    monkeypatch.setattr(one.process.outlet, "_send_bytes", lambda at, data: sent.append(data) if at == key else None)
     one.arrives(10, 20)
     one.process._take(0.0)
     one.process._work()

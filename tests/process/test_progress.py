@@ -71,3 +71,20 @@ def test_a_process_in_which_nothing_changed_says_nothing() -> None:
 
     assert one.told == [10]
     assert one.progress.next_due() is None
+
+
+def test_counts_that_a_busy_process_has_left_out_follow_when_it_is_idle() -> None:
+    one = Reporting()
+    one.fires(idle=False)
+    one.now += REPORT_EVERY
+    one.fires(idle=False)
+    assert ["last" in fields["counts"] for fields in one.channel.of("progress")] == [True, False]
+
+    one.now += REPORT_EVERY
+    one.progress.report(idle=True)
+
+    assert one.channel.of("progress")[-1]["counts"]["last"][0] == 2
+    assert one.progress.counted["last"][0] == 2
+    one.now += 1.0
+    one.progress.report(idle=True)
+    assert len(one.channel.of("progress")) == 3

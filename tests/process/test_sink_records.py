@@ -39,7 +39,7 @@ class Recorder:
     def __init__(self) -> None:
         graph = load_text(GRAPH)
         self.channel, self.stored = RecordedChannel(), Stored()
-        config = SinkConfig("@recorder", "record", graph.to_json(), [], ["camera", "last"], [], "secret", {}, live=True)
+        config = SinkConfig("@recorder", "record", graph.to_json(), [], ["camera", "last"], {}, live=True)
         inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self.process = SinkProcess(config, self.channel, inbox, lambda *_: self.stored)  # type: ignore[arg-type]
         self.process.sink = self.stored  # type: ignore[assignment]

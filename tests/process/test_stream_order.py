@@ -136,3 +136,31 @@ def test_an_end_after_a_jump_back_is_no_earlier_than_what_was_promised() -> None
 
     assert taken[-1] == end(2, 1010)
     assert order.take(message(2)).damaged
+
+
+def taken_by(envelopes: list[Envelope], *, shortcut: bool) -> list[object]:
+    """What becomes of envelopes in turn, with or without the short way for those that simply go on."""
+    order, found = StreamOrder(), []
+    for envelope in envelopes:
+        if shortcut and order.goes_on(envelope):
+            found.append(Verdict([envelope]))
+        else:
+            found.append(order.take(envelope))
+    return found
+
+
+KINDS = st.sampled_from([Kind.MESSAGE, Kind.MESSAGE, Kind.MESSAGE, Kind.FRONTIER, Kind.END])
+
+
+@given(st.lists(st.tuples(KINDS, st.integers(0, 1), st.integers(0, 5), st.integers(0, 12)), max_size=14))
+def test_the_short_way_for_what_simply_goes_on_decides_as_the_long_one(
+    places: list[tuple[Kind, int, int, int]],
+) -> None:
+    envelopes = [Envelope(kind, "a/b/c", incarnation, seq, stamp) for kind, incarnation, seq, stamp in places]
+    assert taken_by(envelopes, shortcut=True) == taken_by(envelopes, shortcut=False)
+
+
+def test_messages_that_follow_each_other_take_the_short_way() -> None:
+    order = StreamOrder()
+    order.take(Envelope(Kind.MESSAGE, "a/b/c", 0, 0, 10))
+    assert all(order.goes_on(Envelope(Kind.MESSAGE, "a/b/c", 0, seq, 10 + seq)) for seq in range(1, 5))

@@ -122,6 +122,12 @@ def chunks_that_expand_without_end() -> bytes:
     return unindexed(chunk(zeros_packed(size, head), size) * 60)
 
 
+def large_chunks_with_an_index() -> bytes:
+    size = 2**29 - 2**20
+    head = struct.pack("<BQHIQQ", 5, size - 9, 1, 0, 1, 1)
+    return unindexed((chunk(zeros_packed(size, head), size) + message_index([(1, 0)])) * 60)
+
+
 def zeros_in_lz4() -> bytes:
     return unindexed(chunk(lz4.frame.compress(bytes(2**27)), 2**27, "lz4") * 30)
 
@@ -186,6 +192,16 @@ def string_longer_than_the_file() -> bytes:
     return unindexed(record(12, struct.pack("<I", 2**32 - 1) + b"m"))
 
 
+def opened(path: Path, content: bytes) -> tuple[str, int]:
+    """Reads a file in a process of its own, with limits: what that says, and the megabytes that it took."""
+    path.write_bytes(content)
+    done = subprocess.run(
+        [sys.executable, "-c", OPEN, str(path)], capture_output=True, text=True, timeout=LIMIT_S, check=True
+    )
+    said, megabytes = done.stdout.splitlines()
+    return said, int(megabytes)
+
+
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
@@ -212,15 +228,17 @@ def string_longer_than_the_file() -> bytes:
 def test_a_file_made_to_do_harm_costs_little_and_is_named(
     make: Callable[[], bytes], expected: str, tmp_path: Path
 ) -> None:
-    path = tmp_path / "hostile.mcap"
-    path.write_bytes(make())
-    done = subprocess.run(
-        [sys.executable, "-c", OPEN, str(path)], capture_output=True, text=True, timeout=LIMIT_S, check=True
-    )
-    said, megabytes = done.stdout.splitlines()
+    said, megabytes = opened(tmp_path / "hostile.mcap", make())
     assert expected.format(chunk=len(BEGIN) + 9, record=len(BEGIN)) in said
-    assert said.startswith("read") or str(path) in said
-    assert int(megabytes) < 850
+    assert said.startswith("read") or "hostile.mcap" in said
+    assert megabytes < 850
+
+
+def test_large_messages_of_next_to_nothing_are_refused_at_the_second_though_they_are_indexed(tmp_path: Path) -> None:
+    said, megabytes = opened(tmp_path / "hostile.mcap", large_chunks_with_an_index())
+
+    assert "is one of 2 chunks that together expand from 32866 to 1071644672 bytes" in said
+    assert megabytes < 1100
 
 
 def test_checksums_of_chunks_are_held_against_them(tmp_path: Path) -> None:

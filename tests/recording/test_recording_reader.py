@@ -308,10 +308,10 @@ def test_a_type_that_is_not_declared_here_is_listed_and_raw(
     record: Callable[..., Path], pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = record([("a", pose(1)), ("b", Image(stamp=2, frame="c", data=[[1]]))])
-    import dataflow.recording.reader as reader
+    import dataflow.recording.streams as streams
 
-    known = {name: cls for name, cls in reader.message_types().items() if name != "Pose"}
-    monkeypatch.setattr(reader, "message_types", lambda: known)
+    known = {name: cls for name, cls in streams.message_types().items() if name != "Pose"}
+    monkeypatch.setattr(streams, "message_types", lambda: known)
     with Recording(path) as recording:
         assert recording.streams["a"].message_type is None
         assert [m.stream for m in recording.messages()] == ["b"]

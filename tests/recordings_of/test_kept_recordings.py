@@ -64,7 +64,7 @@ def test_the_kept_live_recording_holds_what_live_runs_do() -> None:
 
 
 def test_the_kept_run_replays_with_the_same_digests() -> None:
-    assert replay(HERE / "run.mcap", placement="one_host").digests() == DIGESTS["run.mcap"]
+    assert replay(HERE / "run.mcap", placement="one_process").digests() == DIGESTS["run.mcap"]
 
 
 @pytest.mark.parametrize("file", FILES)

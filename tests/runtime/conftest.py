@@ -1,4 +1,4 @@
-"""Makes the test operators importable, here and in host processes, and watches for leftovers."""
+"""Makes the test operators importable, here and in processes, and watches for leftovers."""
 
 from __future__ import annotations
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 
 import numpy as np
 from runtime_operators import number, value
@@ -93,3 +96,57 @@ class Noise(Source):
         for k in range(self.count):
             noise = np.random.default_rng(k).random(4096, np.float32)
             yield {"fast": value(10**9 + k * 10**7, k, *noise.tolist())}
+
+
+class Large(Source):
+    """1 MB a message, 200 a second; the first number counts."""
+
+    fast: Out[FeatureVector]
+    count: int = Param(100, ge=1, doc="how many")
+
+    def stream(self) -> Iterator[Mapping[str, Message]]:
+        for k in range(self.count):
+            stamp = 10**9 + k * 5_000_000
+            yield {"fast": FeatureVector(stamp=stamp, vectors=np.full((1, 1 << 18), k, np.float32), model="test")}
+
+
+class Counting(Operator):
+    """Counts what it gets."""
+
+    x: In[FeatureVector]
+
+    def setup(self) -> None:
+        self.count = 0
+
+    def process(self, x: FeatureVector) -> None:
+        self.count += 1
+        self.take(int(x.vectors[0, 0]))
+
+    def take(self, number: int) -> None:
+        """Does what is to be done at a message."""
+
+    def summary(self) -> Mapping[str, float]:
+        return {"count": self.count}
+
+
+class Stopped(Counting):
+    """Stops its own process (SIGSTOP) at one message."""
+
+    at: int = Param(20, doc="the number of the message")
+    file: str = Param(doc="where it writes the number of its process")
+
+    def take(self, number: int) -> None:
+        if number == self.at:
+            Path(self.file).write_text(str(os.getpid()))
+            os.kill(os.getpid(), signal.SIGSTOP)
+
+
+class Waker(Counting):
+    """Lets the process of `Stopped` go on."""
+
+    at: int = Param(300, doc="the number of the message at which it does")
+    file: str = Param(doc="where the number of that process is")
+
+    def take(self, number: int) -> None:
+        if number == self.at:
+            os.kill(int(Path(self.file).read_text()), signal.SIGCONT)

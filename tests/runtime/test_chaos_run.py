@@ -37,7 +37,7 @@ PLAN = {
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-@pytest.mark.parametrize("placement", ["one_host", "host_each"])
+@pytest.mark.parametrize("placement", ["one_process", "process_each"])
 def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
     placement: str, seed: int, tmp_path: Path
 ) -> None:
@@ -55,7 +55,7 @@ def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
         assert faults
         tuned = list(recorded_firings(recording, "tuned"))
         diagnosed = [r.message for r in recording.messages([diagnostics_key("test")])]
-    verified = verify(path, placement="one_host" if placement == "host_each" else "host_each")
+    verified = verify(path, jobs=1 if placement == "process_each" else None)
     assert verified.identical, verified.as_json()
     assert {v.operator for v in verified.operators} == {"mix", "slow", "smooth", "merge", "tuned", "sum"}
     assert len({r.detail["value"] for r in tuned if r.kind == "param"}) > 1  # so they were changed, and repeated
@@ -68,7 +68,7 @@ def test_a_parameter_that_is_changed_changes_what_comes_after_and_is_repeated(tm
     graph = load_graph(HERE / "chaos.yaml", settings=["count=60"], live=True)
     plan = {"faults": [{"kind": "param", "operator": "tuned", "name": "factor", "values": [0.0], "at": "200ms"}]}
 
-    run(graph, live=True, placement="one_host", record=path, faults=plan_of(plan, graph))
+    run(graph, live=True, placement="one_process", record=path, faults=plan_of(plan, graph))
 
     with Recording(path) as recording:
         records = list(recorded_firings(recording, "tuned"))
@@ -79,4 +79,4 @@ def test_a_parameter_that_is_changed_changes_what_comes_after_and_is_repeated(tm
     assert 0 < before < len(numbers)
     assert len(set(numbers[: before - 1])) > 1
     assert set(numbers[before:]) == {numbers[before - 1]}  # nothing is added with a weight of nothing
-    assert verify(path, placement="host_each").identical
+    assert verify(path).identical

@@ -37,7 +37,7 @@ def fails(graph: Graph, **options: object) -> RunFailed:
     return caught.value
 
 
-@pytest.mark.parametrize("placement", ["one_host", "host_each"])
+@pytest.mark.parametrize("placement", ["one_process", "process_each"])
 def test_an_operator_that_raises_is_named_with_its_traceback(placement: str) -> None:
     failure = fails(broken("raise"), placement=placement)
 
@@ -55,20 +55,20 @@ def test_an_operator_that_raises_is_named_with_its_traceback(placement: str) -> 
     ],
 )
 def test_a_broken_contract_is_named(how: str, words: str) -> None:
-    failure = fails(broken(how), placement="one_host", paranoid=True)
+    failure = fails(broken(how), placement="one_process", paranoid=True)
 
     assert failure.operator == "bad"
     assert words in str(failure)
 
 
 def test_an_operator_that_exits_is_named_as_one_that_raises() -> None:
-    failure = fails(broken("exit"), placement="host_each")
+    failure = fails(broken("exit"), placement="process_each")
 
     assert failure.operator == "bad"
     assert "in fire at stamp 1200000000: SystemExit: enough" in str(failure)
 
 
-def test_what_operators_start_ends_with_their_host_and_holds_nobody_up() -> None:
+def test_what_operators_start_ends_with_their_process_and_holds_nobody_up() -> None:
     lines: list[str] = []
 
     Supervisor(RunPlan(broken("children")), on_output=lambda label, line: lines.append(line)).run()
@@ -80,14 +80,14 @@ def test_what_operators_start_ends_with_their_host_and_holds_nobody_up() -> None
         time.sleep(0.02)
 
 
-def test_a_daemon_that_an_operator_leaves_is_named_and_ends_with_its_host() -> None:
+def test_a_daemon_that_an_operator_leaves_is_named_and_ends_with_its_process() -> None:
     lines: list[str] = []
 
     report = Supervisor(RunPlan(broken("daemon")), on_output=lambda label, line: lines.append(line)).run()
 
     left = int(next(line for line in lines if "left behind" in line).rpartition(" ")[2])
     (note,) = report.notes
-    assert note.startswith("host 'bad' left processes behind, which were killed: ")
+    assert note.startswith("process 'bad' left processes behind, which were killed: ")
     assert note.endswith(f"(process {left})")
     assert not psutil.pid_exists(left)
 
@@ -95,7 +95,7 @@ def test_a_daemon_that_an_operator_leaves_is_named_and_ends_with_its_host() -> N
 def test_a_source_that_is_stopped_runs_its_finally(tmp_path: Path) -> None:
     note = tmp_path / "note"
     graph = chain(f"tidy: {{use: runtime_operators:Tidy, params: {{note: {note}}}}}")
-    supervisor = Supervisor(RunPlan(graph, placement="host_each"))
+    supervisor = Supervisor(RunPlan(graph, placement="process_each"))
 
     def stop() -> None:
         while supervisor.status.phase == "starting":
@@ -109,22 +109,22 @@ def test_a_source_that_is_stopped_runs_its_finally(tmp_path: Path) -> None:
     assert note.read_text() == "device released"
 
 
-def test_a_host_that_dies_is_named_with_the_signal_and_how_far_it_was() -> None:
-    failure = fails(broken("die"), placement="host_each")
+def test_a_process_that_dies_is_named_with_the_signal_and_how_far_it_was() -> None:
+    failure = fails(broken("die"), placement="process_each")
 
-    assert "host 'bad' was killed by SIGKILL while running" in str(failure)
+    assert "process 'bad' was killed by SIGKILL while running" in str(failure)
 
 
 def test_an_operator_that_hangs_ends_the_run_within_the_stall_timeout() -> None:
-    failure = fails(broken("hang"), placement="host_each", stall_timeout=1.0)
+    failure = fails(broken("hang"), placement="process_each", stall_timeout=1.0)
 
-    assert "no progress for 1 s; still busy: host 'bad'" in str(failure)
+    assert "no progress for 1 s; still busy: process 'bad'" in str(failure)
 
 
 def test_a_failure_leaves_a_recording_that_says_so(tmp_path: Path) -> None:
     path = tmp_path / "failed.mcap"
 
-    fails(broken("raise"), record=path, placement="host_each")
+    fails(broken("raise"), record=path, placement="process_each")
 
     with Recording(path) as recording:
         assert recording.metadata["dataflow:outcome"]["outcome"].startswith("failed: operator 'bad'")
@@ -158,7 +158,7 @@ def unexplained(path: Path) -> dict[str, int]:
     [
         (False, "raise"),
         (True, "raise"),
-        (True, "die"),  # the supervisor holds what its host had not sent
+        (True, "die"),  # the supervisor holds what its process had not sent
     ],
 )
 def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: str, tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_after_a_failure_every_recorded_message_is_explained(live: bool, how: st
     )
 
     with pytest.raises(RunFailed):
-        Supervisor(RunPlan(graph, record=path, placement="host_each", live=live)).run()
+        Supervisor(RunPlan(graph, record=path, placement="process_each", live=live)).run()
 
     lost = unexplained(path)
     assert {"test/left/fast", "test/bad/y", "test/smooth/mean", "test/merge/seen"} <= set(lost)
@@ -205,13 +205,13 @@ class Running:
         self.folder = cwd
         self.family: list[psutil.Process] = []
 
-    def until_running(self, hosts: int) -> None:
-        """Waits until all host processes exist and sources are released."""
+    def until_running(self, processes: int) -> None:
+        """Waits until all processes exist and sources are released."""
         deadline = time.monotonic() + 30
         me = psutil.Process(self.process.pid)
         while time.monotonic() < deadline:
             self.family = me.children(recursive=True)
-            if len(self.family) >= hosts + 1 and any((self.folder / "dataflow").glob("*.json")):
+            if len(self.family) >= processes + 1 and any((self.folder / "dataflow").glob("*.json")):
                 return
             time.sleep(0.05)
         raise AssertionError("the graph did not start")
@@ -239,7 +239,7 @@ operators:
 def long_run(tmp_path: Path) -> Running:
     (tmp_path / "long.yaml").write_text(GRAPH)
     running = Running("run", "long.yaml", "--record", "run.mcap", "-q", cwd=tmp_path)
-    running.until_running(hosts=4)
+    running.until_running(processes=4)
     return running
 
 
@@ -268,7 +268,7 @@ def test_killing_the_supervisor_leaves_no_process_and_a_readable_recording(long_
 
 
 @pytest.mark.parametrize("victim", ["recorder", "operator"])
-def test_killing_a_host_ends_the_run_and_names_it(long_run: Running, tmp_path: Path, victim: str) -> None:
+def test_killing_a_process_ends_the_run_and_names_it(long_run: Running, tmp_path: Path, victim: str) -> None:
     time.sleep(1.2)
     recorder = [p for p in long_run.family if any(f.path.endswith("run.mcap") for f in p.open_files())]
     others = [p for p in long_run.family if p.children() == [] and p not in recorder]
@@ -286,7 +286,9 @@ def test_killing_a_host_ends_the_run_and_names_it(long_run: Running, tmp_path: P
 def test_nothing_is_left_in_shared_memory(tmp_path: Path) -> None:
     before = set(os.listdir("/dev/shm")) if Path("/dev/shm").is_dir() else set()
 
-    Supervisor(RunPlan(chain("sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}"), placement="host_each")).run()
+    Supervisor(
+        RunPlan(chain("sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}"), placement="process_each")
+    ).run()
 
     assert {n for n in (os.listdir("/dev/shm") if before else []) if "dataflow" in n or "zenoh" in n} <= before
     assert threading.active_count() < 20

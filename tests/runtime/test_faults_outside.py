@@ -1,31 +1,26 @@
-"""Faults outside the operators: a full disk, a viewer that dies, a link between two hosts that breaks."""
+"""Faults outside the operators: a full disk, a viewer that dies, a process that is stopped, slow subscribers."""
 
 from __future__ import annotations
 
 import os
 import resource
-import select
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 from background_run import Background
 
 from dataflow.client.attach import find_running
-from dataflow.graph import Graph, load_graph
+from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.records.reading import recorded_firings
-from dataflow.supervision.plan import RunPlan
-from dataflow.supervision.report import RunReport
-from dataflow.supervision.supervisor import Supervisor
+from dataflow.supervision.run import run
+from dataflow.transport import Envelope, Kind, NetworkConfig, decode
 from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
@@ -120,7 +115,7 @@ def test_a_disk_that_is_full_ends_the_run_and_the_recording_stays_readable(tmp_p
 
 def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
     graph = load_graph(graph_file(tmp_path, count=250), live=True)
-    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="host_each")
+    running = Background(graph, live=True, record=tmp_path / "run.mcap", placement="process_each")
     find_running("outside", wait=30)
     viewer = subprocess.Popen(
         [sys.executable, "-m", "dataflow.cli.main", "echo", "--json"],
@@ -137,148 +132,112 @@ def test_a_viewer_that_is_killed_is_not_missed(tmp_path: Path) -> None:
 
     assert report.summaries["sum"]["count"] == 250
     assert not report.restarts
-    assert verify(tmp_path / "run.mcap", placement="one_host").identical
+    assert verify(tmp_path / "run.mcap", jobs=1).identical
 
 
-# A link that is lost
+# A process that is stopped
 
 
-class Link:
-    """A wire between two hosts, for a test to cut: a proxy in front of `endpoint`, a Unix socket."""
-
-    def __init__(self, endpoint: str) -> None:
-        self._to = endpoint.removeprefix("unixsock-stream/")
-        self._server = socket.socket(socket.AF_UNIX)
-        self._server.bind(f"{self._to}.wire")
-        self._server.listen()
-        self.endpoint = f"{endpoint}.wire"
-        self.whole = True
-        self.carried = 0
-        self.cuts = 0
-        self._over = False
-        self._pairs: dict[socket.socket, socket.socket] = {}
-        self._thread = threading.Thread(target=self._carry, daemon=True)
-        self._thread.start()
-
-    def _carry(self) -> None:
-        while not self._over:
-            able, _, _ = select.select([self._server, *self._pairs], [], [], 0.02)
-            if not self.whole:
-                self._drop()
-            for end in able:
-                if end is self._server:
-                    self._accept()
-                elif end in self._pairs:
-                    self._pass(end)
-
-    def _accept(self) -> None:
-        near, _ = self._server.accept()
-        try:
-            if not self.whole:
-                raise ConnectionError("the wire is cut")
-            far = socket.socket(socket.AF_UNIX)
-            far.connect(self._to)
-        except OSError:  # nobody is there (any more)
-            near.close()
-        else:
-            self._pairs |= {near: far, far: near}
-
-    def _pass(self, end: socket.socket) -> None:
-        try:
-            data = end.recv(1 << 16)
-            if data:
-                self._pairs[end].sendall(data)
-                self.carried += len(data)
-                return
-        except OSError:
-            pass  # either end is gone: so is the connection
-        self._close(end)
-
-    def _close(self, end: socket.socket) -> None:
-        for each in (end, self._pairs.pop(end)):
-            self._pairs.pop(each, None)
-            each.close()
-
-    def _drop(self) -> None:
-        while self._pairs:
-            self.cuts += 1
-            self._close(next(iter(self._pairs)))
-
-    def end(self) -> None:
-        self._over = True
-        self._thread.join(5)
-        self.whole = False
-        self._drop()
-        self._server.close()
+STOPPED = """\
+graph: outside
+namespace: test
+operators:
+  left: {use: faulty_operators:Large, params: {count: COUNT}}
+  stopped:
+    use: faulty_operators:Stopped
+    inputs: {x: left/fast}
+    params: {at: 20, file: "FILE"}
+    live: {queue: newest, size: 10}
+  waker:
+    use: faulty_operators:Waker
+    inputs: {x: left/fast}
+    params: {at: 320, file: "FILE"}
+    live: {queue: newest, size: 1000}
+"""
 
 
-@pytest.fixture
-def links() -> Iterator[list[Link]]:
-    made: list[Link] = []
-    yield made
-    for link in made:
-        link.end()
+def test_a_stopped_consumer_costs_its_producer_and_other_consumers_nothing_and_its_loss_is_counted(
+    tmp_path: Path,
+) -> None:
+    """Messages of 1 MB: what it does not take is more than the memory that large messages lie in."""
+    path = tmp_path / "outside.yaml"
+    path.write_text(STOPPED.replace("COUNT", "360").replace("FILE", str(tmp_path / "pid")))
+
+    report = run(load_graph(path, live=True), live=True, placement="process_each")
+
+    assert report.summaries["waker"]["count"] == 360, report.drops
+    assert "left" not in report.drops
+    assert report.transport["left"]["shared_full"] == 0
+    reasons = {why: n for _, why, n in report.drops["stopped"]}
+    assert reasons["missed"] >= 50
+    assert report.summaries["stopped"]["count"] + sum(reasons.values()) == 360
+    assert not report.restarts
 
 
-def run_with_a_cut(label: str, graph: Graph, path: Path, links: list[Link]) -> RunReport:
-    """A live run, a host each, in which every link to the process `label` is cut for half a second."""
-    supervisor = Supervisor(RunPlan(graph, live=True, placement="host_each", record=path))
-    _, config = supervisor.core.run.configs[label]
-    links.extend(Link(endpoint) for endpoint in config["connect"])
-    config["connect"] = [link.endpoint for link in links]
-    reports: list[RunReport] = []
-    thread = threading.Thread(target=lambda: reports.append(supervisor.run()))
-    thread.start()
+# Subscribers from outside
+
+
+class Outside:
+    """A plain Zenoh program that subscribes to all streams of a running graph. `slow`: it takes nothing any more."""
+
+    def __init__(self, *, slow: bool) -> None:
+        self.seen: dict[str, list[Envelope]] = {}
+        self._end = threading.Event()
+        found = find_running("outside", wait=30)
+        self._session = zenoh.open(NetworkConfig(connect=found.endpoints).zenoh_config())
+        take = self._wait if slow else self._take
+        self._session.declare_subscriber("test/**", zenoh.handlers.Callback(take, indirect=False))
+
+    def _wait(self, sample: zenoh.Sample) -> None:
+        self._end.wait()
+
+    def _take(self, sample: zenoh.Sample) -> None:
+        self.seen.setdefault(str(sample.key_expr), []).append(decode(bytes(sample.payload)))
+
+    def close(self) -> None:
+        self._end.set()
+        self._session.close()
+
+
+@pytest.mark.parametrize("live", [False, True])
+def test_a_plain_subscriber_gets_every_message_in_the_documented_envelope(tmp_path: Path, live: bool) -> None:
+    graph = load_graph(graph_file(tmp_path, count=150), live=live)
+    running = Background(graph, live=live, rate=1.0, record=tmp_path / "run.mcap", placement="process_each")
+    outside = Outside(slow=False)
     try:
-        find_running("outside", wait=30)
-        time.sleep(0.5)
-        for link in links:
-            link.whole = False
-        time.sleep(0.5)
-        for link in links:
-            link.whole = True
+        running.end()
     finally:
-        thread.join(60)
-    assert sum(link.cuts for link in links) >= 1
-    (report,) = reports
-    return report
+        outside.close()
+    with Recording(tmp_path / "run.mcap") as recording:
+        for stream in ("test/left/fast", "test/smooth/mean"):
+            stored = {r.message.stamp: r.message.digest() for r in recording.messages([stream])}
+            seen = outside.seen[stream]
+            messages = [envelope.message for envelope in seen if envelope.message is not None]
+            numbers = [envelope.seq for envelope in seen if envelope.message is not None]
+            assert numbers == list(range(numbers[0], len(stored)))  # all, from when it subscribed
+            assert [m.digest() for m in messages] == [stored[m.stamp] for m in messages]
+            assert seen[-1].kind is Kind.END
 
 
-def gaps_in(path: Path) -> list[Mapping[str, Any]]:
-    with Recording(path) as recording:
-        return [event.data for event in recording.events() if event.name == "gap"]
+def test_a_slow_subscriber_from_outside_costs_nobody_anything(tmp_path: Path) -> None:
+    """Messages of 1 MB: it blocks what publishes to it at once."""
+    path = tmp_path / "outside.yaml"
+    path.write_text(STOPPED.replace("COUNT", "250").replace("at: 20", "at: -1").replace("FILE", str(tmp_path / "pid")))
+    running = Background(load_graph(path, live=True), live=True, placement="process_each")
+    outside = Outside(slow=True)
+    try:
+        report = running.end()
+    finally:
+        outside.close()
+    assert report.summaries["waker"]["count"] == 250
+    assert "left" not in report.drops
+    assert report.summaries["stopped"]["count"] + sum(n for *_, n in report.drops.get("stopped", ())) == 250
 
 
-def test_a_link_that_is_lost_and_restored_loses_messages_but_neither_the_run_nor_the_proof(
-    tmp_path: Path, links: list[Link]
-) -> None:
-    """The link from `left` to `smooth`; everything else stays connected."""
-    graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
+def test_nothing_is_published_while_nobody_listens(tmp_path: Path) -> None:
+    report = run(load_graph(graph_file(tmp_path, count=20)), placement="process_each")
 
-    report = run_with_a_cut("smooth", graph, path, links)
-
-    assert report.summaries["sum"]["count"] == 300  # whose link was whole
-    gaps = gaps_in(path)
-    assert [(gap["stream"], gap["taker"]) for gap in gaps] == [("test/left/fast", "smooth")]
-    (gap,) = gaps
-    assert 0 < gap["following"] - gap["first"] < 299  # it came back
-    verified = verify(path, graph=graph, placement="one_host")
-    assert verified.identical, verified.as_json()
-
-
-def test_a_recorder_that_was_cut_off_has_every_firing_record_and_its_gaps_are_said(
-    tmp_path: Path, links: list[Link]
-) -> None:
-    graph, path = load_graph(graph_file(tmp_path, count=300), live=True), tmp_path / "run.mcap"
-
-    run_with_a_cut("@recorder", graph, path, links)
-
-    assert {gap["taker"] for gap in gaps_in(path)} == {"@recorder"}
-    with Recording(path) as recording:
-        for operator in graph.nodes:
-            indices = sorted(record.index for record in recorded_firings(recording, operator))
-            assert indices == list(range(len(indices))), operator
-    verified = verify(path, graph=graph, placement="one_host")
-    assert not verified.identical
-    assert not any(v.lost_records or v.unaccounted or v.unfinished for v in verified.operators)
-    assert all(v.verdict == "unverifiable" and v.unverifiable for v in verified.operators)
+    assert {label: counts["published_messages"] for label, counts in report.transport.items()} == dict.fromkeys(
+        ("left", "smooth", "sum"), 0
+    )
+    assert report.transport["smooth"]["received_messages"] >= 20

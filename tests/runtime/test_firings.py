@@ -142,7 +142,7 @@ SPEC = AlignSpec(
 
 
 def live_firings(seed: int) -> tuple[list[Firing], dict[str, list[Entry]]]:
-    """Firings of an aligner whose frontiers are forced at random moments, as a live host does, and all messages."""
+    """Firings of an aligner whose frontiers are forced at random moments, as a live process does, and all messages."""
     dice = random.Random(seed)
     streams = {
         name: [

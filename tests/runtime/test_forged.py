@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import pytest
@@ -43,7 +42,7 @@ def test_forged_ends_frontiers_and_messages_change_nothing(tmp_path: Path, live:
         "sum: {use: runtime_operators:Sum, inputs: {x: smooth/mean}}",
         count=100,
     )
-    undisturbed = run(graph, placement="one_host")
+    undisturbed = run(graph, placement="one_process")
     path = tmp_path / "run.mcap"
     running = Background(graph, record=path, live=live)
     found = find_running("chain", wait=30)
@@ -51,14 +50,12 @@ def test_forged_ends_frontiers_and_messages_change_nothing(tmp_path: Path, live:
     try:
         for key in KEYS:
             publisher = forger.declare_publisher(key)
-            while not publisher.matching_status.matching:
-                time.sleep(0.001)
+            assert not publisher.matching_status.matching  # no process of the run subscribes to a stream's key
             for payload in forged(key):
                 publisher.put(payload)
     finally:
         forger.close()
         report = running.end()
-    assert sum(counts["foreign"] for counts in report.transport.values()) == 2 * len(forged(KEYS[0]))
     assert report.summaries == undisturbed.summaries
     assert report.streams == undisturbed.streams or live
-    assert verify(path, placement="one_host").identical
+    assert verify(path, jobs=1).identical

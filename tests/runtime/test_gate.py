@@ -285,7 +285,7 @@ def test_a_folder_stands_for_all_its_recordings_each_once(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "error", [ReplayError("no sensors"), RunFailed("host died", "its last words"), KeyError("a fault of ours")]
+    "error", [ReplayError("no sensors"), RunFailed("process died", "its last words"), KeyError("a fault of ours")]
 )
 def test_whatever_goes_wrong_with_one_recording_is_its_own_result(error: Exception) -> None:
     def broken(path: Path) -> VerifyReport:

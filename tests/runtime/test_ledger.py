@@ -27,7 +27,7 @@ HERE = Path(__file__).resolve().parent
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("ledger") / "run.mcap"
-    run(load_graph(HERE / "mixed.yaml", settings=["count=60"]), placement="one_host", record=path)
+    run(load_graph(HERE / "mixed.yaml", settings=["count=60"]), placement="one_process", record=path)
     return path
 
 

@@ -45,9 +45,9 @@ def test_sources_wait_for_those_that_drop_nothing_and_depend_on_none_that_does()
 
 
 def test_an_operator_that_drops_frees_what_shares_its_process() -> None:
-    hosts = [["left", "slow", "mix"], ["right", "merge", "exact"], ["after"], ["last"]]
+    processes = [["left", "slow", "mix"], ["right", "merge", "exact"], ["after"], ["last"]]
 
-    assert waited_for(graph(), hosts) == {"exact", "merge"}
+    assert waited_for(graph(), processes) == {"exact", "merge"}
 
 
 def test_an_operator_is_behind_by_what_its_sources_have_given() -> None:

@@ -20,7 +20,7 @@ HERE = Path(__file__).resolve().parent
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("middle") / "run.mcap"
-    run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_host", record=path)
+    run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_process", record=path)
     return path
 
 
@@ -36,7 +36,7 @@ def messages(path: Path) -> dict[str, dict[int, bytes]]:
 def test_a_replay_from_the_middle_makes_what_the_whole_one_makes_there(recorded: Path, tmp_path: Path) -> None:
     again = tmp_path / "again.mcap"
 
-    replay(recorded, start=0.5, placement="host_each", record=again)
+    replay(recorded, start=0.5, placement="process_each", record=again)
 
     whole, part = messages(recorded), messages(again)
     assert part["test/tuned/y"]
@@ -46,7 +46,7 @@ def test_a_replay_from_the_middle_makes_what_the_whole_one_makes_there(recorded:
 
 
 def test_verification_from_the_middle_takes_up_recorded_states(recorded: Path) -> None:
-    whole = {v.operator: v for v in verify(recorded, placement="one_host").operators}
+    whole = {v.operator: v for v in verify(recorded, jobs=1).operators}
 
     report = verify(recorded, start=0.5)
 
@@ -80,7 +80,7 @@ def test_a_middle_after_a_restart_has_the_parameters_with_which_it_was_started_a
             {"kind": "param", "operator": "tuned", "name": "factor", "values": [2.0], "at": "1s"},
         ]
     }
-    run(graph, live=True, placement="one_host", record=path, faults=plan_of(plan, graph), rate=1.0)
+    run(graph, live=True, placement="one_process", record=path, faults=plan_of(plan, graph), rate=1.0)
 
     report = verify(path, start=1.2, only="tuned")
 

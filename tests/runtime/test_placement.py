@@ -43,22 +43,22 @@ def busy_cores(count: int = 2, seconds: float = 60.0) -> Iterator[None]:
 
 
 def groupings(graph: Graph, count: int, seed: int) -> list[dict[str, str]]:
-    """Random assignments of operators to at most four hosts."""
+    """Random assignments of operators to at most four processes."""
     dice = random.Random(seed)
-    return [{node: f"host{dice.randrange(1, 5)}" for node in graph.nodes} for _ in range(count)]
+    return [{node: f"process{dice.randrange(1, 5)}" for node in graph.nodes} for _ in range(count)]
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """A recorded run in a host each, and its digests."""
+    """A recorded run in a process each, and its digests."""
     path = tmp_path_factory.mktemp("recorded") / "run.mcap"
-    report = run(load_graph(HERE / "mixed.yaml"), placement="host_each", record=path, paranoid=True)
+    report = run(load_graph(HERE / "mixed.yaml"), placement="process_each", record=path, paranoid=True)
     return path, report.digests()
 
 
-def test_a_run_gives_the_same_digests_in_one_host_and_in_a_host_each(mixed: Graph) -> None:
-    together = run(mixed, placement="one_host")
-    apart = run(mixed, placement="host_each")
+def test_a_run_gives_the_same_digests_in_one_process_and_in_a_process_each(mixed: Graph) -> None:
+    together = run(mixed, placement="one_process")
+    apart = run(mixed, placement="process_each")
 
     assert together.digests() == apart.digests()
     assert set(together.streams) == set(mixed.streams)
@@ -71,7 +71,7 @@ def test_replay_gives_the_digests_of_the_run_in_every_placement(recording: tuple
     path, expected = recording
     graph = load_graph(HERE / "mixed.yaml")
 
-    for placement in ("one_host", "host_each", *groupings(graph, 2, seed=7)):
+    for placement in ("one_process", "process_each", *groupings(graph, 2, seed=7)):
         assert replay(path, placement=placement).digests() == expected, placement
 
 
@@ -82,7 +82,7 @@ def test_replay_gives_the_same_digests_on_loaded_cores_with_operators_that_sleep
     graph = load_graph(HERE / "mixed.yaml", settings=["sleep=0.004"])
 
     with busy_cores():
-        assert replay(path, graph=graph, placement="host_each").digests() == expected
+        assert replay(path, graph=graph, placement="process_each").digests() == expected
 
 
 @pytest.mark.parametrize("window", [(1, 1), (3, 1 << 20)])
@@ -128,18 +128,18 @@ def test_the_window_grows_when_the_graph_must_look_further_ahead() -> None:
 def test_large_messages_arrive_whole(mixed: Graph) -> None:
     graph = load_graph(HERE / "mixed.yaml", settings=["count=20", "padding=300000"])
 
-    assert run(graph, placement="one_host").digests() == run(graph, placement="host_each").digests()
+    assert run(graph, placement="one_process").digests() == run(graph, placement="process_each").digests()
 
 
-def test_operators_of_nested_graphs_run_in_hosts_of_their_own_and_are_seen_by_tools(
+def test_operators_of_nested_graphs_run_in_processes_of_their_own_and_are_seen_by_tools(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     graph = load_graph(HERE / "outer.yaml")
 
-    together = run(graph, placement="one_host")
-    apart = run(graph, placement="host_each", record=tmp_path / "run.mcap")
+    together = run(graph, placement="one_process")
+    apart = run(graph, placement="process_each", record=tmp_path / "run.mcap")
 
     assert together.digests() == apart.digests()
     assert apart.streams["fleet/robot1/front/counter/constant"][0] == 1
-    assert replay(tmp_path / "run.mcap", placement="host_each").digests() == apart.digests()
+    assert replay(tmp_path / "run.mcap", placement="process_each").digests() == apart.digests()

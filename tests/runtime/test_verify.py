@@ -22,7 +22,7 @@ HERE = Path(__file__).resolve().parent
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("verify") / "run.mcap"
-    run(load_graph(HERE / "mixed.yaml"), placement="host_each", record=path)
+    run(load_graph(HERE / "mixed.yaml"), placement="process_each", record=path)
     return path
 
 
@@ -57,7 +57,7 @@ def thin(tmp_path_factory: pytest.TempPathFactory) -> Path:
     graph = load_graph(HERE / "mixed.yaml")
     sensors = tuple(s for s, made in graph.streams.items() if graph.nodes[made.node].source)
     path = tmp_path_factory.mktemp("thin") / "run.mcap"
-    run(replace(graph, record=replace(graph.record, streams=sensors)), placement="one_host", record=path)
+    run(replace(graph, record=replace(graph.record, streams=sensors)), placement="one_process", record=path)
     return path
 
 

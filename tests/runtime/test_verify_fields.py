@@ -22,7 +22,7 @@ SETTINGS = ["count=30"]
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("fields") / "run.mcap"
-    run(load_graph(HERE / "mixed.yaml", settings=SETTINGS), placement="one_host", record=path)
+    run(load_graph(HERE / "mixed.yaml", settings=SETTINGS), placement="one_process", record=path)
     return path
 
 
@@ -115,7 +115,7 @@ def test_without_recorded_outputs_only_digests_are_compared_and_it_says_so(tmp_p
     graph = load_graph(HERE / "mixed.yaml", settings=SETTINGS)
     sensors = tuple(s for s, made in graph.streams.items() if graph.nodes[made.node].source)
     path = tmp_path / "thin.mcap"
-    run(replace(graph, record=replace(graph.record, streams=sensors)), placement="one_host", record=path)
+    run(replace(graph, record=replace(graph.record, streams=sensors)), placement="one_process", record=path)
 
     report = verified(path, "Nudged")
 
@@ -147,7 +147,7 @@ def test_facts_that_differ_from_the_recording_are_named_with_both_values(
     assert found["threads OMP_NUM_THREADS"] == ("1", "8")
 
 
-def test_the_facts_hold_the_threads_of_the_hosts_and_the_gpus_of_the_driver(
+def test_the_facts_hold_the_threads_of_the_processes_and_the_gpus_of_the_driver(
     recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from dataflow.recording import facts

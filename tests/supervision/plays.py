@@ -14,7 +14,7 @@ from dataflow.supervision.commands import Command, Over, Send, Signal, Spawn
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.events import Begin, Died, Event, Moment, Remained, Said, StopAsked, Tick
-from dataflow.supervision.plan import RunPlan, host_plans
+from dataflow.supervision.plan import RunPlan, process_plans
 
 WALL = 1_700_000_000.0
 STEP = 0.05
@@ -35,10 +35,10 @@ class Play:
 
     def __init__(self, *operators: str, live: bool = False, **options: Any) -> None:
         graph = graph_of(*(operators or (LEFT, SUM)))
-        self.plan = RunPlan(graph, live=live, **{"placement": "host_each"} | options)
-        self.hosts = host_plans(self.plan)
-        endpoints = {label: f"tcp/127.0.0.1:{7000 + k}" for k, label in enumerate(self.hosts)}
-        self.core = core_of(self.plan, self.hosts, configurations(self.plan, self.hosts, endpoints, "secret"))
+        self.plan = RunPlan(graph, live=live, **{"placement": "process_each"} | options)
+        self.processes = process_plans(self.plan)
+        endpoints = {label: f"tcp/127.0.0.1:{7000 + k}" for k, label in enumerate(self.processes)}
+        self.core = core_of(self.plan, self.processes, configurations(self.plan, self.processes, endpoints))
         self.now = 100.0
         self.commands: list[Command] = []
         self.over: Over | None = None
@@ -72,7 +72,7 @@ class Play:
         while self.now < until and self.over is None:
             self.now += STEP
             if self.beating and self.core.run.under_way:
-                given += self.tell(*(self.beat(label) for label in self.hosts if self.works(label)))
+                given += self.tell(*(self.beat(label) for label in self.processes if self.works(label)))
             given += self.tell(Tick())
         return given
 
@@ -104,7 +104,7 @@ class Play:
     def _ends(self, label: str, code: int) -> list[Event]:
         """A process ends; in a live run, what it has kept of its firing records is read."""
         self.alive.discard(label)
-        nodes = self.hosts[label].nodes
+        nodes = self.processes[label].nodes
         remains = Remains({n: self.kept.pop(n, []) for n in nodes}, {n: self.reached.get(n, Reached()) for n in nodes})
         return [*([Remained(label, remains)] if self.plan.live and nodes else []), Died(label, code)]
 
@@ -118,16 +118,16 @@ class Play:
 
     def _answer(self, label: str, kind: str, fields: Mapping[str, Any]) -> list[Event]:
         match kind:
-            case "host" | "sink" if label in self.broken:
+            case "operators" | "sink" if label in self.broken:
                 return [self.failed(label, "setup()")]
-            case "host" | "sink":
+            case "operators" | "sink":
                 return [Said(label, "joined", {}), Said(label, "ready", {"first": None, "steps": None})]
             case "probe":
                 return [
                     Said(other, "seen", {"stream": stream})
-                    for other in self.hosts
+                    for other in self.processes
                     if other in self.alive and other not in self.deaf
-                    for stream in self.hosts[label].publish
+                    for stream in self.processes[label].publish
                 ]
             case "poll" if self.state is not None:
                 return [Said(label, "state", IDLE | self.state | {"round": fields["round"]})]
@@ -163,7 +163,7 @@ class Play:
 
     def ends(self) -> Over:
         """All processes hand in their reports, and the run closes."""
-        self.tell(*(self.ended(label) for label in self.hosts))
+        self.tell(*(self.ended(label) for label in self.processes))
         self.wait(5.0)
         assert self.over is not None
         return self.over

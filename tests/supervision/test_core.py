@@ -30,6 +30,13 @@ def test_sources_are_released_when_every_edge_is_proven_and_not_before() -> None
     assert play.core.status.phase == "running"
 
 
+def test_placements_go_by_their_former_names_for_one_version() -> None:
+    with pytest.warns(DeprecationWarning, match="'one_host' is now 'one_process'"):
+        play = Play(placement="one_host")
+
+    assert list(play.processes) == ["all"]
+
+
 def test_an_edge_that_is_not_proven_is_named_when_the_time_is_up() -> None:
     play = Play(start_timeout=10.0)
     play.deaf.add("sum")
@@ -45,7 +52,7 @@ def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
     play.tell(Begin(), Said("sum", "joined", {}))
     play.wait(25.0)
 
-    assert play.failure() == "not ready within 10 s: host 'sum'"
+    assert play.failure() == "not ready within 10 s: process 'sum'"
     assert killed(play.commands) == ["sum"]
 
 
@@ -53,7 +60,7 @@ def test_the_end_is_told_to_the_recorder_when_the_others_have_closed() -> None:
     play = Play(record="run.mcap").starts()
     order = []
 
-    play.tell(*(play.ended(label) for label in play.hosts))
+    play.tell(*(play.ended(label) for label in play.processes))
     for command in play.wait(1.0):
         order += [label for label, _ in sent([command], "leave")]
 
@@ -67,7 +74,7 @@ def test_the_end_is_told_to_the_recorder_when_the_others_have_closed() -> None:
 def test_a_recording_is_not_complete_when_a_close_fails_before_it() -> None:
     play = Play(record="run.mcap").starts()
     play.deaf.add("sum")
-    play.tell(*(play.ended(label) for label in play.hosts))
+    play.tell(*(play.ended(label) for label in play.processes))
     play.wait(0.2)
 
     play.tell(play.failed("sum", "close()"), Said("sum", "closed", {"facts": {}}), Died("sum", 1))
@@ -96,11 +103,11 @@ def test_the_first_death_ends_the_run_with_how_far_it_was_and_its_last_words() -
     play.dies("sum", -11)
     play.wait(1.0)
 
-    assert play.failure() == "host 'sum' was killed by SIGSEGV while running (sum had reached stamp 5)"
+    assert play.failure() == "process 'sum' was killed by SIGSEGV while running (sum had reached stamp 5)"
     assert play.over is not None
     assert play.over.failure is not None
     assert play.over.failure.details == "a segment is at fault"
-    assert dict(sent(play.commands, "leave"))["left"]["outcome"].startswith("failed: host 'sum' was killed")
+    assert dict(sent(play.commands, "leave"))["left"]["outcome"].startswith("failed: process 'sum' was killed")
 
 
 def test_what_fails_because_of_a_failure_is_noted_and_the_first_cause_stays() -> None:
@@ -132,7 +139,7 @@ def test_nobody_makes_progress_and_who_does_not_answer_is_killed_and_named() -> 
 
     play.wait(60.0)
 
-    assert play.failure() == "no progress for 20 s; still busy: host 'left'; host 'sum'"
+    assert play.failure() == "no progress for 20 s; still busy: process 'left'; process 'sum'"
     assert "sum" in killed(play.commands)
 
 
@@ -178,7 +185,7 @@ def test_a_rate_at_which_nothing_is_ever_due_is_named() -> None:
     play.wait(5.0)
 
     assert "no progress for 3 s" in play.failure()
-    assert "the next message of host 'sum' is due in 3.17e+290 years at rate 1e-300" in play.failure()
+    assert "the next message of process 'sum' is due in 3.17e+290 years at rate 1e-300" in play.failure()
 
 
 def test_ctrl_c_drains_and_a_second_one_does_not_wait() -> None:
@@ -223,10 +230,10 @@ def test_patience_shortens_the_time_for_closing(patience: float, closes_within: 
     play = Play(stall_timeout=patience).starts()
     play.deaf.add("sum")
 
-    play.tell(*(play.ended(label) for label in play.hosts))
+    play.tell(*(play.ended(label) for label in play.processes))
     play.wait(100.0)
 
-    assert play.failure() == f"did not close within {closes_within:g} s: host 'sum'"
+    assert play.failure() == f"did not close within {closes_within:g} s: process 'sum'"
     assert killed(play.commands) == ["sum"]
 
 
@@ -236,7 +243,7 @@ def test_what_a_process_has_left_behind_is_named() -> None:
     over = play.ends()
 
     assert over.report is not None
-    assert over.report.notes == ("host 'sum' left processes behind, which were killed: sleep (process 12)",)
+    assert over.report.notes == ("process 'sum' left processes behind, which were killed: sleep (process 12)",)
 
 
 def test_a_program_that_cannot_go_on_ends_the_run_in_order() -> None:

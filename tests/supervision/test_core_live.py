@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 
 import pytest
-from plays import LEFT, Play, killed, sent, spawned
+from plays import LEFT, STEP, Play, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
 from dataflow.records.firing import Emission, FiringRecord
@@ -39,13 +39,13 @@ def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
     told = play.wait(0.3)
 
     assert spawned(told) == ["smooth"]
-    ((_, config),) = sent(told, "host")
+    ((_, config),) = sent(told, "operators")
     assert config["resume"]["smooth"] == {"incarnation": 1, "last": {"mean": 7}, "changed": {}, "restarts": 1}
     assert [label for label, _ in sent(told, "probe")] == ["smooth"]
     assert [label for label, _ in sent(told, "go")] == ["smooth"]
     assert play.core.status.notes == [
-        "host 'smooth' was killed by SIGKILL; started again in 0.1 s",
-        "host 'smooth' is back",
+        "process 'smooth' was killed by SIGKILL; started again in 0.1 s",
+        "process 'smooth' is back",
     ]
     assert play.ends().report is not None
 
@@ -56,7 +56,7 @@ def test_restarts_come_to_an_end() -> None:
         play.dies("smooth", -9)
         play.wait(1.0)
 
-    assert play.failure() == "host 'smooth' was killed by SIGKILL while running"
+    assert play.failure() == "process 'smooth' was killed by SIGKILL while running"
 
 
 def test_a_process_that_is_killed_while_starting_is_restarted_by_its_policy() -> None:
@@ -68,8 +68,23 @@ def test_a_process_that_is_killed_while_starting_is_restarted_by_its_policy() ->
     told = play.wait(1.0)
 
     assert spawned(told) == ["smooth"]
-    ((_, config),) = sent(told, "host")
+    ((_, config),) = sent(told, "operators")
     assert "resume" not in config  # nobody had heard of the one before
+    assert play.core.status.phase == "running"
+
+
+def test_one_restarted_while_starting_may_see_a_probe_as_soon_as_it_is_ready() -> None:
+    play = robot()
+    play.tell(Begin())
+    play.deaf.add("smooth")
+    play.wait(STEP)
+    play.dies("smooth", -9)
+    while not spawned(play.wait(STEP)):  # the others are probing when its successor is ready
+        pass
+
+    play.tell(*(Said("smooth", "seen", {"stream": stream}) for stream in play.processes["smooth"].subscribe))
+    play.wait(1.0)
+
     assert play.core.status.phase == "running"
 
 
@@ -99,7 +114,7 @@ def test_a_set_up_that_fails_after_a_restart_is_tried_again_by_the_policy() -> N
     play.wait(1.0)
 
     assert play.core.status.restarts == {"smooth": 2}
-    assert play.core.status.notes[-1] == "host 'smooth' is back"
+    assert play.core.status.notes[-1] == "process 'smooth' is back"
 
 
 def test_a_process_that_fails_itself_is_restarted_and_an_operator_that_failed_for_good_is_not() -> None:
@@ -107,7 +122,7 @@ def test_a_process_that_fails_itself_is_restarted_and_an_operator_that_failed_fo
     failed = {"operator": None, "when": "", "summary": "ProcessFailure: no statics", "traceback": "…"}
     play.tell(Said("smooth", "failed", failed))
     play.wait(1.0)
-    assert play.core.status.notes[-1] == "host 'smooth' is back"
+    assert play.core.status.notes[-1] == "process 'smooth' is back"
 
     play.tell(play.failed("smooth", "fire at stamp 5"))  # its process has tried
     play.wait(1.0)
@@ -120,7 +135,7 @@ def test_one_that_failed_and_does_not_leave_is_killed() -> None:
     play.tell(Said("smooth", "failed", {"operator": None, "when": "", "summary": "x", "traceback": ""}))
 
     assert killed(play.wait(11.0)) == ["smooth"]
-    assert play.core.status.notes[-1] == "host 'smooth' is back"
+    assert play.core.status.notes[-1] == "process 'smooth' is back"
 
 
 def test_a_stopped_process_is_killed_and_restarted_by_its_policy() -> None:
@@ -129,7 +144,7 @@ def test_a_stopped_process_is_killed_and_restarted_by_its_policy() -> None:
     play.deaf.add("smooth")
 
     assert killed(play.wait(4.0)) == ["smooth"]
-    assert "host 'smooth' gave no sign of life for 3.0 s; started again" in play.core.status.notes[0]
+    assert "process 'smooth' gave no sign of life for 3.0 s; started again" in play.core.status.notes[0]
 
 
 def test_a_process_that_reads_nothing_is_killed_and_restarted_by_its_policy() -> None:
@@ -137,7 +152,7 @@ def test_a_process_that_reads_nothing_is_killed_and_restarted_by_its_policy() ->
 
     assert killed(play.tell(NotReading("smooth", 2.0, 9))) == []
     assert killed(play.tell(NotReading("smooth", 3.5, 9))) == ["smooth"]
-    assert "host 'smooth' has read nothing for 3.5 s" in play.core.status.notes[0]
+    assert "process 'smooth' has read nothing for 3.5 s" in play.core.status.notes[0]
 
 
 def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
@@ -146,7 +161,7 @@ def test_one_that_lost_what_it_needs_ends_the_run_without_a_policy() -> None:
     play.tell(NotReading("@recorder", 9.0, 500, overflowed=True))
     play.wait(20.0)
 
-    assert play.failure() == "host '@recorder' has read nothing for 9 s"
+    assert play.failure() == "process '@recorder' has read nothing for 9 s"
 
 
 def covered(play: Play, stamp: int) -> tuple[int, int]:
@@ -171,7 +186,7 @@ def stopped_for_a_while(consumer: str) -> Play:
     assert covered(play, 500)[1] == 100  # its backlog still counts
 
     play.wait(3.2)
-    assert "host 'sum' gave no sign of life for 3.0 s; nobody waits for it" in play.core.status.notes
+    assert "process 'sum' gave no sign of life for 3.0 s; nobody waits for it" in play.core.status.notes
     play.tell(play.progress("other", {"other": 900}))
     assert covered(play, 900)[1] == 900
 
@@ -220,7 +235,7 @@ def test_a_process_that_gives_no_sign_of_life_for_too_long_ends_the_run(label: s
         play.tell(play.progress("left", {"left": 5}))
         play.wait(0.5)
 
-    assert play.failure() == f"host {label!r} gave no sign of life for 20 s"
+    assert play.failure() == f"process {label!r} gave no sign of life for 20 s"
 
 
 def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
@@ -230,7 +245,23 @@ def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
         play.tell(play.beat("left"), play.beat("after"), play.beat("smooth", ("smooth", 5, 0.5 * k)))
         play.wait(0.5)
 
-    assert play.failure() == "no progress for 20 s; still busy: host 'smooth', smooth at stamp 5 for 20 s"
+    assert play.failure() == "no progress for 20 s; still busy: process 'smooth', smooth at stamp 5 for 20 s"
+
+
+def test_a_call_that_does_not_end_is_named_when_the_sources_have_ended_though_a_timer_goes_on() -> None:
+    play = robot(stall_timeout=20.0).starts()
+    play.beating = False
+    for k in range(60):
+        play.tell(play.beat("left"), play.beat("after", ("after", 5, 0.5 * k)), play.beat("smooth"))
+        play.tell(play.progress("smooth", {"smooth": k}))
+        play.wait(0.5)
+    assert play.over is None  # sources may go on without it
+
+    streams = play.plan.graph.nodes["left"].outputs.values()
+    play.tell(*(Said("left", "stream_ended", {"stream": s, "reason": "end of source"}) for s in streams))
+    play.wait(20.0)
+
+    assert play.failure().startswith("all sources have ended, and a call does not: process 'after', after at stamp 5")
 
 
 def test_after_a_restart_a_stuck_graph_is_proven_again() -> None:
@@ -261,8 +292,8 @@ def test_a_source_behind_the_clock_is_named_at_once_and_at_the_end() -> None:
 
 
 def test_a_process_that_is_busy_is_named_as_what_holds_its_source_up() -> None:
-    play = Play(LEFT, SUM, live=True, placement="one_host").starts()
-    (label,) = play.hosts
+    play = Play(LEFT, SUM, live=True, placement="one_process").starts()
+    (label,) = play.processes
     counts = {"left": [1, 1, 0, 0, 5], "sum": [1, 1, 0, 0, 5]}
     play.tell(Said(label, "progress", {"done": {}, "counts": counts, "behind": {"left": [0.1, 4.0]}}))
 
@@ -295,7 +326,7 @@ def test_ctrl_c_while_a_process_is_away_ends_the_run() -> None:
     play.stops()
     play.wait(1.0)
 
-    assert play.failure() == "interrupted while host 'smooth' was to be started again"
+    assert play.failure() == "interrupted while process 'smooth' was to be started again"
 
 
 def test_what_did_not_drain_because_a_process_is_silent_is_laid_to_that() -> None:
@@ -307,7 +338,7 @@ def test_what_did_not_drain_because_a_process_is_silent_is_laid_to_that() -> Non
     play.stops()
     play.wait(80.0)
 
-    assert "not everything was drained within 60 s: host 'left' gives no sign of life; sum was at" in play.failure()
+    assert "not everything was drained within 60 s: process 'left' gives no sign of life; sum was at" in play.failure()
 
 
 def test_records_of_a_failed_run_reach_the_recorder_when_the_others_have_left() -> None:
@@ -357,7 +388,7 @@ def test_a_process_that_died_again_at_once_does_not_use_an_incarnation_twice() -
     play.keeps(FiringRecord("smooth", 3, 0, "fire", 5, outputs=(Emission(0, 5, bytes(16)),)))
     play.dies("smooth", -9)
 
-    ((_, config),) = sent(play.wait(0.3), "host")
+    ((_, config),) = sent(play.wait(0.3), "operators")
     assert config["resume"]["smooth"]["incarnation"] == 4
 
 

@@ -7,10 +7,10 @@ import sys
 
 ASKS = """
 import os, signal
-from dataflow.supervision.run import _interrupts
+from dataflow.supervision.interrupts import interrupts
 
 stops = []
-with _interrupts(lambda: stops.append(1)):
+with interrupts(lambda: stops.append(1)):
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM):
         before = len(stops)
         os.kill(os.getpid(), number)

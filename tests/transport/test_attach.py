@@ -21,14 +21,14 @@ def test_a_tap_begins_with_the_statics_that_exist_and_waits_for_no_process_that_
 ) -> None:
     """The time allowed is longer than the test's: a wait for something that never comes would not end."""
     monkeypatch.setattr(attach, "CONNECT_WITHIN", 1000.0)
-    host = open_bus(listen=(endpoint,))
+    process = open_bus(listen=(endpoint,))
     graph = load_text("graph: robot\noperators: {camera: {use: operators.sources:SyntheticRgbd}}")
     found = RunningGraph("robot", "robot1", 1, 0.0, (endpoint,), 0.0, graph.to_json())
-    with TapServer(host, "robot1"):
+    with TapServer(process, "robot1"):
         with attach.tap(found, ["**"]) as client:
             assert client.take(0.0) is None
         image = DepthImage(stamp=3, frame="camera", data=np.zeros((2, 2), np.float32))
-        host.declare_static(INFO, encode(carrying(image, INFO, 0)))
+        process.declare_static(INFO, encode(carrying(image, INFO, 0)))
         for _ in range(10):
             with attach.tap(found, ["**"]) as client:
                 taken = client.take(0.0)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from transport_envelopes import carrying
 
 from dataflow.messages import Message, array, scalar
+from dataflow.transport import codec
 from dataflow.transport.codec import decode, decode_head, encode, encode_parts
 from dataflow.transport.envelope import ALIGNMENT, MAGIC, PRELUDE, VERSION, DecodeError, Envelope, Kind, Limits
 
@@ -276,3 +277,31 @@ def test_a_message_and_its_kind_must_agree() -> None:
         encode(Envelope(Kind.FRONTIER, "a/b/c", 0, 0, 7, sample()))
     with pytest.raises(ValueError, match="stamp 8"):
         encode(Envelope(Kind.MESSAGE, "a/b/c", 0, 0, 8, sample(7)))
+
+
+def outcome(data: bytes) -> str | bytes:
+    """The digest of what is decoded; the error where there is one."""
+    try:
+        message = decode(data).message
+    except DecodeError as error:
+        return str(error)
+    assert message is not None
+    assert not any(held.flags.writeable for held in message.arrays() if held is not None)
+    return message.digest()
+
+
+@settings(max_examples=300, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_a_small_body_is_decoded_as_any_other(data: st.DataObject) -> None:
+    """As a whole, or value by value: the same messages and the same errors, also where bytes were changed."""
+    message = data.draw(st.one_of(samples(), st.just(sample(mask=None)), st.just(sample(mask=None, pixels=None))))
+    wire = bytearray(encode(message_envelope(message)))
+    for place, value in data.draw(st.lists(st.tuples(st.integers(0, len(wire) - 1), st.integers(0, 255)), max_size=3)):
+        wire[place] = value
+    if wire[5] != Kind.MESSAGE:
+        return
+
+    whole = outcome(bytes(wire))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "_SMALL_BODY", -1)
+        assert outcome(bytes(wire)) == whole

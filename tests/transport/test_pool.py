@@ -8,22 +8,16 @@ import sys
 import threading
 from pathlib import Path
 
-import pytest
+import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from transport_envelopes import carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport.codec import encode_head, encode_parts, parts_size
 from dataflow.transport.counters import Counters
-from dataflow.transport.shared import SUPPORTED, Board, PoolReader
-
-if not SUPPORTED:
-    pytest.skip(f"no memfd on {sys.platform}", allow_module_level=True)
-
-import numpy as np
-from transport_envelopes import carrying
-
-from dataflow.transport.pool import Block, BoardReader, SharedPool
+from dataflow.transport.pool import Block, SharedPool
+from dataflow.transport.shared import Board, PoolReader, make_board
 
 KIB = 1 << 10
 DEPTH = "robot1/camera/depth"
@@ -97,15 +91,14 @@ def mappings() -> int:
     )
 
 
-def references(pool: SharedPool, board: Board, count: int) -> list[bytes]:
-    """Messages that a publisher with this pool sends to the consumer of `board`."""
-    claims = (BoardReader(os.getpid(), board.descriptor, "consumer"),)
+def references(pool: SharedPool, count: int) -> list[bytes]:
+    """Messages that a publisher with this pool sends to a consumer that releases nothing."""
     sent = []
     for seq in range(count):
         image = DepthImage(stamp=seq, frame="camera", data=np.full((128, 128), seq, np.float32))
         envelope = carrying(image, DEPTH, seq)
         parts = encode_parts(envelope)
-        block = pool.write(parts, parts_size(parts), claims)
+        block = pool.write(parts, parts_size(parts), (Holder(),))
         assert block is not None
         sent.append(pool.reference(encode_head(envelope), block, parts_size(parts)))
     return sent
@@ -113,16 +106,17 @@ def references(pool: SharedPool, board: Board, count: int) -> list[bytes]:
 
 def test_the_pool_of_a_publisher_that_was_replaced_is_unmapped_with_its_last_view() -> None:
     before = mappings()
-    board, reader = Board(), PoolReader()
+    descriptor = make_board()
+    board, reader = Board(descriptor), PoolReader()
     views: list[memoryview] = []
     for _ in range(5):
         pool = SharedPool(1024 * KIB)
-        views = [reader.resolve(reference, board) for reference in references(pool, board, 3)]
+        views = [reader.resolve(reference, board) for reference in references(pool, 3)]
         pool.close()
     assert mappings() == before + 1
     old = views
     pool = SharedPool(1024 * KIB)
-    new = [reader.resolve(reference, board) for reference in references(pool, board, 1)]
+    new = [reader.resolve(reference, board) for reference in references(pool, 1)]
     pool.close()
     assert mappings() == before + 2
     assert bytes(old[2][-4:]) == np.float32(2).tobytes()
@@ -130,7 +124,8 @@ def test_the_pool_of_a_publisher_that_was_replaced_is_unmapped_with_its_last_vie
     views.clear()
     assert mappings() == before + 1
     new.clear()
-    board.close()
+    del board
+    os.close(descriptor)
     assert mappings() == before
 
 
@@ -140,7 +135,7 @@ def test_counts_of_several_threads_are_complete() -> None:
     sys.setswitchinterval(1e-6)
     try:
         threads = [
-            threading.Thread(target=lambda: [counters.moved("sent", 3) for _ in range(5000)] and None) for _ in range(4)
+            threading.Thread(target=lambda: [counters.published(3) for _ in range(5000)] and None) for _ in range(4)
         ]
         for thread in threads:
             thread.start()
@@ -148,5 +143,5 @@ def test_counts_of_several_threads_are_complete() -> None:
             thread.join()
     finally:
         sys.setswitchinterval(interval)
-    assert counters.as_dict()["sent_messages"] == 20_000
-    assert counters.as_dict()["sent_bytes"] == 60_000
+    assert counters.as_dict()["published_messages"] == 20_000
+    assert counters.as_dict()["published_bytes"] == 60_000

@@ -50,5 +50,5 @@ def test_progress_is_shown_for_every_operator_and_both_times_are_told(kept: Path
 
     assert seen[-1].operators["busy"].firings == 150
     assert set(seen[-1].operators) == {"look", "smooth", "busy", "tally"}
-    assert set(seen[-1].host_of.values()) == {"worker 1", "worker 2"}
+    assert set(seen[-1].process_of.values()) == {"worker 1", "worker 2"}
     assert report.total > report.wall > 0

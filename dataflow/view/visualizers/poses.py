@@ -1,4 +1,4 @@
-"""Where things are: transforms, poses, odometry, paths, particles, satellite fixes."""
+"""Visualisers of places: transforms, poses, odometry, paths, particles, satellite fixes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the scene means: the scene graph, activities, embeddings."""
+"""The meaning of a scene: the scene graph, activities, embeddings."""
 
 from __future__ import annotations
 

@@ -65,7 +65,7 @@ def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
 
 
 def _kind(key: str) -> str:
-    """Which plot a value belongs to: the same unit, more or less."""
+    """Tells which plot a value belongs to: the same unit, more or less."""
     lower = key.lower()
     if _RATE.search(lower):
         return "rate"

@@ -49,7 +49,7 @@ def assess(weights: Path, classes: Sequence[str], images: Sequence[LabelledImage
 
 
 def candidates(found: Detections2D, classes: Sequence[str]) -> Candidates:
-    """What was found, numbered as `classes`; boxes of other classes are left out."""
+    """Returns what was found, numbered as `classes`; boxes of other classes are left out."""
     number = np.array([classes.index(n) if n in classes else -1 for n in found.class_names], np.int32)
     labels = number[found.class_ids]
     keep = labels >= 0

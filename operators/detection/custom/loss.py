@@ -39,7 +39,8 @@ class Truth:
 
 @dataclass(frozen=True, eq=False)
 class Assignment:
-    """Who answers for whom in one map: entries of (image, anchor, row, column) and the object (index into Truth)."""
+    """Says who answers for whom in one map: entries of (image, anchor, row, column) and the object (index into
+    Truth)."""
 
     image: Tensor
     anchor: Tensor
@@ -145,7 +146,8 @@ def _flat_index(at: tuple[Tensor, Tensor, Tensor, Tensor], shape: torch.Size) ->
 
 @torch.no_grad()
 def _ignored(boxes: Tensor, objectness: Tensor, truth: Truth, stride: int) -> Tensor:
-    """Which predictions (N, A, H, W) are not to be punished: cells in an ignored object, boxes much like an object.
+    """Tells which predictions (N, A, H, W) are not to be punished: cells in an ignored object, boxes much like an
+    object.
 
     Those that are sure enough to be empty are not compared: most are, and the comparison costs more than the network.
     """

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from operators.sources.simulator.furniture import any_tone, dark, tone
-from operators.sources.simulator.shapes import Array, Material, Shape, at, bone, box, ellipsoid
+from operators.sources.simulator.shapes import Array, Material, Shape, at, bone, box, ellipsoid, lathe
 
 Rng = np.random.Generator
 
@@ -23,7 +23,7 @@ _SHOULDER, _HIP = 0.118, 0.055  # half widths
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """Where the body is: pelvis (3,) and heading, lean forward (rad), soles (2, 3), hands (2, 3); left first."""
+    """Posture of a body: pelvis (3,) and heading, lean forward (rad), soles (2, 3), hands (2, 3); left first."""
 
     pelvis: Array
     yaw: float
@@ -57,7 +57,7 @@ class Body:
         return np.asarray(posture.pelvis + self.height * (_TORSO + _NECK) * spine + 0.05 * up + 0.13 * forward)
 
     def grip(self, posture: Posture, side: int) -> Array:
-        """Where the hand really is: its target, or as near to it as the arm reaches."""
+        """Tells where the hand really is: its target, or as near to it as the arm reaches."""
         _, _, end = self._arm(posture, side)
         return end
 
@@ -96,31 +96,84 @@ class Body:
         return shoulder, elbow, hand
 
 
+@dataclass(frozen=True)
+class Look:
+    """What a person wears, as patches that are added to the parts of the body: trunk, hips and head."""
+
+    skin: Material
+    hair: Material
+    shirt: Material
+    trousers: Material
+    shoes: Material
+    sleeve: Material
+    shin: Material
+    on_hips: Shape = ()
+    on_trunk: Shape = ()
+    on_head: Shape = ()
+
+
 def drawn_body(rng: Rng) -> Body:
     """A person of drawn height, build, skin, hair and clothes."""
     h = rng.uniform(1.58, 1.88)
     build = rng.uniform(0.9, 1.12)
     skin = Material("plain", tone(rng, (0.04, 0.085), (0.25, 0.6), (0.4, 0.95)), tile=0.3)
-    face = Material("face", skin.tint, tile=0)
     hair = Material("carpet", tone(rng, (0.03, 0.12), (0.1, 0.7), (0.1, 0.75)), tile=0.12)
     shirt = Material(("fabric", "checked", "plain")[int(rng.integers(3))], any_tone(rng), tile=0.25)
     trousers = Material("fabric", tone(rng, (0, 1), (0.1, 0.6), (0.14, 0.6)), tile=0.3)
     shoes = Material("plain", dark(rng), tile=0.3)
     sleeve = shirt if rng.uniform() < 0.6 else skin
+    return _dressed(h, build, Look(skin, hair, shirt, trousers, shoes, sleeve, trousers))
 
-    pelvis = at(ellipsoid(0.062 * h * build, 0.09 * h * build, 0.075 * h, trousers, segments=14, rings=8))
+
+def varied_body(rng: Rng) -> Body:
+    """A person of any look: also tall and small, in skirts and shorts, with hats, long hair and rucksacks."""
+    h, build = rng.uniform(1.52, 1.93), rng.uniform(0.86, 1.25)
+    skin = Material("plain", tone(rng, (0.03, 0.09), (0.2, 0.65), (0.3, 0.97)), tile=0.3)
+    hair = Material("carpet", tone(rng, (0.0, 0.14), (0.0, 0.75), (0.06, 0.9)), tile=0.12)
+    cloths = ("fabric", "checked", "plain", "carpet")
+    shirt = Material(cloths[int(rng.integers(4))], any_tone(rng), tile=0.25)
+    trousers = Material(cloths[int(rng.integers(3))], tone(rng, (0, 1), (0.0, 0.9), (0.1, 0.95)), tile=0.3)
+    shoes = Material("plain", any_tone(rng) if rng.uniform() < 0.4 else dark(rng), tile=0.3)
+    sleeve = shirt if rng.uniform() < 0.5 else skin
+    bare = rng.uniform() < 0.3
+    hips: Shape = ()
+    trunk: Shape = ()
+    head: Shape = ()
+    if bare and rng.uniform() < 0.6:  # a skirt down to above the knees
+        waist, hem = 0.075 * h * build, 0.115 * h * build
+        hips = at(lathe([(hem, 0.0), (waist, 0.17 * h)], trousers, segments=16), z=-0.13 * h)
+    if rng.uniform() < 0.25:
+        cloth = Material("fabric", any_tone(rng), tile=0.3)
+        trunk = box((0.07 * h, 0.15 * h, 0.22 * h), cloth, center=(-0.105 * h * build, 0, 0.1 * h), cell=0.2)
+    worn = rng.uniform()
+    if worn < 0.3:  # a hat with a brim
+        felt = Material("fabric", any_tone(rng), tile=0.2)
+        brim = [(0.1 * h, 0.0), (0.058 * h, 0.012 * h), (0.052 * h, 0.06 * h), (0.0, 0.07 * h)]
+        head = at(lathe(brim, felt, segments=16), x=-0.008 * h, z=0.062 * h)
+    elif worn < 0.6:  # long hair, down to the shoulders
+        head = at(ellipsoid(0.03 * h, 0.052 * h, 0.085 * h, hair, segments=12, rings=8), x=-0.045 * h, z=-0.015 * h)
+    shin = skin if bare else trousers
+    return _dressed(h, build, Look(skin, hair, shirt, trousers, shoes, sleeve, shin, hips, trunk, head))
+
+
+def _dressed(h: float, build: float, look: Look) -> Body:
+    """A body of a height (m) and build with a look."""
+    skin, hair, shirt, trousers = look.skin, look.hair, look.shirt, look.trousers
+    face = Material("face", skin.tint, tile=0)
+    hips = at(ellipsoid(0.062 * h * build, 0.09 * h * build, 0.075 * h, trousers, segments=14, rings=8))
     torso = bone(0.2 * h, 0.085 * h * build, 0.1 * h * build, shirt, segments=14, flat=0.66)
     neck = at(bone(0.06 * h, 0.032 * h, 0.03 * h, skin, segments=8), z=-0.075 * h)
     head = at(ellipsoid(0.052 * h, 0.044 * h, 0.066 * h, face, segments=16, rings=10), z=0.028 * h)
     cap = at(ellipsoid(0.056 * h, 0.05 * h, 0.058 * h, hair, segments=14, rings=8), x=-0.013 * h, z=0.046 * h)
-    parts = [pelvis, torso, neck + head + cap]
+    parts = [hips + look.on_hips, torso + look.on_trunk, neck + head + cap + look.on_head]
     for side in (1, -1):
         upper = bone(_UPPER * h, 0.031 * h * build, 0.025 * h * build, shirt)
-        fore = bone(_FORE * h, 0.025 * h * build, 0.018 * h, sleeve)
+        fore = bone(_FORE * h, 0.025 * h * build, 0.018 * h, look.sleeve)
         hand = at(ellipsoid(0.014 * h, 0.024 * h, 0.032 * h, skin, segments=8, rings=6), z=(_FORE + _HAND * 0.5) * h)
         thigh = bone(_THIGH * h, 0.05 * h * build, 0.034 * h * build, trousers, segments=12)
-        shin = bone(_SHIN * h, 0.034 * h * build, 0.024 * h, trousers)
-        foot = box((0.15 * h, 0.055 * h, 0.045 * h), shoes, center=(0.04 * h, 0.004 * h * side, 0.0225 * h), cell=0.2)
+        shin = bone(_SHIN * h, 0.034 * h * build, 0.024 * h, look.shin)
+        sole = (0.04 * h, 0.004 * h * side, 0.0225 * h)
+        foot = box((0.15 * h, 0.055 * h, 0.045 * h), look.shoes, center=sole, cell=0.2)
         parts += [upper, fore + hand, thigh, shin, foot]
     return Body(h, tuple(parts))
 

@@ -43,6 +43,7 @@ ACTIVITIES = (
 """What a mover can be doing.
 
 Persons stand (upright, feet still), walk, sit down, sit, stand up (the two transitions), reach (a hand goes to an
-object or puts it back) and drink (the held mug is away from the table). Balls roll or rest; robots drive or rest.
+object or puts it back) and drink (the held mug is away from the table). Balls roll or rest; robots drive, or rest
+where they all but stand.
 """
 ACTIVITY_IDS = {name: k for k, name in enumerate(ACTIVITIES)}

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from operators.sources.simulator import furniture
+from operators.sources.simulator.choosers import add_chooser
 from operators.sources.simulator.furnishing import (
     Style,
     Wall,
@@ -17,15 +18,14 @@ from operators.sources.simulator.furnishing import (
     raise_wall,
 )
 from operators.sources.simulator.inhabitants import add_ball, add_rover, add_walker
-from operators.sources.simulator.scene import Builder, Light, World
+from operators.sources.simulator.scene import Builder, Light, Order, World
 from operators.sources.simulator.shapes import Array
-from operators.sources.simulator.trajectory import Trajectory
 
 LANE = 1.0
 """Metres between the block and the robot's path; those who come towards it keep to the outer wall."""
 
 
-def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
+def corridor(seed: int, order: Order) -> World:
     """A ring of about thirty metres, drawn from the seed."""
     rng = np.random.default_rng([seed, 2])
     block_x, block_y, width = rng.uniform(3.0, 4.2), rng.uniform(2.0, 3.0), rng.uniform(2.75, 3.0)
@@ -35,15 +35,21 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     lay_floor(builder, (-x, -y), (x, y), height, style)
     outer = _ring(x, y, height, inside=True)
     inner = _ring(block_x, block_y, height, inside=False)
-    roles = [str(role) for role in rng.permutation(["walker", "walker", "ball", "rover"])] if movers else [""] * 4
-    for wall, role in zip(outer, roles, strict=True):
-        if role:
-            _inhabit(builder, rng, wall, role, wall.length / 2 - 1.9)
-    for wall in outer:
+    cast = order.cast(["walker", "walker", "ball", "rover"])
+    roles = [str(role) for role in rng.permutation(cast)] if order.movers else [""] * 4
+    kept = [
+        _inhabit(builder, rng, wall, role, wall.length / 2 - 1.9) if role else None
+        for wall, role in zip(outer, roles, strict=True)
+    ]
+    for wall, own in zip(outer, kept, strict=True):
         half = wall.length / 2 - 0.6
         raise_wall(builder, wall, style)
-        spans = _doors(builder, rng, wall, half, int(rng.integers(1, 3)))
-        line_wall(builder, rng, wall, _between(spans, half - width + 0.6), depth=0.5)
+        if own is None:
+            spans = _doors(builder, rng, wall, half, int(rng.integers(1, 3)))
+            line_wall(builder, rng, wall, _between(spans, half - width + 0.6), depth=0.5)
+        else:
+            spans = []
+            line_wall(builder, rng, wall, _between([own], half - width + 0.6), depth=0.5)
         decorate(builder, rng, wall, windows=rng.uniform() < 0.5, taken=spans)
     for wall in inner:
         half = wall.length / 2 - 0.2
@@ -68,7 +74,7 @@ def corridor(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         tuple(builder.things),
         lights,
         0.5,
-        Trajectory(_lane(block_x, block_y), speed=speed, hold=hold),
+        order.drive(_tour(block_x, block_y, width) if order.tour else _lane(block_x, block_y)),
         landmarks,
         (0.12, 0.0, rng.uniform(0.95, 1.15), 0.0, math.radians(rng.uniform(4, 8)), 0.0),
         tuple(builder.placements),
@@ -103,6 +109,17 @@ def _lane(x: float, y: float) -> Array:
     return np.array(points)
 
 
+def _tour(x: float, y: float, width: float) -> Array:
+    """Waypoints around the block counter-clockwise and back clockwise, with a turn in one corner after each round."""
+    lap = [(float(px), float(py)) for px, py in _lane(x, y)[5:]]  # without the corner in which it turns
+    c = width - 0.84  # of the turn's middle, from the block's corner
+    turn = [(0.3, 1.0), (c - 1.0, 1.12), (c - 0.5, c - 0.36), (c - 0.23, c + 0.2), (c + 0.1, c + 0.31),
+            (c + 0.31, c + 0.1), (c + 0.18, c - 0.23), (c - 0.4, c - 0.55), (c - 1.0, 1.0), (0.2, 0.98)]  # fmt: skip
+    there = [(x + u, -y - v) for u, v in turn]
+    back = [(x + v, -y - u) for u, v in turn]
+    return np.array([*lap, *there, *lap[::-1], *back])
+
+
 def _doors(
     builder: Builder, rng: np.random.Generator, wall: Wall, half: float, count: int, *, opened: float = 0.35
 ) -> list[tuple[float, float]]:
@@ -118,17 +135,25 @@ def _doors(
 
 
 def _between(spans: list[tuple[float, float]], half: float) -> list[tuple[float, float]]:
-    """What is left of (-half, half) without the spans, which rise."""
+    """Returns what is left of (-half, half) without the spans, which rise."""
     edges = [-half, *(edge for span in spans for edge in span), half]
     return [(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a > 0.5]
 
 
-def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, reach: float) -> None:
+def _inhabit(
+    builder: Builder, rng: np.random.Generator, wall: Wall, role: str, reach: float
+) -> tuple[float, float] | None:
+    """Someone or something that moves along an outer wall, `reach` metres to both sides of its middle.
+
+    Returns the span of the wall that is kept free for its own furniture, if any.
+    """
     out = 0.85
 
     def places(*points: tuple[float, float]) -> Array:
         return np.array([wall.place(d, s)[:2, 3] for d, s in points])
 
+    if role == "chooser":
+        return add_chooser(builder, rng, wall, -reach, reach)
     if role == "walker":
         add_walker(builder, rng, places((out, -reach), (out, -0.3 * reach), (out + 0.04, 0.4 * reach), (out, reach)))
     elif role == "ball":
@@ -137,6 +162,7 @@ def _inhabit(builder: Builder, rng: np.random.Generator, wall: Wall, role: str, 
     else:
         angle = np.linspace(0, 2 * math.pi, 10, endpoint=False)
         add_rover(builder, rng, places(*((out + 0.14 * math.sin(a), 0.7 * reach * math.cos(a)) for a in angle)))
+    return None
 
 
 def _lamp_places(x: float, y: float) -> list[tuple[float, float]]:

@@ -6,12 +6,14 @@ compressed stream loses nothing.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from operators.sources.simulator.noise import NoisePool
-from operators.sources.simulator.renderer import View
+from operators.sources.simulator.optics import View
 from operators.sources.simulator.settings import DepthCamera
 
 F32 = NDArray[np.float32]
@@ -38,6 +40,8 @@ def measure(view: View, camera: DepthCamera, pool: NoisePool, rng: np.random.Gen
         seen &= ~(brink & (_uniform(pool, rng, truth.shape) < camera.edge_holes))
     if camera.specks > 0:
         seen &= _uniform(pool, rng, truth.shape) >= camera.specks
+    if camera.missing > 0:
+        seen &= ~_patches(rng, truth.shape, camera.missing)
     return np.where(seen, levels, 0).astype(np.uint16)
 
 
@@ -58,7 +62,7 @@ def png(levels: U16) -> NDArray[np.uint8]:
 def _grained(pool: NoisePool, rng: np.random.Generator, shape: tuple[int, ...], grain: int) -> F32:
     """Noise (H, W) of unit standard deviation that is alike over `grain` pixels, as windows that are matched make it.
 
-    Drawn on a coarser grid and interpolated linearly; that leaves 2/3 of the standard deviation.
+    Drawn on a coarser grid and interpolated linearly, which lessens the deviation; that is made up for.
     """
     if grain == 1:
         return pool.take(rng, shape)
@@ -66,7 +70,25 @@ def _grained(pool: NoisePool, rng: np.random.Generator, shape: tuple[int, ...], 
     coarse = pool.take(rng, (height // grain + 2, width // grain + 2))
     size = (coarse.shape[1] * grain, coarse.shape[0] * grain)
     full = cv2.resize(coarse, size, interpolation=cv2.INTER_LINEAR)
-    return np.asarray(full[grain : grain + height, grain : grain + width] * np.float32(1.5), np.float32)
+    gain = np.float32(1 / interpolated_deviation(grain))
+    return np.asarray(full[grain : grain + height, grain : grain + width] * gain, np.float32)
+
+
+@lru_cache(maxsize=16)
+def interpolated_deviation(grain: int) -> float:
+    """Standard deviation of noise of unit deviation after enlarging it `grain` times by linear interpolation.
+
+    A pixel at the share f between two cells has the variance (1 - f)² + f² along each axis, so the deviation of the
+    image, root mean square over both axes, is the mean of that over a cell's pixels.
+    """
+    f = ((np.arange(grain) + 0.5) / grain - 0.5) % 1
+    return float(np.mean((1 - f) ** 2 + f**2))
+
+
+def _patches(rng: np.random.Generator, shape: tuple[int, ...], share: float) -> NDArray[np.bool_]:
+    """Patches (H, W) that cover a share of the image, each a few tenths of it wide."""
+    field = cv2.resize(rng.standard_normal((6, 8)), shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return np.asarray(field <= np.quantile(field, share))
 
 
 def _uniform(pool: NoisePool, rng: np.random.Generator, shape: tuple[int, ...]) -> F32:

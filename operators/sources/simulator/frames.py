@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,3 +31,28 @@ def mounted(mount: Mount) -> Array:
     )
     T.flags.writeable = False
     return T
+
+
+class Mounted(Protocol):
+    """A sensor with a mount, and the error of the calibration that tells it."""
+
+    @property
+    def mount(self) -> Mount: ...
+
+    @property
+    def mount_error(self) -> Mount: ...
+
+
+def place(sensor: Mounted) -> Array:
+    """`T_base_sensor` (4, 4) of where a sensor really is."""
+    return displaced(mounted(sensor.mount), sensor.mount_error)
+
+
+def displaced(T: Array, error: Mount) -> Array:
+    """A pose (4, 4) moved by an error in its own axes."""
+    return T @ mounted(error) if any(error) else T
+
+
+def displaced_optical(T: Array, error: Mount) -> Array:
+    """The same for an optical frame: the error is that of its housing (x forward, y left, z up)."""
+    return T @ BODY_TO_OPTICAL.T @ mounted(error) @ BODY_TO_OPTICAL if any(error) else T

@@ -27,7 +27,7 @@ FLOOR = 0
 
 @dataclass(frozen=True)
 class Style:
-    """How a building looks."""
+    """Looks of a building."""
 
     wall: Material
     accent: Material
@@ -163,7 +163,7 @@ def scatter(
 
 
 def small_items(rng: Rng, count: int) -> list[Item]:
-    """What lies about on tables."""
+    """Returns what lies about on tables."""
     makers: list[Callable[[], Item]] = [
         lambda: ("mug", objects.mug(rng)),
         lambda: ("bottle", objects.bottle(rng)),

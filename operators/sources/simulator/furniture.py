@@ -1,4 +1,4 @@
-"""What stands on the floor: tables, chairs, shelves, doors, plants, bins, lamps and robots, of drawn size and colour.
+"""Furniture: tables, chairs, shelves, doors, plants, bins, lamps and robots, of drawn size and colour.
 
 Every function takes a generator and returns the shape in the object's own frame: origin on the floor below its middle,
 front towards +x. Those that carry other things also return where.

@@ -5,15 +5,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import NavSatFix
-from operators.sources.simulator.frames import Array, mounted
+from operators.sources.simulator.frames import Array, place
 from operators.sources.simulator.settings import Gnss
-from operators.sources.simulator.trajectory import Trajectory
+from operators.sources.simulator.stage import Stage
 
 _A = 6378137.0  # WGS 84
 _F = 1 / 298.257223563
 _E2 = _F * (2 - _F)
+
+_IN_VIEW, _LEAST = 12, 4  # satellites above the horizon, and those that a fix takes
+_MASK = 0.17  # radians above the horizon below which satellites are not used
+_FAR = 100.0  # metres within which something may hide a satellite
 
 
 def geodetic(enu: Array, latitude: float, longitude: float, altitude: float) -> tuple[float, float, float]:
@@ -42,17 +47,29 @@ class GnssModel:
     """The receiver with its slowly changing error (a first-order Gauss-Markov process): one call a tick, in order."""
 
     def __init__(self, gnss: Gnss, seed: int) -> None:
-        self._gnss = gnss
         self._error = np.random.default_rng([seed, 41]).normal(0, gnss.drift, 3) * [1, 1, 2]
+        rng = np.random.default_rng([seed, 42])
+        azimuth = 2 * math.pi * (np.arange(_IN_VIEW) + rng.uniform(0, 1, _IN_VIEW)) / _IN_VIEW
+        elevation = np.arcsin(rng.uniform(math.sin(_MASK), 1, _IN_VIEW))
+        level = np.cos(elevation)
+        self._satellites = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=1)
 
-    def measure(self, path: Trajectory, t: float, rng: np.random.Generator, stamp: int, frame: str) -> NavSatFix:
-        gnss = self._gnss
+    def measure(
+        self, gnss: Gnss, stage: Stage, t: float, rng: np.random.Generator, stamp: int, frame: str
+    ) -> NavSatFix | None:
+        """A fix, or None where too few satellites are in sight."""
         keep = math.exp(-1 / (gnss.rate * gnss.drift_time))
         scale = np.array([1.0, 1.0, 2.0])
         fresh = rng.standard_normal((2, 3)) * scale
         self._error = keep * self._error + math.sqrt(1 - keep**2) * gnss.drift * fresh[0]
-        place = (path.at([t]).T_world_base()[0] @ mounted(gnss.mount))[:3, 3]
-        enu = place + self._error + gnss.noise * fresh[1] + np.array(gnss.bias)
+        antenna = (stage.T_world_base(t) @ place(gnss))[:3, 3]
+        satellites, worse = int(rng.integers(8, 13)), 1.0
+        if gnss.sky:
+            satellites = int(np.count_nonzero(~stage.at(t).blocked(self._lines_of_sight(antenna))))
+            if satellites < _LEAST:
+                return None
+            worse = math.sqrt(_IN_VIEW / satellites)
+        enu = antenna + worse * self._error + worse * gnss.noise * fresh[1] + np.array(gnss.bias)
         latitude, longitude, altitude = geodetic(enu, gnss.latitude, gnss.longitude, gnss.altitude)
         return NavSatFix(
             stamp=stamp,
@@ -60,7 +77,12 @@ class GnssModel:
             latitude=latitude,
             longitude=longitude,
             altitude=altitude,
-            satellites=int(rng.integers(8, 13)),
+            satellites=satellites,
             covariance_type="diagonal_known",
-            covariance=np.diag((gnss.noise**2 + gnss.drift**2) * scale**2),
+            covariance=np.diag(worse**2 * (gnss.noise**2 + gnss.drift**2) * scale**2),
         )
+
+    def _lines_of_sight(self, antenna: Array) -> NDArray[np.float32]:
+        """Rays (S, 6) from the antenna towards the satellites."""
+        rays = np.concatenate([np.broadcast_to(antenna, self._satellites.shape), _FAR * self._satellites], axis=1)
+        return rays.astype(np.float32)

@@ -10,39 +10,35 @@ import math
 import numpy as np
 
 from dataflow.messages import Imu
-from operators.sources.simulator.frames import Array, mounted
+from operators.sources.simulator.drive import Drive
+from operators.sources.simulator.frames import Array, place
 from operators.sources.simulator.settings import Inertial
-from operators.sources.simulator.trajectory import Trajectory
 
 
-def true_reading(path: Trajectory, imu: Inertial, t: float) -> tuple[Array, Array]:
+def true_reading(drive: Drive, imu: Inertial, t: float) -> tuple[Array, Array]:
     """Angular velocity (rad/s) and specific force (m/s²) in the sensor's frame, without error.
 
-    The robot turns about its z axis alone: at the lever (x, y) from its origin a turn adds α × l + ω × (ω × l).
+    At the lever l from the body's origin a turn adds α × l + ω × (ω × l).
     """
-    motion = path.at([t])
-    T_base_imu = mounted(imu.mount)
-    x, y, _ = T_base_imu[:3, 3]
-    rate, change = float(motion.yaw_rate[0]), float(motion.yaw_acceleration[0])
-    ax, ay = motion.acceleration[0]
-    c, s = math.cos(motion.yaw[0]), math.sin(motion.yaw[0])
-    forward = c * ax + s * ay - change * y - rate * rate * x
-    left = -s * ax + c * ay + change * x - rate * rate * y
+    state = drive.state(t)
+    T_base_imu = place(imu)
+    lever, omega = T_base_imu[:3, 3], state.angular
+    up = state.T_world_base[2, :3]
+    force = state.acceleration + imu.gravity * up
+    force = force + np.cross(state.angular_acceleration, lever) + np.cross(omega, np.cross(omega, lever))
     R_imu_base = T_base_imu[:3, :3].T
-    return R_imu_base @ [0.0, 0.0, rate], R_imu_base @ [forward, left, imu.gravity]
+    return R_imu_base @ omega, R_imu_base @ force
 
 
 class ImuModel:
     """The sensor with its walking biases: one call for every tick, in order."""
 
     def __init__(self, imu: Inertial) -> None:
-        self._imu = imu
         self.gyro_bias = np.array(imu.gyro_bias)
         self.accel_bias = np.array(imu.accel_bias)
 
-    def measure(self, path: Trajectory, t: float, rng: np.random.Generator, stamp: int, frame: str) -> Imu:
-        imu = self._imu
-        omega, force = true_reading(path, imu, t)
+    def measure(self, imu: Inertial, drive: Drive, t: float, rng: np.random.Generator, stamp: int, frame: str) -> Imu:
+        omega, force = true_reading(drive, imu, t)
         white = math.sqrt(imu.rate)  # of a density, sampled at the rate
         noise = rng.standard_normal((4, 3))
         self.gyro_bias = self.gyro_bias + imu.gyro_walk / white * noise[2]

@@ -12,21 +12,11 @@ from operators.sources.simulator.body import drawn_body
 from operators.sources.simulator.furnishing import FLOOR, Wall, put_desk
 from operators.sources.simulator.furniture import Surface
 from operators.sources.simulator.lanes import ROVER, WALKER
-from operators.sources.simulator.movers import (
-    Carried,
-    Driving,
-    Person,
-    Polyline,
-    Rolling,
-    Seat,
-    Timeline,
-    coffee_break,
-    errand,
-    pacing,
-    person_doing,
-)
+from operators.sources.simulator.movers import Carried, Driving, Rolling
+from operators.sources.simulator.persons import Person, person_doing
 from operators.sources.simulator.scene import Builder
-from operators.sources.simulator.shapes import Array, pose
+from operators.sources.simulator.scripts import Point, Polyline, Timeline, coffee_break, errand, pacing
+from operators.sources.simulator.shapes import Array, Shape, pose
 from operators.sources.simulator.trajectory import Trajectory
 
 Rng = np.random.Generator
@@ -78,23 +68,33 @@ def seat_person(builder: Builder, rng: Rng, place: Place, path: Array, timeline:
     side = place.pelvis[:2] - place.T_mug[:2, 3]
     side = side / np.linalg.norm(side)
     grasp = place.T_mug[:3, 3] + np.array([0.055 * side[0], 0.055 * side[1], 0.055])
-    seat = Seat(place.pelvis + np.array([0, 0, 0.012 * body.height]))
-    person = Person(body, path, timeline, seat=seat, grasp=grasp, hand=place.hand)
+    pelvis = place.pelvis + np.array([0, 0, 0.012 * body.height])
+    timeline = timeline.with_place(as_point(pelvis), as_point(grasp))
+    person = Person(body, path, timeline, hand=place.hand)
     id = builder.new_id()
     builder.move("person", body.parts, person, id=id)
-    reached = next(
-        sum(a.seconds for a in timeline.acts[: k + 1]) for k, a in enumerate(timeline.acts) if a.activity == "reaching"
-    )
-    mug = Carried(place.T_mug, person, reached - 1e-6 - timeline.phase)
-    builder.move("mug", (objects.mug(rng),), mug, id=place.mug)
-    builder.relate(place.mug, "on", place.table, lambda t: not person.held(t))
-    builder.relate(id, "holding", place.mug, person.held)
-    builder.relate(id, "sitting_on", place.chair, person.seated)
-    builder.relate(id, "on", FLOOR, lambda t: not person.seated(t))
-    builder.relate(id, "reaching_for", place.mug, lambda t: timeline.at(t)[0].activity == "reaching")
+    carry(builder, person, place.mug, objects.mug(rng), "mug", place.T_mug, place.table)
+    builder.relate(id, "holding", place.mug, lambda t: person.held(t) == place.mug)
+    builder.relate(id, "sitting_on", place.chair, lambda t: person.seat(t) is not None)
+    builder.relate(id, "on", FLOOR, lambda t: person.seat(t) is None)
+    builder.relate(id, "reaching_for", place.mug, lambda t: person.reached_for(t) == place.mug)
     builder.scripts.append(lambda t: person_doing(id, person, t))
     builder.reserve(id, np.concatenate([Polyline(path).line(), place.pelvis[None, :2]]), WALKER)
     return id
+
+
+def carry(builder: Builder, person: Person, id: int, shape: Shape, label: str, T: Array, on: int) -> None:
+    """A thing that lies on another one and that a person takes and puts back, as its script says."""
+    acts, timeline = person.timeline.acts, person.timeline
+    first = next(k for k, act in enumerate(acts) if act.object == id and act.activity == "reaching")
+    reached = sum(act.seconds for act in acts[: first + 1])
+    builder.move(label, (shape,), Carried(id, T, person, reached - 1e-6 - timeline.phase), id=id)
+    builder.relate(id, "on", on, lambda t: person.held(t) != id)
+
+
+def as_point(p: Array) -> Point:
+    """A place (3,) as a tuple."""
+    return float(p[0]), float(p[1]), float(p[2])
 
 
 def add_desk_worker(builder: Builder, rng: Rng, wall: Wall, along: float, sense: int, far: float, out: float) -> int:

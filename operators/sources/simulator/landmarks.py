@@ -8,7 +8,7 @@ import numpy as np
 
 from dataflow.messages import LandmarkSightings
 from dataflow.messages.geometry import invert, transform_points
-from operators.sources.simulator.frames import mounted
+from operators.sources.simulator.frames import place
 from operators.sources.simulator.settings import Landmarks
 from operators.sources.simulator.stage import Stage
 
@@ -18,7 +18,7 @@ def sightings(
 ) -> LandmarkSightings:
     """Those landmarks that are within range and field, and that nothing hides."""
     landmarks = stage.world.landmarks
-    T_world_sensor = stage.T_world_base(t) @ mounted(sensor.mount)
+    T_world_sensor = stage.T_world_base(t) @ place(sensor)
     p = transform_points(invert(T_world_sensor), landmarks)
     ranges, bearings = np.linalg.norm(p, axis=1), np.arctan2(p[:, 1], p[:, 0])
     elevations = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))

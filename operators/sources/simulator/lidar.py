@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from dataflow.messages import PointCloud
-from operators.sources.simulator.frames import mounted
+from operators.sources.simulator.frames import place
 from operators.sources.simulator.settings import Lidar
 from operators.sources.simulator.stage import Stage
 
@@ -29,7 +29,7 @@ def sweep(stage: Stage, lidar: Lidar, t: float, rng: np.random.Generator, stamp:
     )
     before = (np.arange(lidar.columns) + 1) / lidar.columns - 1  # share of a turn before its end
     offsets = before / lidar.rate if lidar.motion else np.zeros(lidar.columns)
-    T = stage.world.path.at(t + offsets).T_world_base() @ mounted(lidar.mount)
+    T = stage.drive.poses(t + offsets) @ place(lidar)
     rays = np.empty((lidar.columns, lidar.rings, 6), np.float32)
     rays[..., :3] = T[:, None, :3, 3]
     rays[..., 3:] = np.einsum("cij,crj->cri", T[:, :3, :3], beams)

@@ -1,4 +1,5 @@
-"""What is put on furniture or carried: mugs, bottles, books, boxes, balls and monitors, of drawn size and colour.
+"""Things that are put on furniture or carried: mugs, bottles, books, boxes, balls and monitors, of drawn size and
+colour.
 
 As in `furniture`: origin below the middle, front towards +x.
 """

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import RadarScan
 from dataflow.messages.geometry import invert, transform_points
-from operators.sources.simulator.frames import Array, mounted
+from operators.sources.simulator.frames import Array, place
 from operators.sources.simulator.settings import Radar
 from operators.sources.simulator.stage import Stage
 
@@ -22,8 +22,7 @@ def scan(stage: Stage, radar: Radar, t: float, rng: np.random.Generator, stamp: 
     elevation = np.linspace(-_SPAN, _SPAN, _LAYERS)
     a, e = (grid.ravel() for grid in np.meshgrid(azimuth, elevation, indexing="ij"))
     beams = np.stack([np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)], axis=1)
-    T_base_radar = mounted(radar.mount)
-    T = stage.T_world_base(t) @ T_base_radar
+    T = stage.T_world_base(t) @ place(radar)
     rays = np.concatenate([np.broadcast_to(T[:3, 3], beams.shape), beams @ T[:3, :3].T], axis=1).astype(np.float32)
     hits = stage.at(t).cast(rays)
     distance = hits.distance.reshape(_CELLS, _LAYERS)
@@ -60,10 +59,7 @@ def scan(stage: Stage, radar: Radar, t: float, rng: np.random.Generator, stamp: 
 
 def _relative_velocity(stage: Stage, radar: Radar, t: float, points: Array, things: NDArray[np.int32]) -> Array:
     """Velocity (N, 3) of the points hit, relative to the antenna, in the world."""
-    motion = stage.world.path.at([t])
-    lever = motion.T_world_base()[0, :3, :3] @ mounted(radar.mount)[:3, 3]
-    antenna = np.zeros(3)
-    antenna[:2] = motion.velocity[0] + motion.yaw_rate[0] * np.array([-lever[1], lever[0]])
+    antenna = stage.drive.state(t).velocity_of(place(radar)[:3, 3])
     velocity = np.tile(-antenna, (len(points), 1))
     for k in np.unique(things):
         if k >= 0 and not stage.world.things[k].still:

@@ -32,7 +32,7 @@ larger; a is in_front_of b, nearer to the robot, when its x is smaller.
 
 
 class Nearness:
-    """Which things are near each other; pairs of things that stand still are worked out once."""
+    """Finds things that are near each other; pairs of things that stand still are worked out once."""
 
     def __init__(self, things: list[Thing]) -> None:
         self._things = things

@@ -8,99 +8,34 @@ is); on movers at every time, without shadows. Results do not depend on `threads
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Any, Protocol
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.sources.simulator.atlas import LEVELS, make_atlas
 from operators.sources.simulator.classes import CLASS_IDS, VOID
+from operators.sources.simulator.lighting import Baked, Floor, dimmed, direct
+from operators.sources.simulator.mesh import APART, Apart, Mesh, Scene, placed, shift
 from operators.sources.simulator.native import open3d
-from operators.sources.simulator.scene import Light, World
+from operators.sources.simulator.optics import F32, I32, Optics, View, camera_rays, inverse_lengths, rectangle
+from operators.sources.simulator.painting import SIZE
+from operators.sources.simulator.scene import World
 from operators.sources.simulator.shapes import Array, Patch
-from operators.sources.simulator.textures import LEVELS, SIZE, Atlas, make_atlas
-
-F32 = NDArray[np.float32]
-I32 = NDArray[np.int32]
 
 _CHUNK = 1 << 14  # pixels shaded at once: the work stays in the cache (and remap takes no more than 32,767)
 _NONE = 0xFFFFFFFF
-_APART = 64.0  # metres between things in the scene of silhouettes; no world is wider than half of it
 _SILHOUETTE_RAYS = 600  # about so many rays judge how much of a thing would be seen
-
-
-class _Scene(Protocol):
-    """What is used of Open3D's RaycastingScene; tensors are its own."""
-
-    def add_triangles(self, vertices: Any, triangles: Any) -> int: ...
-
-    def cast_rays(self, rays: Any, nthreads: int) -> Mapping[str, Any]: ...
-
-    def test_occlusions(self, rays: Any, tnear: float, tfar: float, nthreads: int) -> Any: ...
-
-
-@dataclass(frozen=True)
-class Optics:
-    """A pinhole camera: size in pixels, focal length and principal point in pixels."""
-
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-
-    def columns(self) -> Array:
-        """x / z (W,) of every column."""
-        return np.asarray((np.arange(self.width) - self.cx) / self.fx, np.float64)
-
-    def rows(self) -> Array:
-        """y / z (H,) of every row."""
-        return np.asarray((np.arange(self.height) - self.cy) / self.fy, np.float64)
-
-
-@lru_cache(maxsize=8)
-def _inverse_lengths(optics: Optics) -> F32:
-    """(H, W) of the directions with z = 1."""
-    x, y = optics.columns(), optics.rows()
-    return np.asarray(1 / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2), np.float32)
-
-
-def _rays(T_world_camera: Array, optics: Optics) -> F32:
-    """Origin and direction (H, W, 6) of every pixel in the world; z = 1 in the camera, so distances are depths."""
-    rays = np.empty((optics.height, optics.width, 6), np.float32)
-    rays[..., :3] = T_world_camera[:3, 3]
-    x, y = optics.columns(), optics.rows()
-    for axis in range(3):
-        a, b, c = T_world_camera[axis, :3]
-        np.add((a * x).astype(np.float32)[None], (b * y + c).astype(np.float32)[:, None], out=rays[..., 3 + axis])
-    return rays
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """What a camera sees, without noise.
-
-    `depth` (H, W) metres along z, infinite where nothing is hit; `cosine` (H, W) of the angle between ray and surface
-    normal; `triangle` (H, W) index of what is hit; `instances` and `classes` (H, W), 0 and `VOID` where nothing is
-    hit; `color` (H, W, 3) RGB 0 to 255 and beyond, or None where it was not asked for.
-    """
-
-    depth: F32
-    cosine: F32
-    triangle: I32
-    instances: NDArray[np.uint16]
-    classes: NDArray[np.uint8]
-    color: F32 | None
+_CUBE = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_SHRINK = np.array([0.5**k for k in range(LEVELS)], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """Where rays (N) end: `distance` in units of the rays' directions (infinite for none), `things` index or -1."""
+    """Ends of rays (N): `distance` in units of the rays' directions (infinite for none), `things` index or -1."""
 
     distance: F32
     normals: F32
@@ -108,45 +43,20 @@ class Hits:
     brightness: F32
 
 
-class _Mesh:
-    """Patches of several things as one mesh, with what shading needs to know of each triangle."""
-
-    def __init__(self, parts: list[tuple[int, int, Patch]], atlas: Atlas) -> None:
-        """`parts` are (index of the thing, index of the part's pose, patch)."""
-        patches = [patch for _, _, patch in parts]
-        offsets = np.cumsum([0, *(len(p.vertices) for p in patches)])
-        empty = np.zeros((0, 3))
-        self.vertices = np.concatenate([empty, *(p.vertices for p in patches)])
-        self.normals = np.concatenate([empty, *(p.normals for p in patches)])
-        self.triangles = np.concatenate(
-            [empty.astype(np.int64), *(p.triangles + o for p, o in zip(patches, offsets, strict=False))]
-        )
-        self.pose_of_vertex = np.repeat([pose for _, pose, _ in parts], [len(p.vertices) for p in patches]).astype(int)
-        self.glow = np.repeat([p.material.glow for p in patches], [len(p.vertices) for p in patches])
-        counts = [len(p.triangles) for p in patches]
-        self.thing_of_triangle = np.repeat([thing for thing, _, _ in parts], counts).astype(np.int32)
-
-        uvs = np.concatenate([np.zeros((0, 2)), *(p.uvs for p in patches)])[self.triangles]
-        uvs = uvs - np.floor(uvs.min(axis=1, keepdims=True, initial=np.inf)) if len(uvs) else uvs
-        self.uv = uvs.astype(np.float32)  # (T, 3, 2)
-        cell = [atlas.names.index(p.material.pattern) for p in patches]
-        self.origin = np.repeat(atlas.origins[cell], counts, axis=0).reshape(-1, 2)
-        tint = np.zeros((len(patches), 4), np.uint8)
-        tint[:, :3] = [np.clip(np.rint(np.array(p.material.tint) * 255), 0, 255) for p in patches] if patches else 0
-        self.tint = np.repeat(tint.view(np.uint32)[:, 0], counts)
-        corners = self.vertices[self.triangles]
-        area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        e1, e2 = self.uv[:, 1] - self.uv[:, 0], self.uv[:, 2] - self.uv[:, 0]
-        texels = np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) * SIZE * SIZE
-        self.density = np.sqrt(texels / np.maximum(area, 1e-12)).astype(np.float32)  # texels per metre
+def always_on(t: float) -> float:
+    """Lamps that shine at all times."""
+    return 1.0
 
 
 class Renderer:
     """Casts rays into one world. `at(t)` sets the time; everything else sees the world as it is then."""
 
-    def __init__(self, world: World, seed: int, *, threads: int = 1) -> None:
+    def __init__(
+        self, world: World, seed: int, *, threads: int = 1, level: Callable[[float], float] = always_on
+    ) -> None:
+        """`level` is the share of their strength with which lamps shine at a time."""
         self._o3d = open3d()
-        self.world, self._threads = world, threads
+        self.world, self._threads, self._level = world, threads, level
         things = world.things
         self._still = [k for k, thing in enumerate(things) if thing.still]
         self._movers = [k for k, thing in enumerate(things) if not thing.still]
@@ -156,8 +66,8 @@ class Renderer:
         still: list[tuple[int, int, Patch]] = []
         for k in self._still:
             T = things[k].mover.frame(0.0)
-            still += [(k, 0, _placed(patch, T)) for patch in things[k].parts[0]]
-        self._mesh = _Mesh(still, self._atlas)
+            still += [(k, 0, placed(patch, T)) for patch in things[k].parts[0]]
+        self._mesh = Mesh(still, self._atlas)
         self._scene = self._build(self._mesh.vertices, self._mesh.triangles)
         moving: list[tuple[int, int, Patch]] = []
         pose = 0
@@ -165,13 +75,11 @@ class Renderer:
             for part in things[k].parts:
                 moving += [(k, pose, patch) for patch in part]
                 pose += 1
-        self._moving = _Mesh(moving, self._atlas)
-        self._mover_vertices = [
-            np.flatnonzero(_thing_of_vertex(self._moving) == k) for k in self._movers
-        ]  # vertices of each mover
+        self._moving = Mesh(moving, self._atlas)
+        self._mover_vertices = [np.flatnonzero(self._moving.thing_of_vertex == k) for k in self._movers]
 
-        received = _bake(world, self._mesh.vertices, self._mesh.normals, self._occluded)
-        light = np.where(self._mesh.glow > 0, self._mesh.glow, received).astype(np.float32)
+        lamps = [k for k, thing in enumerate(things) if thing.label == "lamp"]
+        self._baked = Baked.of(world, self._mesh, lamps, self._occluded)
         both = (self._mesh, self._moving)
         self._thing_of_triangle = np.concatenate([m.thing_of_triangle for m in both])
         self._id_of_thing = np.array([*(thing.id for thing in things), 0], np.uint16)
@@ -183,20 +91,25 @@ class Renderer:
         self._tint = np.concatenate([m.tint for m in both])
         self._density = np.concatenate([m.density for m in both])
         self._lights = [np.zeros(len(uv), np.float32) for _ in range(3)]  # l0, dl1, dl2
-        self._set_light(slice(0, len(self._mesh.triangles)), self._mesh.triangles, light)
         self._first_moving = len(self._mesh.triangles)
-        self._floor = _Floor(self._mesh, light, [k for k, thing in enumerate(things) if thing.label == "floor"])
+        self._floor = Floor(self._mesh, [k for k, thing in enumerate(things) if thing.label == "floor"])
+        self._lit: float | None = None
         self._time: float | None = None
-        self._apart: _Apart | None = None
+        self._apart: Apart | None = None
         self._corners: dict[int, Array] = {}
         self.at(0.0)
 
     def at(self, t: float) -> None:
-        """Poses the movers."""
+        """Poses the movers and switches the lamps."""
         if self._time == t:
             return
         self._time = t
-        self._apart_movers: _Scene | None = None
+        level = self._level(t)
+        if level != self._lit:
+            self._lit = level
+            self._still_light = self._baked.at(level)
+            self._set_light(slice(0, self._first_moving), self._mesh.triangles, self._still_light)
+        self._apart_movers: Scene | None = None
         if not self._movers:
             return
         things = self.world.things
@@ -206,15 +119,16 @@ class Renderer:
         normals = np.einsum("vij,vj->vi", of[:, :3, :3], self._moving.normals)
         self._moved = vertices
         self._moving_scene = self._build(vertices, self._moving.triangles)
-        received = _lamps(self.world.lights, vertices, normals) + self.world.ambient * (0.72 + 0.13 * normals[:, 2])
+        received = direct(self.world.lights, level, vertices, normals)
+        received += dimmed(self.world, level) * self.world.ambient * (0.72 + 0.13 * normals[:, 2])
         light = np.where(self._moving.glow > 0, self._moving.glow, received).astype(np.float32)
         self._set_light(slice(self._first_moving, None), self._moving.triangles, light)
-        shaded = self._floor.shaded([vertices[own] for own in self._mover_vertices])
+        shaded = self._floor.shaded(self._still_light, [vertices[own] for own in self._mover_vertices])
         self._set_light(self._floor.triangles, self._mesh.triangles[self._floor.triangles], shaded)
 
     def view(self, T_world_camera: Array, optics: Optics, *, color: bool = True) -> View:
-        """What a camera at `T_world_camera` (optical frame) sees now."""
-        rays = _rays(T_world_camera, optics)
+        """Returns what a camera at `T_world_camera` (optical frame) sees now."""
+        rays = camera_rays(T_world_camera, optics)
         depth, triangle, weights, normals = self._first_hit(self._scene, rays)
         for rows, columns in self._rectangles(T_world_camera, optics):
             part = np.ascontiguousarray(rays[rows, columns])
@@ -224,7 +138,7 @@ class Renderer:
             triangle[rows, columns][nearer] = i[nearer] + self._first_moving
             weights[rows, columns][nearer] = w[nearer]
             normals[rows, columns][nearer] = n[nearer]
-        cosine = np.abs(np.einsum("hwi,hwi->hw", normals, rays[..., 3:])) * _inverse_lengths(optics)
+        cosine = np.abs(np.einsum("hwi,hwi->hw", normals, rays[..., 3:])) * inverse_lengths(optics)
         things = np.where(np.isfinite(depth), self._thing_of_triangle.take(triangle, mode="clip"), -1)
         instances = self._id_of_thing.take(things)
         classes = self._class_of_thing.take(things)
@@ -246,7 +160,7 @@ class Renderer:
         return Hits(distance, normals, things.astype(np.int32), tint.mean(axis=1).astype(np.float32) / 255)
 
     def blocked(self, rays: F32) -> NDArray[np.bool_]:
-        """Whether something lies on each ray (N, 6) before its direction's full length."""
+        """Tells whether something lies on each ray (N, 6) before its direction's full length."""
         return np.asarray(self.cast(rays).distance < 1.0)
 
     def silhouette(self, things: list[int], T_world_camera: Array, optics: Optics) -> Array:
@@ -257,7 +171,7 @@ class Renderer:
         border of one image size on each side.
         """
         if self._apart is None:
-            self._apart = _Apart(self._mesh, self._moving, self._build)
+            self._apart = Apart(self._mesh, self._moving, self._build)
         counts = np.zeros(len(things))
         still: list[tuple[int, F32, int]] = []
         moving: list[tuple[int, F32, int]] = []
@@ -265,10 +179,10 @@ class Renderer:
         R = T_world_camera[:3, :3].astype(np.float32)
         for slot, k in enumerate(things):
             own = self._corners_of(k) if self.world.things[k].still else self._moved[self._vertices_of(k)]
-            rectangle = _rectangle(transform_points(T_camera_world, own), optics, margin=1.0)
-            if rectangle is None:
+            corners = rectangle(transform_points(T_camera_world, own), optics, margin=1.0)
+            if corners is None:
                 continue
-            left, top, right, bottom = rectangle
+            left, top, right, bottom = corners
             stride = max(1, int(np.ceil(np.sqrt((right - left) * (bottom - top) / _SILHOUETTE_RAYS))))
             u, v = np.meshgrid(
                 np.arange(left + stride // 2, right, stride, dtype=np.float32),
@@ -280,7 +194,7 @@ class Renderer:
                 [(u.ravel() - optics.cx) / optics.fx, (v.ravel() - optics.cy) / optics.fy, np.ones(u.size)]
             )
             rays[:, 3:] = (R @ local.astype(np.float32)).T
-            rays[:, :2] += _shift(np.array([k]))[0, :2].astype(np.float32)
+            rays[:, :2] += shift(np.array([k]))[0, :2].astype(np.float32)
             (still if self.world.things[k].still else moving).append((slot, rays, stride))
         scenes = [(still, self._apart.scene)] if still else []
         if moving:
@@ -291,7 +205,7 @@ class Renderer:
             distance, *_ = self._first_hit(scene, np.concatenate([rays for _, rays, _ in jobs]))
             end = 0
             for slot, rays, stride in jobs:
-                near = distance[end : end + len(rays)] < 0.5 * _APART
+                near = distance[end : end + len(rays)] < 0.5 * APART
                 counts[slot] = np.count_nonzero(near) * stride * stride
                 end += len(rays)
         return counts
@@ -306,14 +220,14 @@ class Renderer:
     def _vertices_of(self, thing: int) -> NDArray[np.int64]:
         return self._mover_vertices[self._movers.index(thing)]
 
-    def _build(self, vertices: Array, triangles: NDArray[np.int64]) -> _Scene:
+    def _build(self, vertices: Array, triangles: NDArray[np.int64]) -> Scene:
         """A scene of one mesh. Open3D commits it at the first cast."""
         core = self._o3d.core
-        scene: _Scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
+        scene: Scene = self._o3d.t.geometry.RaycastingScene(nthreads=self._threads)
         scene.add_triangles(core.Tensor(vertices.astype(np.float32)), core.Tensor(triangles.astype(np.uint32)))
         return scene
 
-    def _first_hit(self, scene: _Scene, rays: F32) -> tuple[F32, I32, F32, F32]:
+    def _first_hit(self, scene: Scene, rays: F32) -> tuple[F32, I32, F32, F32]:
         """Distance, triangle (0 where nothing is hit), weights of corners 1 and 2, and unit normal per ray (..., 6)."""
         tensor = self._o3d.core.Tensor.from_numpy(rays)
         answer = scene.cast_rays(tensor, nthreads=self._threads)
@@ -338,9 +252,9 @@ class Renderer:
         """Rows and columns of the image that each mover may cover."""
         T_camera_world = invert(T_world_camera)
         for vertices in self._mover_vertices:
-            rectangle = _rectangle(transform_points(T_camera_world, self._moved[vertices]), optics, margin=0.0)
-            if rectangle is not None:
-                left, top, right, bottom = rectangle
+            corners = rectangle(transform_points(T_camera_world, self._moved[vertices]), optics, margin=0.0)
+            if corners is not None:
+                left, top, right, bottom = corners
                 yield slice(top, bottom), slice(left, right)
 
     def _shade(self, triangle: I32, weights: F32, depth: F32, cosine: F32, optics: Optics) -> F32:
@@ -366,121 +280,5 @@ class Renderer:
             tint = np.ascontiguousarray(self._tint.take(i).view(np.uint8).reshape(-1, 4)[:, :3])
             albedo = cv2.multiply(texels, tint, scale=1 / 255)
             out[part] = cv2.multiply(albedo, cv2.merge([light, light, light]).reshape(-1, 3), dtype=cv2.CV_32F)
-        out[~np.isfinite(z)] = 0
+        out[~np.isfinite(z)] = self.world.sky
         return out.reshape(*shape, 3)
-
-
-class _Floor:
-    """The floor's light, dimmed below movers: a soft shadow without which they would seem to float."""
-
-    def __init__(self, mesh: _Mesh, light: F32, floors: list[int]) -> None:
-        self.triangles = np.flatnonzero(np.isin(mesh.thing_of_triangle, floors))
-        self._vertices = np.unique(mesh.triangles[self.triangles])
-        self._places = mesh.vertices[self._vertices, :2]
-        self._light = light
-
-    def shaded(self, movers: list[Array]) -> F32:
-        """Light (V,) on all still vertices, given the movers' vertices (N, 3)."""
-        factor = np.ones(len(self._vertices))
-        for vertices in movers:
-            low = vertices[vertices[:, 2] < 0.35, :2]
-            if len(low):
-                middle, spread = low.mean(axis=0), 0.1 + low.std(axis=0).mean()
-                square = ((self._places - middle) ** 2).sum(axis=1)
-                factor *= 1 - 0.45 * np.exp(-square / (2 * spread**2))
-        light = self._light.copy()
-        light[self._vertices] *= factor.astype(np.float32)
-        return light
-
-
-class _Apart:
-    """The same things, each in a place of its own, far from all others: what each alone would look like."""
-
-    def __init__(self, still: _Mesh, moving: _Mesh, build: Callable[[Array, NDArray[np.int64]], _Scene]) -> None:
-        self._build = build
-        self._still, self._moving = still, moving
-        self.scene = build(still.vertices + _shift(_thing_of_vertex(still)), still.triangles)
-        self._offset = _shift(_thing_of_vertex(moving))
-
-    def movers(self, vertices: Array) -> _Scene:
-        return self._build(vertices + self._offset, self._moving.triangles)
-
-
-_CUBE = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-_SHRINK = np.array([0.5**k for k in range(LEVELS)], np.float32)
-
-
-def _shift(things: NDArray[np.int32]) -> Array:
-    shift = np.zeros((len(things), 3))
-    shift[:, 0], shift[:, 1] = _APART * (things % 32), _APART * (things // 32)
-    return shift
-
-
-def _thing_of_vertex(mesh: _Mesh) -> NDArray[np.int32]:
-    of = np.zeros(len(mesh.vertices), np.int32)
-    of[mesh.triangles] = mesh.thing_of_triangle[:, None]
-    return of
-
-
-def _placed(patch: Patch, T: Array) -> Patch:
-    return Patch(
-        transform_points(T, patch.vertices), patch.normals @ T[:3, :3].T, patch.uvs, patch.triangles, patch.material
-    )
-
-
-def _rectangle(points: Array, optics: Optics, margin: float) -> tuple[int, int, int, int] | None:
-    """(left, top, right, bottom) in pixels around points (N, 3) in the camera's frame, or None where none is seen.
-
-    It is cut at `margin` image sizes outside the image.
-    """
-    z = points[:, 2]
-    near = 0.05
-    if z.max() <= near:
-        return None
-    w, h = optics.width, optics.height
-    low_u, low_v, high_u, high_v = -margin * w, -margin * h, (1 + margin) * w, (1 + margin) * h
-    if z.min() > near:
-        u, v = points[:, 0] / z * optics.fx + optics.cx, points[:, 1] / z * optics.fy + optics.cy
-        low_u, high_u = max(low_u, float(u.min()) - 1), min(high_u, float(u.max()) + 2)
-        low_v, high_v = max(low_v, float(v.min()) - 1), min(high_v, float(v.max()) + 2)
-    left, top, right, bottom = int(np.floor(low_u)), int(np.floor(low_v)), int(np.ceil(high_u)), int(np.ceil(high_v))
-    return (left, top, right, bottom) if left < right and top < bottom else None
-
-
-def _lamps(lights: tuple[Light, ...], points: Array, normals: Array) -> Array:
-    """Direct light (V,) on points with normals, without shadows."""
-    total = np.zeros(len(points))
-    for light in lights:
-        total += _lamp(light, np.array(light.position), points, normals)
-    return total
-
-
-def _lamp(light: Light, position: Array, points: Array, normals: Array) -> Array:
-    to = position - points
-    square = (to * to).sum(axis=1)
-    lambert = np.maximum(0, (to * normals).sum(axis=1)) / np.sqrt(np.maximum(square, 1e-9))
-    return np.asarray(light.strength * lambert / np.maximum(square, 0.25))
-
-
-def _bake(world: World, vertices: Array, normals: Array, occluded: Callable[[F32, float], NDArray[np.bool_]]) -> Array:
-    """Light (V,) on still vertices: lamps with soft shadows, and ambient light where the surroundings are open."""
-    rng = np.random.default_rng(20)  # only where on a lamp and in the half sphere the few samples lie
-    start = vertices + 4e-3 * normals
-    total = np.zeros(len(vertices))
-    samples = 4
-    for light in world.lights:
-        for _ in range(samples):
-            spot = np.array(light.position) + rng.uniform(-1, 1, 3) * [light.radius, light.radius, 0.02]
-            received = _lamp(light, spot, vertices, normals)
-            lit = received > 1e-4
-            rays = np.concatenate([start[lit], spot - start[lit]], axis=1).astype(np.float32)
-            received[lit] *= ~occluded(rays, 0.999)
-            total += received / samples
-    openness = np.zeros(len(vertices))
-    directions = rng.standard_normal((20, 3))
-    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    for direction in directions:
-        toward = normals + 0.98 * direction  # cosine-weighted about the normal
-        toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-        openness += ~occluded(np.concatenate([start, toward], axis=1).astype(np.float32), 0.8)
-    return total + world.ambient * (0.15 + 0.85 * openness / len(directions))

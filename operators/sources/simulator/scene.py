@@ -1,4 +1,4 @@
-"""What a world is made of: things with shape and pose, lights, landmarks, the robot's path, and who rests on what."""
+"""Parts of a world: things with shape and pose, lights, landmarks, the robot's path, and who rests on what."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from operators.sources.simulator.trajectory import Trajectory
 
 
 class Mover(Protocol):
-    """How a thing moves; times in seconds since the start."""
+    """Motion of a thing; times in seconds since the start."""
 
     def frame(self, t: float) -> Array:
         """`T_world_thing` (4, 4): upright, on what the thing stands on."""
@@ -83,11 +83,17 @@ class Thing:
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp that shines in all directions; `strength` is its irradiance at 1 m, `radius` softens its shadows."""
+    """A lamp that shines in all directions; `strength` is its irradiance at 1 m, `radius` softens its shadows.
+
+    Movers throw and take no shadows: a lamp with an `area` (lowest and highest x and y) shines on those in it alone.
+    One that is not `switched`, the sun, shines whatever the lighting.
+    """
 
     position: tuple[float, float, float]
     strength: float
     radius: float = 0.25
+    area: tuple[tuple[float, float], tuple[float, float]] | None = None
+    switched: bool = True
 
 
 @dataclass(frozen=True)
@@ -101,7 +107,7 @@ class Relation:
 
 @dataclass(frozen=True)
 class Doing:
-    """What a mover does: an activity, on which object (-1 for none), since when (s), and the goal it was given."""
+    """Occupation of a mover: an activity, on which object (-1 for none), since when (s), and the goal it was given."""
 
     thing: int
     activity: str
@@ -116,6 +122,32 @@ class Placement:
 
     relation: Relation
     holds: Callable[[float], bool] | None = None
+
+
+@dataclass(frozen=True)
+class Order:
+    """Holds what is asked of a world.
+
+    `speed` (m/s) of the robot, `hold` (s) that it stands at first, whether there are `movers`, how many `people` are
+    among them, whether the robot makes a `tour` that crosses itself and sees places from several sides instead of a
+    round, and `jumps`: times (s) and shares of the round by which it is carried ahead.
+    """
+
+    speed: float
+    hold: float
+    movers: bool
+    people: int = 2
+    tour: bool = False
+    jumps: tuple[tuple[float, float], ...] = ()
+
+    def cast(self, roles: Sequence[str]) -> list[str]:
+        """Roles of movers: after the first two, as many give way to those who choose as there are more people."""
+        more = self.people - 2
+        return [*roles[:2], *["chooser"] * more, *roles[2 + more :]]
+
+    def drive(self, waypoints: Array, *, at_most: float = 1.0) -> Trajectory:
+        """The robot's path through waypoints (N, 2), nowhere faster than `at_most` (m/s)."""
+        return Trajectory(waypoints, speed=min(self.speed, at_most), hold=self.hold, jumps=self.jumps)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,13 +169,17 @@ class World:
     scripts: tuple[Callable[[float], Doing], ...] = ()
     floor_id: int = 0
     lanes: tuple[Lane, ...] = ()
+    daylight: float = 0.3
+    """Share of the ambient light that does not come from lamps."""
+    sky: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Colour where nothing is hit, RGB, 0 to 255."""
 
     def relations(self, t: float) -> list[Relation]:
         """The relations of placement and contact that hold at a time."""
         return [p.relation for p in self.placements if p.holds is None or p.holds(t)]
 
     def doings(self, t: float) -> list[Doing]:
-        """What every mover does at a time."""
+        """Returns what every mover does at a time."""
         return [script(t) for script in self.scripts]
 
     def thing(self, id: int) -> Thing:

@@ -1,10 +1,11 @@
-"""When sensors measure: each on its own grid of whole nanoseconds, merged into one sequence of stamps."""
+"""Schedule of the sensors' measurements: each on its own grid of whole nanoseconds, merged into one sequence of
+stamps."""
 
 from __future__ import annotations
 
 import heapq
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,6 +31,11 @@ def ticks(sensor: str, rate: float, first_stamp: int, end_stamp: int) -> Iterato
             return
         yield Tick(sensor, index, stamp)
         index += 1
+
+
+def ticks_at(sensor: str, stamps: Sequence[int], end_stamp: int) -> Iterator[Tick]:
+    """Ticks at given, rising stamps before the end."""
+    return (Tick(sensor, k, stamp) for k, stamp in enumerate(stamps) if stamp < end_stamp)
 
 
 def merged(streams: Mapping[str, Iterator[Tick]]) -> Iterator[tuple[int, list[Tick]]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -13,20 +14,41 @@ Mount = tuple[float, float, float, float, float, float]
 
 
 class Sensor(BaseModel):
-    """What all sensors have. A sensor with rate 0 is off and costs nothing."""
+    """Settings that all sensors have. A sensor with rate 0 is off and costs nothing."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     rate: float = Field(0.0, ge=0, le=1000, description="measurements a second; 0 switches the sensor off")
     phase: Duration = Field(0, description="time of the first measurement after the start")
     delay: Duration = Field(0, description="how much older than its stamp a measurement is: a wrong clock")
+    clock_drift: float = Field(
+        0.0, ge=0, lt=0.1, description="how much older it gets every second, seconds: a clock that goes wrong"
+    )
     dropout: float = Field(0.0, ge=0, le=1, description="probability that a measurement is missing")
     outages: tuple[tuple[float, float], ...] = Field(
         (), description="spans (from, to) in seconds since the start without any measurement"
     )
+    frozen: float = Field(0.0, ge=0, le=1, description="probability that a measurement repeats the last one")
 
 
-class ColorCamera(Sensor):
+class Placed(Sensor):
+    """A sensor with a place on the robot."""
+
+    mount_error: Mount = Field(
+        (0.0, 0.0, 0.0, 0.0, 0.0, 0.0),
+        description="where it really is, seen from where its calibration says: a wrong calibration",
+    )
+
+
+class Camera(Placed):
+    """A sensor with a calibration of its own."""
+
+    focal_error: float = Field(
+        0.0, gt=-0.5, lt=1, description="the calibration's focal length is too long by this share"
+    )
+
+
+class ColorCamera(Camera):
     """A colour camera with square pixels and no distortion."""
 
     rate: float = Field(10.0, ge=0, le=200, description="images a second; 0 switches the camera off")
@@ -50,7 +72,7 @@ class ColorCamera(Sensor):
     black: float = Field(0.0, ge=0, le=1, description="probability of a black frame")
 
 
-class DepthCamera(Sensor):
+class DepthCamera(Camera):
     """A depth camera that measures inverse depth, as stereo and structured light do: errors grow with z²."""
 
     rate: float = Field(10.0, ge=0, le=200, description="images a second; 0 switches the camera off")
@@ -73,10 +95,11 @@ class DepthCamera(Sensor):
     grazing: float = Field(0.12, ge=0, lt=1, description="no return where the cosine of ray and normal is less")
     edge_holes: float = Field(0.5, ge=0, le=1, description="probability of no return on the brink of a depth step")
     specks: float = Field(0.002, ge=0, le=1, description="probability of no return anywhere")
+    missing: float = Field(0.0, ge=0, le=1, description="share of the image without return, in patches")
     black: float = Field(0.0, ge=0, le=1, description="probability of a frame without any return")
 
 
-class StereoRig(Sensor):
+class StereoRig(Camera):
     """Two parallel cameras."""
 
     width: int = Field(320, ge=16, le=4096, description="columns")
@@ -93,7 +116,7 @@ class StereoRig(Sensor):
     black: float = Field(0.0, ge=0, le=1, description="probability of black frames")
 
 
-class Lidar(Sensor):
+class Lidar(Placed):
     """A rotating laser scanner; its stamp is the end of the sweep."""
 
     rings: int = Field(16, ge=1, le=256, description="laser channels")
@@ -114,7 +137,7 @@ class Lidar(Sensor):
     )
 
 
-class Inertial(Sensor):
+class Inertial(Placed):
     """An inertial measurement unit."""
 
     mount: Mount = Field((0.0, 0.0, 0.3, 0.0, 0.0, 0.0), description="place on the robot")
@@ -125,6 +148,23 @@ class Inertial(Sensor):
     gyro_bias: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="at the start, rad/s")
     accel_bias: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="at the start, m/s²")
     gravity: float = Field(9.80665, gt=0, description="m/s²")
+
+
+class Magnetometer(Placed):
+    """A magnetometer in the Earth's field, which iron in the building bends; the world's x axis points east."""
+
+    mount: Mount = Field((0.0, 0.0, 0.9, 0.0, 0.0, 0.0), description="place on the robot")
+    strength: float = Field(48e-6, gt=0, description="of the Earth's field, teslas")
+    inclination: float = Field(
+        1.12, ge=-1.58, le=1.58, description="how far the field points below the horizon, radians"
+    )
+    declination: float = Field(0.06, description="of magnetic from true north, eastwards, radians")
+    noise: float = Field(0.2e-6, ge=0, description="standard deviation, teslas")
+    hard_iron: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="field of the robot itself, teslas")
+    soft_iron: float = Field(0.0, ge=0, lt=0.5, description="the robot's iron stretches its x axis by this share")
+    disturbance: float = Field(
+        0.0, ge=0, description="standard deviation of the building's field, which changes over metres, teslas"
+    )
 
 
 class Wheels(Sensor):
@@ -144,7 +184,7 @@ class Wheels(Sensor):
     )
 
 
-class Radar(Sensor):
+class Radar(Placed):
     """A radar with a fan of cells: range, bearing and Doppler velocity of what reflects."""
 
     mount: Mount = Field((0.2, 0.0, 0.45, 0.0, 0.0, 0.0), description="place on the robot")
@@ -158,7 +198,7 @@ class Radar(Sensor):
     clutter: float = Field(0.5, ge=0, description="mean number of false detections a scan")
 
 
-class Landmarks(Sensor):
+class Landmarks(Placed):
     """Sightings of known landmarks by range and bearing."""
 
     mount: Mount = Field((0.0, 0.0, 0.62, 0.0, 0.0, 0.0), description="place on the robot")
@@ -171,7 +211,7 @@ class Landmarks(Sensor):
     missing: float = Field(0.05, ge=0, le=1, description="probability that a landmark in view is not seen")
 
 
-class Gnss(Sensor):
+class Gnss(Placed):
     """A satellite receiver; the world's origin has the given coordinates, its x axis points east."""
 
     mount: Mount = Field((0.0, 0.0, 1.2, 0.0, 0.0, 0.0), description="place of the antenna on the robot")
@@ -182,10 +222,57 @@ class Gnss(Sensor):
     drift: float = Field(0.3, ge=0, description="standard deviation of a slowly changing error, metres")
     drift_time: float = Field(30.0, gt=0, description="time in which that error changes, seconds")
     bias: tuple[float, float, float] = Field((0.0, 0.0, 0.0), description="east, north, up, metres")
+    sky: bool = Field(
+        False, description="satellites need a free line of sight: fewer give worse fixes, fewer than four none"
+    )
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """All sensors of the robot."""
+
+    color_camera: ColorCamera
+    depth_camera: DepthCamera
+    stereo: StereoRig
+    lidar: Lidar
+    inertial: Inertial
+    magnetometer: Magnetometer
+    wheels: Wheels
+    radar: Radar
+    landmarks: Landmarks
+    gnss: Gnss
+
+    def mounted(self) -> dict[str, Lidar | Inertial | Magnetometer | Radar | Landmarks | Gnss]:
+        """Those with a mount of their own, by frame."""
+        return {
+            "lidar": self.lidar,
+            "imu": self.inertial,
+            "magnetometer": self.magnetometer,
+            "radar": self.radar,
+            "landmark_sensor": self.landmarks,
+            "gnss": self.gnss,
+        }
+
+    def cast_rays(self) -> bool:
+        """Tells whether any that is on needs the renderer."""
+        seeing = (self.color_camera, self.depth_camera, self.stereo, self.lidar, self.radar, self.landmarks)
+        return any(sensor.rate for sensor in seeing) or bool(self.gnss.rate and self.gnss.sky)
+
+
+class Motion(BaseModel):
+    """Says how the robot's body is shaken on its way."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    bumps: float = Field(
+        0.0, ge=0, le=0.02, description="deviation of the floor's height under the robot, metres; it tilts accordingly"
+    )
+    sway: float = Field(0.0, ge=0, le=0.1, description="deviation of a swing as of a rig carried by hand, metres")
+    turn: float = Field(0.0, ge=0, le=0.3, description="the same in roll, pitch and yaw, radians")
 
 
 class Truth(BaseModel):
-    """What is known about the world itself. A rate of 0 switches a stream off."""
+    """Settings of the world itself. A rate of 0 switches a stream off."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -199,3 +286,11 @@ class Truth(BaseModel):
     spatial: bool = Field(
         True, description="add near, left_of and in_front_of to the relations of placement and contact"
     )
+    occupancy: bool = Field(False, description="the true map: which cells of the floor plan are taken")
+    resolution: float = Field(0.05, ge=0.01, le=1, description="side of a cell of it, metres")
+    band: tuple[float, float] = Field(
+        (0.05, 1.5), description="heights between which a thing takes the cells that it covers, metres"
+    )
+    surfaces: bool = Field(False, description="the true planes: floor, walls, table tops, boards")
+    mesh: bool = Field(False, description="the surface of all that stands still")
+    events: bool = Field(False, description="faults, kidnappings and lamps, when each begins and ends")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.sources.simulator.renderer import Optics, Renderer, View
+from operators.sources.simulator.drive import Drive, Shake
+from operators.sources.simulator.optics import Optics, View
+from operators.sources.simulator.renderer import Renderer, always_on
 from operators.sources.simulator.scene import World
 
 Array = NDArray[np.float64]
@@ -16,19 +19,28 @@ Array = NDArray[np.float64]
 class Stage:
     """Sensors that measure at one time from one place share one cast."""
 
-    def __init__(self, world: World, seed: int, *, threads: int = 1) -> None:
+    def __init__(
+        self,
+        world: World,
+        seed: int,
+        *,
+        threads: int = 1,
+        shakes: Sequence[Shake] = (),
+        level: Callable[[float], float] = always_on,
+    ) -> None:
         self.world = world
-        self._seed, self._threads = seed, threads
+        self.drive = Drive(world.path, shakes)
+        self._seed, self._threads, self._level = seed, threads, level
         self._last: tuple[tuple[float, bytes, Optics], View] | None = None
 
     @cached_property
     def renderer(self) -> Renderer:
         """Made when it is first asked for: sensors that cast no rays need none. Raises ImportError without Open3D."""
-        return Renderer(self.world, self._seed, threads=self._threads)
+        return Renderer(self.world, self._seed, threads=self._threads, level=self._level)
 
     def T_world_base(self, t: float) -> Array:
         """(4, 4)."""
-        return np.asarray(self.world.path.at([t]).T_world_base()[0])
+        return np.asarray(self.drive.poses([t])[0])
 
     def at(self, t: float) -> Renderer:
         """The renderer, set to a time."""
@@ -36,7 +48,7 @@ class Stage:
         return self.renderer
 
     def view(self, t: float, T_base_camera: Array, optics: Optics, *, color: bool) -> View:
-        """What a camera on the robot sees at a time."""
+        """Returns what a camera on the robot sees at a time."""
         key = (t, T_base_camera.tobytes(), optics)
         if self._last is not None and self._last[0] == key and (self._last[1].color is not None or not color):
             return self._last[1]

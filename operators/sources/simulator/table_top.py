@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from operators.sources.simulator import furniture, objects
+from operators.sources.simulator.choosers import add_chooser
 from operators.sources.simulator.furnishing import (
     FLOOR,
     Style,
@@ -20,12 +21,11 @@ from operators.sources.simulator.furnishing import (
     small_items,
 )
 from operators.sources.simulator.inhabitants import add_ball, add_drinker, add_walker, arm_room
-from operators.sources.simulator.scene import Builder, Light, World
+from operators.sources.simulator.scene import Builder, Light, Order, World
 from operators.sources.simulator.shapes import Array, pose
-from operators.sources.simulator.trajectory import Trajectory
 
 
-def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
+def table_top(seed: int, order: Order) -> World:
     """A room of about seven metres with one table, drawn from the seed."""
     rng = np.random.default_rng([seed, 3])
     half_x, half_y, height = rng.uniform(3.4, 3.8), rng.uniform(3.4, 3.8), rng.uniform(2.4, 2.7)
@@ -34,9 +34,15 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
     corners = [(-half_x, -half_y), (half_x, -half_y), (half_x, half_y), (-half_x, half_y)]
     walls = [Wall.between(corners[k], corners[(k + 1) % 4], height) for k in range(4)]
     walked, door_wall = (int(k) for k in rng.permutation(4)[:2])
-    if movers:
+    if order.movers:
         ways = [walls[walked].place(0.88, s * (walls[walked].length / 2 - 1.3)) for s in (-1.0, -0.3, 0.4, 1.0)]
         add_walker(builder, rng, np.array([T[:2, 3] for T in ways]))
+    kept: dict[int, tuple[float, float]] = {}
+    if order.movers:
+        others = [k for k in range(4) if k not in (walked, door_wall)]
+        for k in others[: order.people - 2]:
+            half = walls[k].length / 2 - 1.5
+            kept[k] = add_chooser(builder, rng, walls[k], -half, half)
     for k, wall in enumerate(walls):
         raise_wall(builder, wall, style, accent=k == 0)
         half = wall.length / 2 - 0.6
@@ -45,9 +51,11 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         if k == door_wall:
             put_on_floor(builder, "door", furniture.door(rng, 0.9, 2.05, rng.uniform(0, 0.4)), wall.place(0.0, 0.0))
             taken, free = [(-0.6, 0.6)], [(-half, -0.65), (0.65, half)]
+        if k in kept:
+            free = [(-half, kept[k][0]), (kept[k][1], half)]
         line_wall(builder, rng, wall, free, depth=0.55)
         decorate(builder, rng, wall, windows=k % 2 == 0, taken=taken)
-    _lay_table(builder, rng, movers)
+    _lay_table(builder, rng, order.movers)
     lights = tuple(
         Light((0.9 * math.cos(a), 0.9 * math.sin(a), height - 0.1), rng.uniform(1.4, 1.9))
         for a in rng.uniform(0, 6) + np.array([0, 2.1, 4.2])
@@ -64,7 +72,7 @@ def table_top(seed: int, *, speed: float, hold: float, movers: bool) -> World:
         tuple(builder.things),
         lights,
         0.62,
-        Trajectory(_circle(rng), speed=min(speed, 0.6), hold=hold),
+        order.drive(_rosette() if order.tour else _circle(rng), at_most=0.6),
         landmarks,
         (0.0, 0.12, rng.uniform(1.15, 1.3), 0.0, math.radians(rng.uniform(15, 19)), math.pi / 2),
         tuple(builder.placements),
@@ -77,6 +85,13 @@ def _circle(rng: np.random.Generator) -> Array:
     """Waypoints counter-clockwise around the table: what the robot's left camera sees is the table."""
     angle = np.linspace(0, 2 * math.pi, 12, endpoint=False) + rng.uniform(0, 6)
     radius = 1.86 + 0.07 * np.sin(2 * angle + rng.uniform(0, 6))
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+
+
+def _rosette() -> Array:
+    """Waypoints of two rounds, now nearer and now farther, that cross each other three times."""
+    angle = np.linspace(0, 4 * math.pi, 28, endpoint=False)
+    radius = 1.78 + 0.13 * np.sin(1.5 * angle)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
 
 

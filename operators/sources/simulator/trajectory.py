@@ -7,6 +7,7 @@ differentiable), its heading is its tangent, as a robot with two driven wheels m
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,17 +46,25 @@ class Trajectory:
     """A closed path through waypoints (N, 2), driven again and again.
 
     The robot stands still for `hold` seconds, then speeds up within `ramp` seconds. `speed` (m/s) is kept on straights
-    and lowered in curves so that the turning rate stays within `turn_rate` (rad/s).
+    and lowered in curves so that the turning rate stays within `turn_rate` (rad/s). Each of `jumps` is a time and a
+    share of the round by which the robot is carried ahead at that time, in no time: a kidnapping.
     """
 
     def __init__(
-        self, waypoints: ArrayLike, *, speed: float = 0.6, turn_rate: float = 0.7, hold: float = 0.0, ramp: float = 1.5
+        self,
+        waypoints: ArrayLike,
+        *,
+        speed: float = 0.6,
+        turn_rate: float = 0.7,
+        hold: float = 0.0,
+        ramp: float = 1.5,
+        jumps: Sequence[tuple[float, float]] = (),
     ) -> None:
         """Raises ValueError for fewer than four waypoints."""
         points = np.asarray(waypoints, np.float64)
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 4:
             raise ValueError(f"a closed path needs at least four waypoints (N, 2), got shape {points.shape}")
-        self.hold, self.ramp = hold, ramp
+        self.hold, self.ramp, self._jumps = hold, ramp, tuple(jumps)
         samples, times = _timed(points, speed, turn_rate)
         self.period = float(times[-1])
         knots = np.linspace(0, self.period, max(24, math.ceil(self.period * 4)) + 1)
@@ -76,7 +85,7 @@ class Trajectory:
     def at(self, times: ArrayLike) -> Motion:
         """The state at `times` (N,) seconds since the start; earlier ones stand still at the first pose."""
         t = np.atleast_1d(np.asarray(times, np.float64))
-        tau, d1, d2 = self._phase(t)
+        tau, d1, d2 = self.clock(t)
         rounds = np.floor(tau / self.period)
         inside = tau - rounds * self.period
         p, v, a, j = (curve(inside) for curve in self._curve)
@@ -101,8 +110,15 @@ class Trajectory:
         """(count, 2) points of the whole path."""
         return np.asarray(self._curve[0](np.linspace(0, self.period, count, endpoint=False)))
 
+    def clock(self, t: Array) -> tuple[Array, Array, Array]:
+        """Time along the curve (N,) and its two derivatives; it leaps where the robot is carried ahead."""
+        tau, d1, d2 = self._phase(t)
+        for at, share in self._jumps:
+            tau = tau + np.where(t >= at, share * self.period, 0.0)
+        return tau, d1, d2
+
     def _phase(self, t: Array) -> tuple[Array, Array, Array]:
-        """Time along the curve and its two derivatives: a seventh-order start without a jerk.
+        """The same without being carried: a seventh-order start without a jerk.
 
         Its slope is the smootherstep 6x⁵ − 15x⁴ + 10x³ of x = (t − hold) / ramp.
         """

@@ -1,18 +1,22 @@
-"""What is true of the world, as messages: boxes in the image and in space, masks, poses, activities and relations."""
+"""Ground truth of the world, as messages: boxes in the image and in space, masks, poses, activities and relations."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Activity, Boxes3D, Detections2D, Odometry, SceneGraph, SegmentationMap
+from dataflow.messages import Activity, Boxes3D, Detections2D, Diagnostics, Level, Odometry, SceneGraph, SegmentationMap
 from dataflow.messages.geometry import matrix_to_quaternion
 from operators.sources.simulator.classes import ACTIVITIES, ACTIVITY_IDS, CLASS_IDS, CLASSES, THINGS, VOID
+from operators.sources.simulator.drive import Drive
+from operators.sources.simulator.events import Change
 from operators.sources.simulator.furnishing import FLOOR
+from operators.sources.simulator.optics import Optics, View
 from operators.sources.simulator.relations import Nearness, spatial
-from operators.sources.simulator.renderer import Optics, Renderer, View
+from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Thing, World
-from operators.sources.simulator.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 _STEP = 1e-3  # seconds; velocities are differences over twice that
@@ -96,10 +100,10 @@ def detections(
 
 
 def velocity(thing: Thing, t: float) -> Array:
-    """Of a thing's own frame, m/s, in the world."""
+    """Of the middle of a thing's box, m/s, in the world: a limb that swings moves it too."""
     if thing.still:
         return np.zeros(3)
-    before, after = (thing.mover.frame(t + dt)[:3, 3] for dt in (-_STEP, _STEP))
+    before, after = (thing.box(t + dt)[0][:3, 3] for dt in (-_STEP, _STEP))
     return np.asarray((after - before) / (2 * _STEP))
 
 
@@ -110,21 +114,21 @@ def masks(view: View, stamp: int, frame: str) -> SegmentationMap:
     )
 
 
-def base_state(path: Trajectory, t: float, stamp: int, world_frame: str, base_frame: str) -> Odometry:
+def base_state(drive: Drive, t: float, stamp: int, world_frame: str, base_frame: str) -> Odometry:
     """The robot's true pose and velocity."""
-    motion = path.at([t])
+    state = drive.state(t)
     return Odometry.from_matrix(
-        motion.T_world_base()[0],
+        state.T_world_base,
         stamp=stamp,
         frame=world_frame,
         child_frame=base_frame,
-        linear=[motion.speed()[0], 0.0, 0.0],
-        angular=[0.0, 0.0, motion.yaw_rate[0]],
+        linear=state.linear,
+        angular=state.angular,
     )
 
 
 def activities(world: World, t: float, first_stamp: int, stamp: int) -> Activity:
-    """What every mover does, on what, since when, and the goal it was given."""
+    """Returns what every mover does, on what, since when, and the goal it was given."""
     doings = world.doings(t)
     return Activity(
         stamp=stamp,
@@ -135,6 +139,16 @@ def activities(world: World, t: float, first_stamp: int, stamp: int) -> Activity
         scores=np.ones(len(doings), np.float32),
         objects=np.array([d.object for d in doings], np.int64),
         since=np.array([first_stamp + round(max(d.since, 0) * 1e9) for d in doings], np.int64),
+    )
+
+
+def events(now: Sequence[Change], stamp: int) -> Diagnostics:
+    """Returns what begins (a warning) and what ends (ok) at one time."""
+    return Diagnostics(
+        stamp=stamp,
+        names=tuple(change.name for change in now),
+        messages=tuple(f"{change.text} {'begins' if change.begins else 'ends'}" for change in now),
+        levels=np.array([Level.WARN if change.begins else Level.OK for change in now], np.uint8),
     )
 
 
@@ -149,7 +163,7 @@ class TrueGraph:
         corners = np.concatenate([thing.vertices(0.0) for thing in floors])
         self._floor = corners.min(axis=0), corners.max(axis=0)
 
-    def at(self, t: float, stamp: int, frame: str) -> SceneGraph:
+    def at(self, t: float, T_world_base: Array, stamp: int, frame: str) -> SceneGraph:
         world = self._world
         boxes = [thing.box(t) for thing in self._things]
         low, high = self._floor
@@ -158,7 +172,7 @@ class TrueGraph:
         relations = world.relations(t)
         if self._nearness is not None:
             middles = {thing.id: T[:3, 3] for thing, (T, _) in zip(self._things, boxes, strict=True)}
-            relations = relations + spatial(self._nearness.pairs(t), middles, world.path.at([t]).T_world_base()[0])
+            relations = relations + spatial(self._nearness.pairs(t), middles, T_world_base)
         return SceneGraph(
             stamp=stamp,
             frame=frame,

@@ -6,16 +6,33 @@ from collections.abc import Callable
 
 from operators.sources.simulator.corridor import corridor
 from operators.sources.simulator.office import office
-from operators.sources.simulator.scene import World
+from operators.sources.simulator.scene import Order, World
 from operators.sources.simulator.table_top import table_top
+from operators.sources.simulator.yard import yard
 
-_MAKERS: dict[str, Callable[..., World]] = {"office": office, "corridor": corridor, "table_top": table_top}
+_MAKERS: dict[str, Callable[[int, Order], World]] = {
+    "office": office,
+    "corridor": corridor,
+    "table_top": table_top,
+    "yard": yard,
+}
 NAMES = tuple(_MAKERS)
+INDOOR = ("office", "corridor", "table_top")
 
 
-def make_world(name: str, seed: int, *, speed: float, hold: float, movers: bool) -> World:
+def make_world(
+    name: str,
+    seed: int,
+    *,
+    speed: float,
+    hold: float,
+    movers: bool,
+    people: int = 2,
+    tour: bool = False,
+    jumps: tuple[tuple[float, float], ...] = (),
+) -> World:
     """A world drawn from the seed. Raises ValueError for an unknown name."""
     maker = _MAKERS.get(name)
     if maker is None:
         raise ValueError(f"no world {name!r}; there are {', '.join(NAMES)}")
-    return maker(seed, speed=speed, hold=hold, movers=movers)
+    return maker(seed, Order(speed, hold, movers, people, tour, jumps))

@@ -22,7 +22,9 @@ from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.camera import RgbdCamera
-from operators.odometry.rgbd_odometry import RgbdOdometry, RgbdOdometryConfig, Status, TrackResult
+from operators.odometry.rgbd_odometry import RgbdOdometry
+from operators.odometry.settings import RgbdOdometryConfig
+from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
 SIZE = (320, 240)
 K_COLOR = np.array([[262.0, 0.0, 159.5], [0.0, 262.0, 119.5], [0.0, 0.0, 1.0]])
@@ -169,7 +171,7 @@ def test_pose_follows_known_motion(
 ) -> None:
     frames, poses = sequence(count, speed, offset)
     results = follow(frames, RgbdOdometryConfig(refine=refine), offset, rate)
-    assert all(r.status is Status.TRACKED for r in results[1:])
+    assert all(r.status is Status.TRACKING for r in results[1:])
     position, rotation = errors(results, poses)
     assert position < metres
     assert rotation < radians
@@ -178,7 +180,8 @@ def test_pose_follows_known_motion(
 def test_first_pose_is_the_identity() -> None:
     frames, _ = sequence(40)
     first = follow(frames[:1])[0]
-    assert first.status is Status.STARTED
+    assert first.status is Status.TRACKING
+    assert first.reason == "the first view"
     assert first.keyframe
     np.testing.assert_array_equal(first.T_world_camera, np.eye(4))
 
@@ -205,7 +208,7 @@ def test_exposure_changes_are_followed() -> None:
         (cv2.convertScaleAbs(gray, alpha=0.6 + 0.4 * (i % 5 != 0)), depth) for i, (gray, depth) in enumerate(frames)
     ]
     results = follow(flicker)
-    assert all(r.status is Status.TRACKED for r in results[1:])
+    assert all(r.status is Status.TRACKING for r in results[1:])
     assert errors(results, poses)[0] < 0.015
 
 
@@ -220,11 +223,20 @@ def test_covariance_covers_the_error_and_grows_with_the_way() -> None:
     results = follow(frames)
     x = np.array([se3.log(invert(T) @ r.T_world_camera) for r, T in zip(results, poses, strict=True)])[1:]
     squared = [e @ np.linalg.solve(r.covariance, e) / 6 for e, r in zip(x, results[1:], strict=True)]
-    assert 0.003 < np.mean(squared) < 3.0
+    assert 0.01 < np.mean(squared) < 3.0
     for r in results[1:]:
         np.testing.assert_allclose(r.covariance, r.covariance.T, atol=1e-12)
         assert np.linalg.eigvalsh(r.covariance)[0] > 0
-    assert np.trace(results[-1].covariance) > np.trace(results[1].covariance)
+
+
+def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() -> None:
+    odometry = RgbdOdometry(camera())
+    for i, frame in enumerate(sequence(25, 3.0)[0]):
+        result, keyframes = odometry.track(*frame, i * 100_000_000), odometry.snapshot().keyframes
+        if i > 0 and not result.keyframe:
+            newest = keyframes[-1]
+            carried = moved_covariance(newest.covariance, newest.T_world_camera, result.T_world_camera)
+            assert np.linalg.eigvalsh(result.covariance - carried)[0] > 0
 
 
 # -- failures ------------------------------------------------------------------------------------------------
@@ -234,8 +246,9 @@ def test_black_images_fall_back_to_depth() -> None:
     frames, poses = sequence(40)
     frames = [black(f) if 10 <= i < 20 else f for i, f in enumerate(frames)]
     results = follow(frames)
-    assert {r.status for r in results[10:20]} == {Status.DEPTH}
-    assert all(r.status is Status.TRACKED for r in results[22:])
+    assert {r.status for r in results[10:20]} == {Status.TRACKING}
+    assert {r.reason for r in results[10:20]} == {"depth; image is black"}
+    assert all(r.status is Status.TRACKING for r in results[22:])
     assert errors(results, poses)[0] < 0.03
 
 
@@ -243,7 +256,7 @@ def test_lost_depth_falls_back_to_features() -> None:
     frames, poses = sequence(40)
     frames = [without_depth(f) if 10 <= i < 20 else f for i, f in enumerate(frames)]
     results = follow(frames)
-    assert all(r.status is Status.TRACKED for r in results[1:])
+    assert all(r.status is Status.TRACKING for r in results[1:])
     assert errors(results, poses)[0] < 0.03
 
 
@@ -252,33 +265,103 @@ def test_blindness_is_bridged_and_recovered_from() -> None:
     frames = [black(without_depth(f)) if 10 <= i < 20 else f for i, f in enumerate(frames)]
     results = follow(frames)
     assert {r.status for r in results[10:20]} == {Status.PREDICTED}
+    assert results[10].reason == "image is black; depth has no return"
     sigmas = [np.sqrt(np.trace(r.covariance[:3, :3])) for r in results[9:20]]
     assert all(b > a for a, b in pairwise(sigmas))
     assert sigmas[-1] > 3 * sigmas[0]
-    assert results[20].status is Status.RELOCALISED
+    assert results[20].status in MEASURED
     assert errors(results[20:], poses[20:])[0] < 0.03
 
 
-def test_loss_is_declared_and_ends_in_a_restart() -> None:
-    frames, _ = sequence(40)
-    blind = [black(without_depth(frames[0]))] * 30
-    results = follow([*frames[:5], *blind], RgbdOdometryConfig(patience_s=0.3, give_up_s=0.6))
-    statuses = [r.status for r in results[5:]]
-    assert statuses[0] is Status.PREDICTED
-    assert Status.LOST in statuses
-    assert Status.RESTARTED in statuses
-    assert statuses.index(Status.LOST) < statuses.index(Status.RESTARTED)
+def repeated(frames: list[Frame], first: int, last: int) -> list[Frame]:
+    return [*frames[:first], *[frames[first]] * (last - first), *frames[last:]]
 
 
-def test_tracking_resumes_after_a_restart() -> None:
+def test_frozen_images_are_noticed_and_not_used() -> None:
     frames, poses = sequence(40)
+    color_stuck = [(stuck[0], f[1]) for stuck, f in zip(repeated(frames, 10, 25), frames, strict=True)]
+    results = follow(color_stuck)
+    assert {r.reason for r in results[11:25]} == {"depth; image repeats the last one"}
+    assert errors(results, poses)[0] < 0.03
+    depth_stuck = [(f[0], stuck[1]) for stuck, f in zip(repeated(frames, 10, 25), frames, strict=True)]
+    results = follow(depth_stuck)
+    assert all("depth repeats the last one" in r.reason for r in results[11:25])
+    assert errors(results, poses)[0] < 0.03
+    results = follow(repeated(frames, 10, 25))
+    assert {r.status for r in results[11:25]} == {Status.PREDICTED}
+
+
+def test_lost_depth_is_bridged_by_the_depth_of_the_map() -> None:
+    """Twenty degrees of turning without depth: new corners take theirs from what the map expects there."""
+    frames, poses = sequence(60, 1.5)
+    results = follow([without_depth(f) if 10 <= i < 50 else f for i, f in enumerate(frames)])
+    assert {r.status for r in results} == {Status.TRACKING}
+    assert any(r.keyframe for r in results[12:50])
+    assert errors(results, poses)[0] < 0.04
+
+
+@pytest.mark.parametrize("share", [0.5, 0.9])
+def test_sparse_depth_is_depth(share: float) -> None:
+    frames, poses = sequence(25, 3.0)
+    rng = np.random.default_rng(3)
+    holes = [(g, np.where(rng.random(d.shape) < share, np.float32(0), d)) for g, d in frames]
+    results = follow(holes, rate=10.0)
+    assert {r.status for r in results} == {Status.TRACKING}
+    assert errors(results, poses)[0] < 0.03
+
+
+def test_old_map_is_found_again_after_a_gap() -> None:
+    frames, poses = sequence(60, 1.5)
     blind = [black(without_depth(frames[0]))] * 30
-    results = follow([*frames[:5], *blind, *frames[20:]], RgbdOdometryConfig(patience_s=0.3, give_up_s=0.6))
-    last = results[-10:]
-    assert {r.status for r in last} == {Status.TRACKED}
-    moved = invert(last[0].T_world_camera) @ last[-1].T_world_camera
-    truth = invert(poses[30]) @ poses[39]
-    assert np.abs(se3.log(invert(truth) @ moved)).max() < 0.01
+    results = follow([*frames[:20], *blind, *frames[45:]])
+    statuses = [r.status for r in results[20:50]]
+    assert statuses[0] is Status.PREDICTED
+    assert statuses[-1] is Status.LOST
+    assert results[50].status is Status.RELOCALISED
+    assert errors(results[50:], poses[45:])[0] < 0.03
+
+
+def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:
+    """The camera is turned to the other side of the room while it sees nothing, and comes back later."""
+    frames, poses = sequence(40)
+    turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    elsewhere = [(render(turned @ T, K_COLOR)[0], render(turned @ T, K_DEPTH)[1]) for T in poses[:25]]
+    blind = [black(without_depth(frames[0]))] * 20
+    results = follow([*frames[:20], *blind, *elsewhere, *frames[20:]])
+    away = results[40:65]
+    assert {r.status for r in away} == {Status.LOST}
+    assert "new one begins" in away[0].reason
+    assert np.sqrt(np.trace(away[-1].covariance[:3, :3])) > 0.3
+    moved = invert(away[0].T_world_camera) @ away[-1].T_world_camera
+    assert np.abs(se3.log(invert(invert(poses[0]) @ poses[24]) @ moved)).max() < 0.02
+    back = [r.status for r in results[65:]]
+    assert Status.RELOCALISED in back[:30]
+    assert errors(results[-2:], poses[-2:])[0] < 0.03
+
+
+def mover_sequence(count: int) -> Sequence:
+    """A wall-like body in front of a third of the view slides sideways by 4 cm a frame while the camera sways."""
+    frames, poses = sequence(count, 3.0)
+    moved = []
+    for i, (gray, depth) in enumerate(frames):
+        left = 20 + 3 * i
+        body = np.zeros(depth.shape, bool)
+        body[20:230, left : left + 110] = True
+        pattern = np.roll(TEXTURE[300:540, 200:520], 9 * i, axis=1)
+        bulge = 0.7 + 0.0004 * (np.arange(320, dtype=np.float32) - left - 55) ** 2 / 10
+        moved.append((np.where(body, pattern, gray), np.where(body, bulge[None, :], depth).astype(np.float32)))
+    return moved, poses
+
+
+def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
+    frames, poses = mover_sequence(25)
+    results = follow(frames, rate=10.0)
+    steps = [
+        float(np.linalg.norm(se3.log(invert(invert(poses[i]) @ poses[i + 1]) @ moved)[:3]))
+        for i, moved in enumerate(invert(a.T_world_camera) @ b.T_world_camera for a, b in pairwise(results))
+    ]
+    assert max(steps) < 0.015
+    assert errors(results, poses)[0] < 0.03
 
 
 def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
@@ -286,7 +369,7 @@ def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
     wall = (np.full((240, 320), 128, np.uint8), np.full((240, 320), 1.5, np.float32))
     nearer = [(wall[0], wall[1] - np.float32(0.005 * i)) for i in range(20)]
     results = follow(nearer)
-    assert {r.status for r in results[1:]} <= {Status.PREDICTED, Status.LOST, Status.DEPTH}
+    assert {r.status for r in results[6:]} <= {Status.PREDICTED, Status.LOST}
     T = results[10].T_world_camera
     assert T[2, 3] == pytest.approx(0.05, abs=0.005)
     assert np.isfinite(results[-1].T_world_camera).all()
@@ -297,8 +380,9 @@ def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
 def test_a_start_in_the_dark_costs_no_more_than_the_dark() -> None:
     frames, poses = sequence(40)
     results = follow([black(without_depth(f)) if i < 5 else f for i, f in enumerate(frames)])
-    assert results[5].status is Status.RESTARTED
-    assert all(r.status is Status.TRACKED for r in results[7:])
+    assert {r.status for r in results[:5]} == {Status.LOST}
+    assert results[5].reason == "the first view"
+    assert all(r.status is Status.TRACKING for r in results[7:])
     moved = invert(results[5].T_world_camera) @ results[39].T_world_camera
     assert np.abs(se3.log(invert(invert(poses[5]) @ poses[39]) @ moved)).max() < 0.01
 
@@ -405,16 +489,19 @@ def info(frame: str, K: NDArray[np.float64]) -> CameraInfo:
 def test_operator_gives_the_core_poses_in_named_frames() -> None:
     frames, _ = sequence(40)
     operator = VisualOdometry(odometry_frame="start")
+    operator.setup()
     core = follow(frames[:5], rate=10.0)
     for i, (image, depth) in enumerate(frames[:5]):
         stamp = int(i * 1e9 / 10)
-        out = operator.process(
+        sent = operator.process(
             Image(stamp=stamp, frame="color", data=image),
             DepthImage(stamp=stamp, frame="depth", data=depth),
             info("color", K_COLOR),
             info("depth", K_DEPTH),
         )
+        out, status = sent["odometry"], sent["status"]
         assert (out.stamp, out.frame, out.child_frame) == (stamp, "start", "depth")
+        assert (status.stamp, status.messages) == (stamp, (f"tracking: {core[i].reason}",))
         np.testing.assert_allclose(out.matrix(), core[i].T_world_camera, atol=1e-12)
     assert out.pose_covariance is not None
 
@@ -433,6 +520,8 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
         )
 
     one, other = VisualOdometry(), VisualOdometry()
+    one.setup()
+    other.setup()
     assert one.snapshot() == {}
     for i in range(20):
         one.process(*given(i))
@@ -442,7 +531,8 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
 
     assert pack_state(other.snapshot()) == recorded
     for i in range(20, 30):
-        assert one.process(*given(i)).digest() == other.process(*given(i)).digest()
+        sent, again = one.process(*given(i)), other.process(*given(i))
+        assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 

@@ -27,11 +27,14 @@ EVERYTHING: dict[str, Any] = {
     "stereo": {"rate": 5, **SMALL},
     "lidar": {"rate": 5, "rings": 4, "columns": 60, "motion": True},
     "inertial": {"rate": 100},
+    "magnetometer": {"rate": 50, "disturbance": 2e-6},
     "wheels": {"rate": 20},
     "radar": {"rate": 5},
     "landmarks": {"rate": 5},
     "gnss": {"rate": 2},
-    "truth": {"masks": True},
+    "motion": {"bumps": 0.002, "sway": 0.01, "turn": 0.02},
+    "faults": [{"sensor": "lidar", "span": [0.3, 0.5], "set": {"noise": 0.1}}],
+    "truth": {"masks": True, "occupancy": True, "surfaces": True, "mesh": True, "events": True},
 }
 
 
@@ -105,6 +108,7 @@ NO_CAMERAS: dict[str, Any] = {"color_camera": {**SMALL, "rate": 0}, "depth_camer
         ("stereo", {"left", "right"}),
         ("lidar", {"points"}),
         ("inertial", {"imu"}),
+        ("magnetometer", {"magnetic_field"}),
         ("wheels", {"wheel_ticks", "wheel_odometry"}),
         ("radar", {"radar_scan"}),
         ("landmarks", {"sightings"}),
@@ -115,7 +119,8 @@ NO_CAMERAS: dict[str, Any] = {"color_camera": {**SMALL, "rate": 0}, "depth_camer
 def test_a_sensor_measures_the_same_alone_and_beside_all_others(
     sensor: str, ports: set[str], everything: dict[str, list[Message]]
 ) -> None:
-    alone = run(**{**NO_CAMERAS, "seed": 5, "duration": "600ms", sensor: EVERYTHING[sensor]})
+    shared = {name: EVERYTHING[name] for name in ("seed", "duration", "motion", "faults")}
+    alone = run(**{**NO_CAMERAS, **shared, sensor: EVERYTHING[sensor]})
     for port in ports:
         assert alone[port] == everything[port], port
 
@@ -125,7 +130,8 @@ def test_the_camera_and_its_truth_are_the_same_alone_and_beside_all_others(
 ) -> None:
     truth = {**QUIET, "boxes": True, "masks": True}
     camera = EVERYTHING["color_camera"]
-    alone = run(seed=5, duration="600ms", color_camera=camera, depth_camera={"rate": 0}, truth=truth)
+    shared = {name: EVERYTHING[name] for name in ("seed", "duration", "motion")}
+    alone = run(**shared, color_camera=camera, depth_camera={"rate": 0}, truth=truth)
     for port in ("image", "image_jpeg", "objects", "boxes", "masks"):
         assert alone[port] == everything[port], port
 

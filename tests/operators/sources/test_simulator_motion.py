@@ -9,11 +9,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import cKDTree
 
-from operators.sources.simulator import corridor, office, table_top
+from operators.sources.simulator import corridor, office, table_top, yard
+from operators.sources.simulator.drive import Drive
 from operators.sources.simulator.inertial import true_reading
-from operators.sources.simulator.movers import Person
+from operators.sources.simulator.movers import STANDING, Driving
 from operators.sources.simulator.native import open3d
+from operators.sources.simulator.persons import Person
 from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.settings import Inertial
 from operators.sources.simulator.trajectory import Trajectory
@@ -69,7 +72,7 @@ def test_speed_and_turning_stay_within_limits(name: str) -> None:
 
 def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> None:
     path, imu = world("office", 0).path, Inertial(mount=(0.2, -0.1, 0.4, 0.0, 0.0, 0.5))
-    lever = np.array([0.2, -0.1])
+    drive, lever = Drive(path), np.array([0.2, -0.1])
     dt, steps = 0.005, 2000
     start = path.at([0.0])
     R0 = start.T_world_base()[0][:2, :2]
@@ -77,7 +80,7 @@ def test_a_strapdown_integration_of_the_inertial_readings_follows_the_path() -> 
     p = start.position[0] + R0 @ lever
     v = start.velocity[0] + R0 @ (float(start.yaw_rate[0]) * np.array([-lever[1], lever[0]]))
     for k in range(steps):
-        omega, force = true_reading(path, imu, (k + 0.5) * dt)
+        omega, force = true_reading(drive, imu, (k + 0.5) * dt)
         assert force[2] == pytest.approx(9.80665)
         middle = yaw + omega[2] * dt / 2
         a = np.array(
@@ -116,13 +119,13 @@ def test_the_robot_touches_nothing(name: str, seed: int) -> None:
 @pytest.fixture
 def unfurnished(monkeypatch: pytest.MonkeyPatch) -> None:
     """Worlds without what stands along their walls: their movers are as they would be, and they are made quickly."""
-    for module in (office, corridor, table_top):
+    for module in (office, corridor, table_top, yard):
         monkeypatch.setattr(module, "line_wall", lambda *args, **kwargs: None)
         monkeypatch.setattr(module, "decorate", lambda *args, **kwargs: None)
 
 
 @pytest.mark.usefixtures("unfurnished")
-@pytest.mark.parametrize(("name", "seeds"), [("office", 15), ("corridor", 4), ("table_top", 4)])
+@pytest.mark.parametrize(("name", "seeds"), [("office", 15), ("corridor", 4), ("table_top", 4), ("yard", 4)])
 def test_lanes_lie_apart_and_off_the_path_of_the_robot(name: str, seeds: int) -> None:
     for seed in range(seeds):
         here = make_world(name, seed, speed=0.5, hold=0.0, movers=True)
@@ -133,7 +136,39 @@ def test_lanes_lie_apart_and_off_the_path_of_the_robot(name: str, seeds: int) ->
 
 
 @pytest.mark.usefixtures("unfurnished")
-@pytest.mark.parametrize(("name", "seeds"), [("office", 6), ("corridor", 3), ("table_top", 3)])
+@pytest.mark.parametrize(("name", "seeds"), [("office", 12), ("corridor", 4), ("table_top", 4), ("yard", 3)])
+def test_a_tour_keeps_off_all_lanes_and_crosses_itself(name: str, seeds: int) -> None:
+    for seed in range(seeds):
+        here = make_world(name, seed, speed=0.5, hold=0.0, movers=True, people=2 + seed % 3, tour=True)
+        outline = here.path.outline(2000)
+        assert all(lane.gap(outline) > ROBOT_RADIUS for lane in here.lanes), seed
+        motion = here.path.at(np.linspace(0, here.path.period, 1500, endpoint=False))
+        apart = np.linalg.norm(motion.position[:, None] - motion.position[None], axis=2)
+        turned = np.abs((motion.yaw[:, None] - motion.yaw[None] + math.pi) % (2 * math.pi) - math.pi)
+        k = np.arange(1500)
+        later = np.abs((k[:, None] - k[None] + 750) % 1500 - 750) > 60
+        same = (apart < 0.05) & later
+        assert same.any()
+        assert turned[same].max() > {"table_top": 0.1}.get(name, 3.0)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_tour_touches_nothing_and_stays_within_limits(name: str) -> None:
+    here = make_world(name, 1, speed=0.5, hold=0.0, movers=True, people=4, tour=True)
+    track = cKDTree(here.path.outline(2000))
+    for thing in here.things:
+        if thing.still and thing.label not in ("floor", "ceiling"):
+            v = thing.vertices(0.0)
+            v = v[(v[:, 2] > 0.02) & (v[:, 2] < ROBOT_HEIGHT), :2]
+            gap = track.query(v)[0].min(initial=9)
+            assert gap > ROBOT_RADIUS, f"{thing.label} {thing.id} stands {gap:.2f} m from the path"
+    motion = here.path.at(np.linspace(0, here.path.period, 2000))
+    assert motion.speed().max() < 0.55
+    assert np.abs(motion.yaw_rate).max() < math.radians(45)
+
+
+@pytest.mark.usefixtures("unfurnished")
+@pytest.mark.parametrize(("name", "seeds"), [("office", 6), ("corridor", 3), ("table_top", 3), ("yard", 2)])
 def test_movers_never_meet(name: str, seeds: int) -> None:
     """Axis to axis, for two minutes."""
     for seed in range(seeds):
@@ -204,6 +239,22 @@ def test_movers_never_jump_and_never_sink_into_the_floor(name: str) -> None:
                 assert np.linalg.norm(poses - last, axis=1).max() < 5.0 * 0.12, (thing.label, t)
             last = poses
         assert min(thing.vertices(t)[:, 2].min() for t in times[::25]) > -0.01
+
+
+@pytest.mark.parametrize("name", ["office", "corridor"])
+def test_a_robot_is_said_to_drive_while_it_moves_and_to_rest_while_it_stands(name: str) -> None:
+    robot = next(thing for thing in world(name, 0).things if isinstance(thing.mover, Driving))
+    seen = set()
+    for t in np.arange(0.02, 150, 0.37):
+        ends = [robot.mover.frame(t + dt)[:2, 3] for dt in (-0.01, 0.01)]
+        speed = np.linalg.norm(ends[1] - ends[0]) / 0.02
+        doing = robot.mover.doing(robot.id, t)
+        if abs(speed - STANDING) > 0.005:
+            assert doing.activity == ("driving" if speed > STANDING else "resting"), t
+        before, after = (robot.mover.doing(robot.id, doing.since + dt).activity for dt in (-0.1, 0.1))
+        assert (before, after) == ({"driving": "resting", "resting": "driving"}[doing.activity], doing.activity)
+        seen.add(doing.activity)
+    assert seen == {"driving", "resting"}
 
 
 def test_bones_keep_their_lengths() -> None:

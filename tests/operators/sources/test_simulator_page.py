@@ -9,24 +9,29 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from operators.sources.simulator import settings
+from operators.sources.simulator import events, settings
 from operators.sources.simulator.classes import ACTIVITIES, THINGS, VOID
 from operators.sources.simulator.relations import PLACEMENT, SPATIAL
 from operators.sources.simulator.worlds import NAMES
 
 PAGE = (Path(__file__).parents[3] / "docs" / "simulator.md").read_text(encoding="utf-8")
 SECTIONS: dict[str, type[BaseModel]] = {
-    "## Sensors and their faults": settings.Sensor,
+    "## Sensors and their faults": settings.Camera,
     "### `color_camera`": settings.ColorCamera,
     "### `depth_camera`": settings.DepthCamera,
     "### `stereo`": settings.StereoRig,
     "### `lidar`": settings.Lidar,
     "### `inertial`": settings.Inertial,
+    "### `magnetometer`": settings.Magnetometer,
     "### `wheels`": settings.Wheels,
     "### `radar`": settings.Radar,
     "### `landmarks`": settings.Landmarks,
     "### `gnss`": settings.Gnss,
     "### `truth`": settings.Truth,
+    "### `motion`": settings.Motion,
+    "### `faults`": events.Fault,
+    "### `lighting`": events.Lighting,
+    "### `kidnaps`": events.Kidnap,
 }
 
 
@@ -38,9 +43,9 @@ def section(heading: str) -> str:
 @pytest.mark.parametrize("heading", SECTIONS)
 def test_the_page_has_every_parameter_with_its_default_and_meaning(heading: str) -> None:
     model = SECTIONS[heading]
-    shared: set[str] = set() if model is settings.Sensor else set(settings.Sensor.model_fields)
+    shared: set[str] = set() if model is settings.Camera else set(settings.Camera.model_fields)
     expected = [
-        f"| `{name}` | `{json.dumps(field.default)}` | {field.description} |"
+        f"| `{name}` | {'' if field.is_required() else f'`{json.dumps(field.default)}` '}| {field.description} |"
         for name, field in model.model_fields.items()
         if name not in shared
     ]

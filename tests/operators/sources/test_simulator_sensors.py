@@ -18,7 +18,7 @@ from operators.sources.simulator import color, depth, radar
 from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.sources.simulator.gnss import geodetic
 from operators.sources.simulator.noise import NoisePool
-from operators.sources.simulator.renderer import View
+from operators.sources.simulator.optics import View
 from operators.sources.simulator.scene import Builder, Light, World
 from operators.sources.simulator.schedule import merged, ticks
 from operators.sources.simulator.settings import DepthCamera, Radar, Wheels
@@ -52,7 +52,7 @@ def flat_view(z: float, cosine: float = 1.0, shape: tuple[int, int] = (120, 160)
     return View(full, np.full(shape, cosine, np.float32), zeros, zeros.astype(np.uint16), zeros.astype(np.uint8), None)
 
 
-@pytest.mark.parametrize("grain", [1, 4])
+@pytest.mark.parametrize("grain", [1, 2, 3, 4, 7])
 @pytest.mark.parametrize("z", [1.0, 2.0, 4.0])
 def test_depth_noise_grows_with_the_square_of_depth(z: float, grain: int) -> None:
     camera = DepthCamera(noise=0.004, quantum=0.0002, grain=grain, specks=0)
@@ -60,6 +60,16 @@ def test_depth_noise_grows_with_the_square_of_depth(z: float, grain: int) -> Non
     metres = depth.metres(levels, camera.quantum)
     assert metres.mean() == pytest.approx(z, rel=0.01)
     assert metres.std() == pytest.approx(0.004 * z * z, rel=0.15)
+
+
+@pytest.mark.parametrize("grain", [1, 2, 3, 4, 7, 16])
+def test_depth_noise_is_as_large_as_stated_whatever_its_grain(grain: int) -> None:
+    camera = DepthCamera(noise=0.004, quantum=0.0002, grain=grain, specks=0, edge_holes=0)
+    inverse = [
+        1 / depth.metres(depth.measure(flat_view(1.0), camera, POOL, np.random.default_rng(k)), camera.quantum)
+        for k in range(120)
+    ]
+    assert np.std(inverse) == pytest.approx(0.004, rel=0.02)
 
 
 def test_depth_is_quantised_in_steps_of_inverse_depth() -> None:
@@ -150,7 +160,7 @@ def test_lidar_and_depth_camera_measure_the_same_surfaces() -> None:
     depth_image: Any = step["depth"]
     cloud: Any = step["points"]
     T_base_lidar = mounted(source.lidar.mount)
-    p = transform_points(invert(source._T_base_depth) @ T_base_lidar, cloud.points.astype(np.float64))
+    p = transform_points(invert(source._rig.T_base_depth) @ T_base_lidar, cloud.points.astype(np.float64))
     p = p[p[:, 2] > 0.3]
     info: Any = source.static_outputs()["depth_info"]
     K = info.K
@@ -317,9 +327,10 @@ def test_wheel_odometry_has_the_true_rate_from_its_first_message() -> None:
 def test_the_first_wheel_rate_errs_as_later_ones_do() -> None:
     path, rates = Trajectory(SQUARE, speed=0.5), []
     for seed in range(200):
-        model = WheelModel(Wheels(rate=10, scale_error=0, slip=0.02, ticks_per_turn=1 << 20), seed)
+        wheels = Wheels(rate=10, scale_error=0, slip=0.02, ticks_per_turn=1 << 20)
+        model = WheelModel(wheels, seed)
         rng = np.random.default_rng(seed)
-        measured: list[Any] = [model.measure(path, k * 0.1, rng, k, "odom", "base")[1] for k in range(4)]
+        measured: list[Any] = [model.measure(wheels, path, k * 0.1, rng, k, "odom", "base")[1] for k in range(4)]
         rates.append([message.linear[0] for message in measured])
     spread = np.std(rates, axis=0)
     np.testing.assert_allclose(spread[0], spread[1:].mean(), rtol=0.2)
@@ -334,14 +345,44 @@ def test_a_wheel_with_a_bias_counts_too_much_by_that_share() -> None:
     np.testing.assert_allclose(ends[1].ticks / ends[0].ticks, [1.05, 0.98], atol=1e-3)
 
 
+def test_wheel_odometry_errs_as_its_covariance_says() -> None:
+    """Over many seeds, after rounds in which the constant scale errors add up, against wheels without error."""
+
+    path, steps = Trajectory(SQUARE, speed=0.6), 51
+    fine: dict[str, Any] = {"rate": 2, "ticks_per_turn": 1 << 20}
+
+    def end(wheels: Wheels, seed: int) -> tuple[Array, Array]:
+        """Where the wheels say that they are after 25 s, and the covariance."""
+        model, rng = WheelModel(wheels, seed), np.random.default_rng(seed)
+        odometry = [model.measure(wheels, path, k * 0.5, rng, k, "odom", "base")[1] for k in range(steps)][-1]
+        assert odometry.pose_covariance is not None
+        yaw = 2 * math.atan2(odometry.orientation[2], odometry.orientation[3])
+        return np.array([*odometry.position[:2], yaw]), odometry.pose_covariance[np.ix_([0, 1, 5], [0, 1, 5])]
+
+    exact, _ = end(Wheels(**fine, scale_error=0, slip=0), 0)
+
+    def errors(wheels: Wheels) -> list[tuple[Array, Array]]:
+        found = [end(wheels, seed) for seed in range(50)]
+        turn = [0, 0, 2 * math.pi]
+        return [
+            (e - turn * np.round(e / (2 * math.pi)), covariance) for where, covariance in found for e in [where - exact]
+        ]
+
+    yaws = [(error[2], math.sqrt(covariance[2, 2])) for error, covariance in errors(Wheels(**fine))]
+    assert np.std([yaw for yaw, _ in yaws]) == pytest.approx(np.mean([claimed for _, claimed in yaws]), rel=0.3)
+    small = errors(Wheels(**fine, scale_error=0.001, slip=0.002))  # so small that they are linear in their causes
+    assert 0.7 < np.mean([error @ np.linalg.solve(covariance, error) / 3 for error, covariance in small]) < 1.4
+
+
 def test_wheel_errors_are_as_large_as_stated() -> None:
     """Slip over many seeds: its standard deviation grows with the square root of the way."""
     ends, path = [], Trajectory(SQUARE, speed=0.5)
     for seed in range(60):
-        model = WheelModel(Wheels(rate=5, scale_error=0, slip=0.02, ticks_per_turn=1 << 20), seed)
+        wheels = Wheels(rate=5, scale_error=0, slip=0.02, ticks_per_turn=1 << 20)
+        model = WheelModel(wheels, seed)
         rng = np.random.default_rng(seed)
         for k in range(20):
-            ticks, _ = model.measure(path, k * 0.2, rng, k, "odom", "base")
+            ticks, _ = model.measure(wheels, path, k * 0.2, rng, k, "odom", "base")
         ends.append(ticks.ticks / (1 << 20) * 2 * math.pi * 0.08)
     way = np.mean(ends, axis=0)
     np.testing.assert_allclose(np.std(ends, axis=0), 0.02 * np.sqrt(way), rtol=0.3)
@@ -421,7 +462,52 @@ def test_satellite_fixes_scatter_about_the_antenna() -> None:
     assert np.std([fix.altitude for fix in fixes]) == pytest.approx(1.0, rel=0.15)
 
 
+def test_satellites_are_lost_under_a_roof() -> None:
+    source = robot(world="yard", duration="82s", movers=False, gnss={"rate": 2, "sky": True, "drift": 0, "noise": 0.1})
+    fixes: list[Any] = stream(source, "fix")
+    assert len(fixes) > 60
+    stage, open_sky = source._stage, {}
+    for k in range(164):
+        antenna = (stage.T_world_base(k / 2) @ mounted(source.gnss.mount))[:3, 3]
+        up = np.concatenate([antenna, [0, 0, 20.0]])[None].astype(np.float32)
+        open_sky[k * 500_000_000] = not stage.at(k / 2).blocked(up)[0]
+    seen = {fix.stamp: fix for fix in fixes}
+    under = [stamp for stamp, free in open_sky.items() if not free]
+    assert len(under) > 40
+    assert sum(stamp in seen for stamp in under) < 0.2 * len(under)
+    assert all(stamp in seen for stamp, free in open_sky.items() if free)
+    assert all(fix.satellites >= 4 for fix in fixes)
+    few, many = (
+        [np.trace(fix.covariance) for fix in fixes if low <= fix.satellites < high] for low, high in ((4, 8), (11, 13))
+    )
+    assert min(few) > max(many)
+
+
 def test_a_mount_turns_about_fixed_axes() -> None:
     T = mounted((1.0, 2.0, 3.0, 0.0, math.pi / 2, 0.0)) @ BODY_TO_OPTICAL
     np.testing.assert_allclose(T[:3, 2], [0, 0, -1], atol=1e-12)  # pitch > 0 looks down
     np.testing.assert_allclose(T[:3, 3], [1, 2, 3])
+
+
+def test_a_magnetometer_points_north_and_down() -> None:
+    sensor = {"rate": 10, "noise": 0, "declination": 0.0, "mount": [0, 0, 1, 0.1, -0.2, 0.7]}
+    source = robot(duration="2s", magnetometer=sensor)
+    for message in stream(source, "magnetic_field"):
+        m: Any = message
+        T = source._stage.T_world_base(m.stamp * 1e-9) @ mounted(source.magnetometer.mount)
+        field = T[:3, :3] @ m.field
+        assert math.atan2(field[0], field[1]) == pytest.approx(0, abs=1e-9)  # y is north
+        assert math.atan2(-field[2], np.hypot(*field[:2])) == pytest.approx(source.magnetometer.inclination)
+        assert np.linalg.norm(field) == pytest.approx(source.magnetometer.strength)
+
+
+def test_iron_bends_the_field_of_a_magnetometer() -> None:
+    base = {"rate": 10, "noise": 0}
+    plain, iron, bent, noisy = (
+        np.array([m.field for m in stream(robot(duration="20s", magnetometer={**base, **more}), "magnetic_field")])  # type: ignore[attr-defined]
+        for more in ({}, {"hard_iron": [1e-6, 2e-6, 0], "soft_iron": 0.1}, {"disturbance": 3e-6}, {"noise": 1e-6})
+    )
+    np.testing.assert_allclose(iron, plain * [1.1, 1, 1] + [1e-6, 2e-6, 0], atol=1e-12)
+    assert 1e-6 < (bent - plain).std() < 6e-6
+    assert np.abs(np.diff(bent - plain, axis=0)).max() < 1e-6  # it changes over metres
+    assert (noisy - plain).std() == pytest.approx(1e-6, rel=0.1)

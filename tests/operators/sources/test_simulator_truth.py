@@ -17,13 +17,15 @@ from operators.sources import SimulatedRobot
 from operators.sources.simulator.classes import ACTIVITIES, THINGS
 from operators.sources.simulator.furnishing import FLOOR
 from operators.sources.simulator.furniture import rover
-from operators.sources.simulator.movers import Carried, Person
+from operators.sources.simulator.movers import Carried
+from operators.sources.simulator.optics import Optics
+from operators.sources.simulator.persons import Person
 from operators.sources.simulator.relations import PLACEMENT, SPATIAL
-from operators.sources.simulator.renderer import Optics, Renderer
+from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Builder, Light, Still, World
 from operators.sources.simulator.shapes import Material, bounds, box, pose
 from operators.sources.simulator.trajectory import Trajectory
-from operators.sources.simulator.truth import masks
+from operators.sources.simulator.truth import masks, velocity
 from operators.sources.simulator.worlds import NAMES, make_world
 
 WORLDS = ("office", "table_top")
@@ -72,6 +74,21 @@ def test_masks_and_boxes_in_the_image_count_the_same_pixels(steps: list[dict[str
             assert set(mask.classes[rows, columns]) == {class_id}
 
 
+def test_boxes_move_as_fast_as_their_middles_do(robot: SimulatedRobot) -> None:
+    """Against the way of the middles over 20 ms: limbs that swing move a person's box too."""
+    world, apart, moving = robot._stage.world, [], 0
+    for thing in world.objects():
+        if thing.still:
+            continue
+        for t in np.arange(0.1, 12, 0.61):
+            ends = [thing.box(t + dt)[0][:3, 3] for dt in (-0.01, 0.01)]
+            apart.append(np.linalg.norm(velocity(thing, t) - (ends[1] - ends[0]) / 0.02))
+            moving += bool(np.linalg.norm(ends[1] - ends[0]) > 0.002)
+    assert moving > 10
+    assert np.median(apart) < 0.01
+    assert np.percentile(apart, 95) < 0.1
+
+
 def test_boxes_in_space_enclose_the_boxes_in_the_image(robot: SimulatedRobot, steps: list[dict[str, Any]]) -> None:
     info = robot.static_outputs()["image_info"]
     for step in frames(steps):
@@ -100,7 +117,7 @@ def test_depth_is_where_the_triangles_are(robot: SimulatedRobot) -> None:
     """A second implementation (Möller and Trumbore, 1997) on all triangles, for a few pixels."""
     world, t = robot._stage.world, 3.0
     optics = Optics(40, 30, 34, 34, 19.5, 14.5)
-    T = robot._stage.T_world_base(t) @ robot._T_base_depth
+    T = robot._stage.T_world_base(t) @ robot._rig.T_base_depth
     view = robot._stage.at(t).view(T, optics, color=False)
     corners, ids = [], []
     for thing in world.things:
@@ -310,9 +327,14 @@ def _surface_heights(vertices: np.ndarray, thing: Any, x: float, y: float) -> np
     return np.concatenate(heights)
 
 
+def grasp_of(person: Person) -> Any:
+    """A place that the person grips, if there is one."""
+    return next((act.grasp for act in person.timeline.acts if act.grasp is not None), None)
+
+
 def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
     world = robot._stage.world
-    drinkers = [t for t in world.objects() if isinstance(t.mover, Person) and t.mover._grasp is not None]
+    drinkers = [t for t in world.objects() if isinstance(t.mover, Person) and grasp_of(t.mover) is not None]
     assert drinkers
     for person in drinkers:
         mover = person.mover
@@ -347,13 +369,13 @@ def test_contacts_follow_what_persons_do(robot: SimulatedRobot) -> None:
 def test_a_hand_reaches_its_mug(robot: SimulatedRobot) -> None:
     for thing in robot._stage.world.objects():
         mover = thing.mover
-        if isinstance(mover, Person) and mover._grasp is not None:
+        if isinstance(mover, Person) and grasp_of(mover) is not None:
             before = 0.0
             for act in mover.timeline.acts:
                 if act.activity == "drinking" and act.lift == (0.0, 1.0):
                     t = before - mover.timeline.phase + mover.timeline.period + 1e-3
-                    assert mover.held(t)
-                    assert np.linalg.norm(mover.grip(t) - mover._grasp) < 0.05
+                    assert mover.held(t) == act.object
+                    assert np.linalg.norm(mover.grip(t) - act.grasp) < 0.05
                 before += act.seconds
 
 

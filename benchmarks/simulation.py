@@ -1,0 +1,208 @@
+"""The engine on a simulated machine: as many seeds as asked, each a scenario of its own.
+
+usage: python benchmarks/simulation.py [--seeds 1000] [--from 0] [--jobs 2] [--json]
+       python benchmarks/simulation.py --mutants [--seeds 2000]
+
+Every seed: a small graph, recorded, in one process or one each, live or not, on a machine that is slow or quick, under
+kills, freezes, faults, stops and a disk that is slow or full; then its recording is verified, and
+replayed. All of it runs in one thread on simulated time: supervisor, processes, aligners, flow control, recorder and
+verification are those that ship. What must hold: tests/support/simulation/check.py. A seed that breaks a promise is
+shrunk, and its plan is printed; exit code 1.
+
+With --mutants, faults are planted in the engine, one at a time, and it is counted how many seeds find each.
+
+Needs the package greenlet (`pip install -e '.[dev]'`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import multiprocessing
+import os
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "support")]
+MEMORY = Path("/dev/shm")
+COLLECT_EVERY = 20
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Runs the engine on a simulated machine.")
+    parser.add_argument("--seeds", type=int, default=1000, help="how many (with --mutants: at most, for each)")
+    parser.add_argument("--from", type=int, default=0, dest="first", help="the first one")
+    parser.add_argument("--jobs", type=int, default=len(os.sched_getaffinity(0)), help="processes that share them")
+    parser.add_argument("--mutants", action="store_true", help="plant faults, and count the seeds that find each")
+    parser.add_argument("--only", help="with --mutants: this one")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead")
+    options = parser.parse_args()
+    if os.environ.get("PYTHONHASHSEED") != "0":  # a seed gives the same run everywhere
+        os.environ |= {"PYTHONHASHSEED": "0", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+        os.execv(sys.executable, [sys.executable, *sys.argv])
+    return _mutants(options) if options.mutants else _seeds(options)
+
+
+# Seeds
+
+
+def _seeds(options: argparse.Namespace) -> int:
+    begun = time.monotonic()
+    found: Counter[str] = Counter()
+    totals: Counter[str] = Counter()
+    failures = []
+    for number, result in enumerate(_results(options), start=1):
+        found[result["verdict"]] += 1
+        totals.update(result["counts"])
+        if result["violation"]:
+            failures.append(result)
+            if not options.json:
+                _show_failure(result)
+        if not options.json and sys.stderr.isatty():
+            _show_progress(number, options.seeds, time.monotonic() - begun, len(failures))
+    wall = time.monotonic() - begun
+    summary = {
+        "seeds": options.seeds,
+        "from": options.first,
+        "jobs": options.jobs,
+        "wall_s": round(wall, 1),
+        "seeds_per_minute": round(60 * options.seeds / wall),
+        "verdicts": dict(sorted(found.items())),
+        **totals,
+    }
+    if options.json:
+        print(json.dumps(summary | {"failures": failures}))
+    else:
+        _show_summary(summary, len(failures))
+    return 1 if failures else 0
+
+
+def _results(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+    seeds = range(options.first, options.first + options.seeds)
+    if options.jobs == 1:
+        yield from map(_one, seeds)
+        return
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        yield from pool.imap_unordered(_one, seeds, chunksize=10)
+
+
+def _one(seed: int) -> dict[str, Any]:
+    """Runs one seed; the result as plain values."""
+    from simulation.check import check
+    from simulation.scenario import scenario_of
+    from simulation.shrink import shrink
+    from simulation.world import Violation
+
+    scenario = scenario_of(seed)
+    if seed % COLLECT_EVERY == 0:
+        gc.collect()
+    gc.disable()
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
+        try:
+            result = check(scenario, Path(folder))
+        except Violation as violation:
+            small, said = shrink(scenario, Path(folder), violation)
+            counts: dict[str, int] = {}
+            plan = small.describe()
+            return {"seed": seed, "verdict": "broken", "violation": said, "plan": plan, "counts": counts}
+    outcome = result.outcome
+    verdict = result.verdict + (", the run failed" if outcome.failure is not None else "")
+    counts = {
+        "simulated_s": round(outcome.seconds, 3),
+        "live": int(scenario.live),
+        "killed": len(outcome.killed),
+        "restarts": sum(outcome.report.restarts.values()) if outcome.report is not None else 0,
+        "drops": result.drops,
+        "replayed": int(result.replayed),
+    }
+    return {"seed": seed, "verdict": verdict, "violation": "", "plan": "", "counts": counts}
+
+
+def _show_failure(result: dict[str, Any]) -> None:
+    print(f"\nseed {result['seed']} breaks a promise: {result['violation']}\nshrunk to {result['plan']}", flush=True)
+
+
+def _show_progress(number: int, of: int, seconds: float, failures: int) -> None:
+    filled = 40 * number // of
+    left = seconds / number * (of - number)
+    print(
+        f"\r{'█' * filled}{'·' * (40 - filled)} {number}/{of}, {60 * number / seconds:.0f} a minute, "
+        f"{left:.0f} s left, {failures} broken ",
+        end="",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def _show_summary(summary: dict[str, Any], failures: int) -> None:
+    print(
+        f"\n{summary['seeds']} seeds from {summary['from']}, {summary['wall_s']} s with {summary['jobs']} jobs "
+        f"({summary['seeds_per_minute']} a minute): {failures} break a promise"
+    )
+    print("\n| the recording | seeds |\n| --- | --- |")
+    for verdict, number in summary["verdicts"].items():
+        print(f"| {verdict} | {number} |")
+    names = ("live", "killed", "restarts", "drops", "replayed", "simulated_s")
+    print("\n" + ", ".join(f"{name} {summary.get(name, 0):g}" for name in names))
+
+
+# Mutants
+
+
+def _mutants(options: argparse.Namespace) -> int:
+    from simulation.mutants import MUTANTS
+
+    names = [options.only] if options.only else list(MUTANTS)
+    tasks = [(name, options.first, options.seeds) for name in names]
+    with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
+        found = list(pool.imap(_find, tasks))
+    if options.json:
+        print(json.dumps(found))
+        return 0 if all(each["seeds"] for each in found) else 1
+    print("| planted | seeds to find it | seconds | the shrunk plan breaks |\n| --- | --- | --- | --- |")
+    for each in found:
+        print(f"| {each['said']} | {each['seeds'] or 'not found'} | {each['wall_s']} | {each['violation']} |")
+    for each in found:
+        print(f"\n{each['said']}:\n\n```text\n{each['plan']}\n```")
+    return 0 if all(each["seeds"] for each in found) else 1
+
+
+def _find(task: tuple[str, int, int]) -> dict[str, Any]:
+    """Counts the seeds that it takes until a planted fault is found."""
+    from simulation.check import check
+    from simulation.mutants import MUTANTS
+    from simulation.scenario import scenario_of
+    from simulation.shrink import shrink
+    from simulation.world import Violation
+
+    name, first, most = task
+    begun = time.monotonic()
+    with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder, MUTANTS[name].planted():
+        for seed in range(first, first + most):
+            scenario = scenario_of(seed)
+            try:
+                check(scenario, Path(folder), replay=False)
+            except Violation as violation:
+                wall = round(time.monotonic() - begun, 1)
+                small, said = shrink(scenario, Path(folder), violation)
+                return {
+                    "name": name,
+                    "said": MUTANTS[name].said,
+                    "seeds": seed - first + 1,
+                    "wall_s": wall,
+                    "violation": said.splitlines()[0],
+                    "plan": small.describe(),
+                }
+    wall = round(time.monotonic() - begun, 1)
+    return {"name": name, "said": MUTANTS[name].said, "seeds": 0, "wall_s": wall, "violation": "", "plan": ""}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

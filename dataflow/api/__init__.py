@@ -1,0 +1,1 @@
+"""Recordings and graphs from Python and notebooks; `import dataflow` gives its names."""

@@ -1,0 +1,38 @@
+"""Verification's calls in this process, for operators that no other process finds."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import traceback
+from collections.abc import Sequence
+from contextlib import closing
+from typing import Any
+
+from dataflow.firing.threads import limited_threads
+from dataflow.supervision.report import RunFailed
+from dataflow.verification.board import Board
+from dataflow.verification.letters import read_letter, write_letter
+from dataflow.verification.processes import Call
+
+
+def call_here(calls: Sequence[Call], *, threads: int, **watching: Any) -> list[Any]:
+    """The answers to `calls`, one after the other; nobody watches over them. Raises `RunFailed` as workers do."""
+    with limited_threads(threads):
+        return [_answer(call) for call in calls]
+
+
+def _answer(call: Call) -> Any:
+    module, _, name = call.function.partition(":")
+    function = getattr(importlib.import_module(module), name)
+    shared, letter = os.memfd_create("board"), os.memfd_create("answer")
+    try:
+        with closing(Board(shared, call.operators)) as board:
+            write_letter(letter, {"value": function(call.request, board)})
+        return read_letter(letter)["value"]
+    except Exception as error:
+        text = getattr(error, "traceback", None) or "".join(traceback.format_exception(error))
+        raise RunFailed(str(error) or type(error).__name__, text, getattr(error, "operator", None)) from error
+    finally:
+        os.close(shared)
+        os.close(letter)

@@ -1,0 +1,224 @@
+"""Runs, replays and verifications of graphs, for programs and notebooks."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dataflow.api.builder import Graph
+from dataflow.api.html import run_html, verify_html
+from dataflow.api.local import LocalRun, Watch
+from dataflow.api.recordings import RecordedStreams, open
+from dataflow.firing import seeding
+from dataflow.graph import Graph as ResolvedGraph
+from dataflow.graph import load_graph
+from dataflow.recording import Recording
+from dataflow.recording.facts import machine_facts
+from dataflow.recording.layout import RUN
+from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
+from dataflow.supervision.replay import plan_replay
+from dataflow.supervision.report import RunReport
+from dataflow.verification.report import VerifyReport
+
+NOTEBOOK = "__main__:"
+"""The beginning of import paths of operators in a notebook or script: no other process finds them."""
+GraphLike = Graph | ResolvedGraph | str | Path
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """The result of a run: its report, and the recording if there is one."""
+
+    report: RunReport
+    path: Path | None = None
+
+    @property
+    def summaries(self) -> Mapping[str, Mapping[str, Any]]:
+        """The figures of metrics sinks, by operator: {figure: value}."""
+        return self.report.summaries
+
+    @property
+    def drops(self) -> Mapping[str, tuple[tuple[str, str, int], ...]]:
+        """By operator, (input, reason, number) of the messages that reached no firing."""
+        return self.report.drops
+
+    def digests(self) -> dict[str, str]:
+        """The digest of each stream: equal for equal runs."""
+        return self.report.digests()
+
+    def open(self) -> RecordedStreams:
+        """Opens the recording. Raises `ValueError` when none was made."""
+        if self.path is None:
+            raise ValueError("this run was not recorded: run(record='FILE.mcap')")
+        return open(self.path)
+
+    def __repr__(self) -> str:
+        made = sum(count for count, _ in self.report.streams.values())
+        recorded = f", recorded in {self.path}" if self.path is not None else ""
+        return f"<run of {self.report.graph}: {made:,} messages in {self.report.wall:.2f} s{recorded}>"
+
+    def _repr_html_(self) -> str:
+        return run_html(self.report)
+
+
+@dataclass(frozen=True, slots=True)
+class Verified:
+    """The result of a verification; `report` has all of it."""
+
+    report: VerifyReport
+
+    @property
+    def identical(self) -> bool:
+        """True when every recorded firing was repeated with the same outputs, bit for bit."""
+        return self.report.identical
+
+    @property
+    def culprits(self) -> tuple[str, ...]:
+        """The operators whose own results differ."""
+        return self.report.culprits
+
+    def __repr__(self) -> str:
+        found = "identical" if self.identical else f"not identical; culprits: {', '.join(self.culprits) or 'none'}"
+        return f"<verification: {found}, {self.report.messages:,} messages>"
+
+    def _repr_html_(self) -> str:
+        return verify_html(self.report)
+
+
+def run(
+    graph: GraphLike,
+    *,
+    record: str | Path | None = None,
+    overwrite: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    paranoid: bool = False,
+    watch: Watch | None = None,
+) -> RunResult:
+    """Runs a graph in this process, on this thread, as fast as it goes, and returns when it is done.
+
+    `graph`: a `Graph`, or the path of a YAML file; then `settings` are what `--set` takes: {"detector.threshold": 0.3}.
+    The streams are those of a run in processes, message digest by message digest, given the same thread settings of
+    numpy's libraries. `paranoid` catches operators that write into their inputs. Ctrl-C ends it in order. Raises
+    `GraphError`, and `RunFailed` with the operator that failed.
+    """
+    built = resolved(graph, settings)
+    file = None if record is None else Path(record)
+    report = LocalRun(built, paranoid=paranoid).execute(
+        record=file, metadata=_metadata(built, "run"), overwrite=overwrite, watch=watch
+    )
+    return RunResult(report, file)
+
+
+def replay(
+    recording: str | Path,
+    *,
+    graph: GraphLike | None = None,
+    start: float | None = None,
+    end: float | None = None,
+    record: str | Path | None = None,
+    overwrite: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    paranoid: bool = False,
+    watch: Watch | None = None,
+) -> RunResult:
+    """Replays a recording in this process, through the graph that made it or another one with the same sources.
+
+    Recorded streams replace the sources; everything else runs again. `start`, `end`: seconds from the first message;
+    operators begin in the state that they had at `start`. Raises `ReplayError`, `GraphError`, `RunFailed`.
+    """
+    path = Path(recording)
+    with Recording(path) as opened:
+        built = recorded_graph(opened) if graph is None else resolved(graph, settings)
+        log = plan_replay(opened, built, start=start, end=end)
+    file = None if record is None else Path(record)
+    report = LocalRun(built, log=log, paranoid=paranoid).execute(
+        record=file, metadata=_metadata(built, "replay"), overwrite=overwrite, watch=watch
+    )
+    return RunResult(report, file)
+
+
+def launch(
+    graph: GraphLike,
+    *,
+    live: bool = False,
+    record: str | Path | None = None,
+    overwrite: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    watch: Watch | None = None,
+    **options: Any,
+) -> RunResult:
+    """Runs a graph in processes of its own, as `dataflow run` does, and returns when it is done.
+
+    `live`: sources run by the clock. Further options are the fields of `RunPlan`: `placement`, `rate`, `view_file`.
+    Raises `GraphError`, `RunFailed`, and `ValueError` for operators of a notebook, which other processes cannot find.
+    """
+    from dataflow.supervision.run import run as run_in_processes
+
+    built = resolved(graph, settings)
+    if here := _defined_here(built):
+        raise ValueError(f"{', '.join(here)}: defined in this program, where no other process finds them; use run()")
+    file = None if record is None else Path(record)
+    report = run_in_processes(built, watch=watch, live=live, record=file, overwrite=overwrite, **options)
+    return RunResult(report, file)
+
+
+def verify(
+    recording: str | Path,
+    *,
+    graph: GraphLike | None = None,
+    tolerance: float | None = None,
+    start: float | None = None,
+    only: str | None = None,
+    jobs: int | None = None,
+) -> Verified:
+    """Re-executes a recording by its firing records and compares every output with what was recorded.
+
+    `tolerance`: absolute, for floating-point fields; `start`: seconds from the first message; `only`: one operator;
+    `jobs`: worker processes. Operators of a notebook are re-executed in this process. Raises `ReplayError`,
+    `RunFailed`.
+    """
+    from dataflow.api.here import call_here
+    from dataflow.verification.processes import call_workers
+    from dataflow.verification.verify import verify as verify_recording
+
+    path = Path(recording)
+    with Recording(path) as opened:
+        built = recorded_graph(opened) if graph is None else resolved(graph)
+    workers = call_here if _defined_here(built) else call_workers
+    report = verify_recording(
+        path, graph=built, tolerance=tolerance, start=start, only=only, jobs=jobs, workers=workers
+    )
+    return Verified(report)
+
+
+def resolved(graph: GraphLike, settings: Mapping[str, Any] | None = None) -> ResolvedGraph:
+    """The checked graph of a builder or a YAML file. Raises `GraphError`; `ValueError` for settings without a file."""
+    if isinstance(graph, str | Path):
+        given = {name: v if isinstance(v, str) else json.dumps(v) for name, v in (settings or {}).items()}
+        words = [f"{name}={value}" for name, value in given.items()]
+        return load_graph(graph, settings=words)
+    if settings:
+        raise ValueError("settings change a graph file; give parameters to Graph.add()")
+    return graph.build() if isinstance(graph, Graph) else graph
+
+
+def _defined_here(graph: ResolvedGraph) -> list[str]:
+    return [node.name for node in graph.nodes.values() if node.use.startswith(NOTEBOOK)]
+
+
+def _metadata(graph: ResolvedGraph, mode: str) -> dict[str, dict[str, str]]:
+    """Returns what a recording made here says of itself; the thread settings are those of this process."""
+    facts = {
+        "mode": mode,
+        "started": str(time.time_ns()),
+        "rate": "as fast as it goes",
+        "seed": str(graph.seed),
+        seeding.FACT: str(seeding.VERSION),
+        "threads": str(graph.threads),
+    }
+    return {**graph_metadata(graph), RUN: facts, **machine_facts(dict(os.environ))}

@@ -1,0 +1,193 @@
+"""`dataflow replay`, which also completes thin recordings."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+
+from dataflow.cli.arguments import (
+    End,
+    ModuleFolders,
+    Network,
+    RecordingFile,
+    Settings,
+    Start,
+    existing,
+    find_modules_in,
+    output_file,
+    span,
+    window,
+)
+from dataflow.cli.execution import checked_outputs, execute, plan_options
+from dataflow.cli.output import DIFFERENT, err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.run_options import (
+    OUTPUT,
+    Json,
+    OneProcess,
+    Open,
+    Paranoid,
+    Place,
+    ProcessEach,
+    Quiet,
+    Rate,
+    Record,
+    Replace,
+    Timeout,
+    View,
+)
+
+if TYPE_CHECKING:
+    from dataflow.graph import Graph
+    from dataflow.recording import Recording
+
+
+def replay(
+    recording: RecordingFile,
+    graph: Annotated[
+        Path | None,
+        typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
+    ] = None,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    start: Start = None,
+    end: End = None,
+    rate: Rate = None,
+    timeout: Timeout = 120.0,
+    paranoid: Paranoid = False,
+    network: Network = False,
+    quiet: Quiet = False,
+    one_process: OneProcess = False,
+    process_each: ProcessEach = False,
+    place: Place = None,
+    record: Record = None,
+    view: View = None,
+    open_view: Open = False,
+    complete: Annotated[
+        Path | None,
+        typer.Option(
+            "--complete",
+            metavar="FILE.mcap",
+            rich_help_panel=OUTPUT,
+            help="Compute what a thin recording leaves out, by its firing records, and write the complete recording.",
+        ),
+    ] = None,
+    overwrite: Replace = False,
+    json: Json = False,
+) -> None:
+    """Replay a recording through the graph that made it, or another one.
+
+    Recorded streams replace the sources; everything else runs again, with identical results. Compare two recordings of
+    it with `dataflow diff`. With --start, operators begin in the state they had then, where the recording is of the
+    same operators: their last recorded snapshot, and what they did since, repeated.
+
+    With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
+    nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded
+    digest. Where one comes out otherwise, nothing is written and the exit code is 1; also 1 where firings could not be
+    repeated, and what they made is missing.
+
+    Exit codes:
+
+      0    it ran to its end
+      1    an operator failed; with --complete: not as recorded, or in part
+      2    could not run: a wrong option, a recording that lacks something
+      130  interrupted with Ctrl-C
+
+    Examples:
+
+      dataflow replay run.mcap
+      dataflow replay run.mcap --start 5 --end 10 --rate 1 --view spawn
+      dataflow replay run.mcap --graph other.yaml --set cloud.stride=8
+      dataflow replay run.mcap --record again.mcap --view again.rrd --open
+      dataflow replay thin.mcap --complete full.mcap
+    """
+    began = time.monotonic()
+    from dataflow.graph import load_graph
+    from dataflow.recording import Recording
+    from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
+    from dataflow.supervision.replay import plan_replay
+    from dataflow.supervision.run import replay as replay_recording
+
+    with friendly_errors():
+        existing(recording, "a recording")
+        if record is not None and record.exists() and record.samefile(recording):
+            raise fail(f"--record {record} is the recording that is being replayed; name another file")
+        if graph is None and settings:
+            raise fail("--set changes a graph file: name it with --graph")
+        find_modules_in(path)
+        with Recording(recording) as opened:
+            if graph is None:
+                recorded = graph_as_recorded(opened)
+                loaded = recorded if network else isolated(recorded)
+                if loaded.network != recorded.network:
+                    say_network_ignored(recording)
+            else:
+                loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+            if complete is not None:
+                alone = (start, end, rate, record, view, place) == (None,) * 6
+                if not alone or open_view or one_process or process_each or paranoid:
+                    raise fail(
+                        "--complete repeats a run as it was, in one process: of the other options only --graph, "
+                        "--set, --overwrite, --quiet and --json go with it"
+                    )
+                _complete(recording, loaded, complete, overwrite=overwrite, json=json, quiet=quiet)
+                return
+            whole = span(opened, plan_replay(opened, loaded).streams)
+            begin, finish = window(whole, start, end, recording)
+            if opened.torn:
+                name = escape(str(recording))
+                say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
+            if begin is not None:
+                _say_what_begins_fresh(opened, loaded)
+        outputs = checked_outputs(record, view, open_view, overwrite)
+        options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
+        shown = None
+        if whole is not None:
+            shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
+        execute(
+            lambda watch: replay_recording(recording, graph=loaded, start=start, end=end, watch=watch, **options),
+            loaded,
+            outputs,
+            shown,
+            began=began,
+            json=json,
+            quiet=quiet,
+        )
+
+
+def say_network_ignored(recording: Path) -> None:
+    """Reports that the graph inside a recording would have opened ports or connected somewhere, and did not."""
+    say(
+        f"[yellow]not obeyed:[/] the `network:` section of the graph inside {escape(str(recording))}; this run stays "
+        "on this machine (--network obeys it)"
+    )
+
+
+def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
+    """With --start: which operators cannot have the state they had then."""
+    from dataflow.reexecution.warm_start import fresh_because
+
+    for node in graph.nodes.values():
+        if not node.source and (reason := fresh_because(recording, graph, node)) is not None:
+            say(f"[yellow]{escape(node.name)} begins with fresh state:[/] {escape(reason)}")
+
+
+def _complete(recording: Path, graph: Graph, file: Path, *, overwrite: bool, json: bool, quiet: bool) -> None:
+    from dataflow.cli.progress import RunDisplay, shown
+    from dataflow.cli.verdicts import print_completion
+    from dataflow.verification.complete import complete
+
+    if file.exists() and file.samefile(recording):
+        raise fail(f"--complete {file} is the recording that is to be completed; name another file")
+    output_file(file, ".mcap", overwrite=overwrite, option="--complete")
+    with shown(err, RunDisplay(err), quiet=quiet) as watch:
+        made = complete(recording, file, graph=graph, overwrite=overwrite, watch=watch)
+    if json:
+        print_json(made.as_json())
+    else:
+        print_completion(out, made)
+    if not made.whole:
+        raise typer.Exit(DIFFERENT)

@@ -1,0 +1,101 @@
+"""`dataflow run`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dataflow.cli.arguments import (
+    GraphFile,
+    ModuleFolders,
+    Settings,
+    existing,
+    find_modules_in,
+)
+from dataflow.cli.execution import checked_outputs, execute, plan_options
+from dataflow.cli.output import fail, friendly_errors
+from dataflow.cli.run_options import (
+    Json,
+    Live,
+    OneProcess,
+    Open,
+    Paranoid,
+    Place,
+    ProcessEach,
+    Quiet,
+    Rate,
+    Record,
+    Replace,
+    Timeout,
+    View,
+)
+
+
+def run(
+    graph: GraphFile,
+    settings: Settings = None,
+    path: ModuleFolders = None,
+    rate: Rate = None,
+    timeout: Timeout = 120.0,
+    live: Live = False,
+    paranoid: Paranoid = False,
+    chaos: Annotated[
+        Path | None,
+        typer.Option("--chaos", metavar="PLAN.yaml", help="Let the faults of a plan happen; implies --live."),
+    ] = None,
+    chaos_seed: Annotated[
+        int | None, typer.Option("--chaos-seed", metavar="N", help="Another seed than the plan's own.")
+    ] = None,
+    quiet: Quiet = False,
+    one_process: OneProcess = False,
+    process_each: ProcessEach = False,
+    place: Place = None,
+    record: Record = None,
+    view: View = None,
+    open_view: Open = False,
+    overwrite: Replace = False,
+    json: Json = False,
+) -> None:
+    """Run a graph.
+
+    A table of its operators is shown while it runs, and a summary at the end. Ctrl-C ends it in order: sources stop,
+    everything on its way is finished, files are closed; a second Ctrl-C ends it at once.
+
+    Examples:
+
+      dataflow run graphs/synthetic_rgbd.yaml
+      dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --view spawn
+      dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
+      dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
+      dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
+      dataflow run graphs/simulated_robot.yaml --live --record live.mcap
+      dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
+    """
+    began = time.monotonic()
+    from dataflow.chaos.plan import load_plan
+    from dataflow.graph import load_graph
+    from dataflow.supervision.run import run as run_graph
+
+    with friendly_errors():
+        if chaos_seed is not None and chaos is None:
+            raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+        find_modules_in(path)
+        live = live or chaos is not None
+        loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
+        outputs = checked_outputs(record, view, open_view, overwrite)
+        options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
+        options["live"] = live
+        if chaos is not None:
+            options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
+        execute(
+            lambda watch: run_graph(loaded, watch=watch, **options),
+            loaded,
+            outputs,
+            None,
+            began=began,
+            json=json,
+            quiet=quiet,
+        )

@@ -1,0 +1,87 @@
+"""Seeds numpy's global generator when somebody draws from it, not before: seeding costs as much as a small firing.
+
+`numpy.random` draws under the lock of its bit generator. The one that is put in here is numpy's own, with a lock that
+seeds it first where a seed is pending; so whatever refers to the global generator, and however it was imported, draws
+the same as if it had been seeded at once. The class has the name of numpy's, which `numpy.random.get_state` asks for.
+"""
+
+from __future__ import annotations
+
+import threading
+from types import TracebackType
+from typing import Any, SupportsInt
+
+import numpy as np
+from numpy.random import mtrand
+
+_STATE: Any = np.random.MT19937.state
+
+
+class _SeedingLock:
+    """A lock that seeds the global generator when it is taken, if a seed is pending."""
+
+    def __init__(self) -> None:
+        self.pending: SupportsInt | None = None
+        self.settled = 0
+        """How often somebody has drawn."""
+        self._lock = threading.RLock()
+
+    def __enter__(self) -> None:
+        self._lock.acquire()
+        if self.pending is not None:
+            self.settle()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._lock.release()
+
+    def settle(self) -> None:
+        """Seeds the generator with what is pending, if anything is."""
+        with self._lock:
+            seed, self.pending = self.pending, None
+            if seed is not None:
+                self.settled += 1
+                mtrand._rand.seed(int(seed) & 0xFFFFFFFF)
+
+
+class MT19937(np.random.MT19937):
+    """numpy's bit generator, whose state is asked for, replaced and drawn from as one that is seeded."""
+
+    lock: Any = _SeedingLock()
+
+    @property
+    def state(self) -> Any:
+        self.lock.settle()
+        return _STATE.__get__(self)
+
+    @state.setter
+    def state(self, value: Any) -> None:
+        self.lock.pending = None
+        _STATE.__set__(self, value)
+
+    def random_raw(self, size: Any = None, output: Any = True) -> Any:
+        self.lock.settle()
+        return super().random_raw(size, output)
+
+
+_GENERATOR = MT19937(0)
+
+
+def seed_lazily(seed: SupportsInt) -> None:
+    """Seeds the global generator, as `numpy.random.seed` does, with the low 32 bits of `seed`, as soon as anybody asks
+    something of it."""
+    if mtrand._rand._bit_generator is _GENERATOR:
+        _GENERATOR.lock.pending = seed
+    elif type(mtrand._rand._bit_generator) is np.random.MT19937:
+        mtrand.set_bit_generator(_GENERATOR)
+        _GENERATOR.lock.pending = seed
+    else:
+        np.random.seed(int(seed) & 0xFFFFFFFF)
+
+
+def peek() -> tuple[object, ...]:
+    """Returns a value that differs after a draw, and does not seed the generator."""
+    if mtrand._rand._bit_generator is not _GENERATOR:
+        state: Any = np.random.get_state(legacy=False)
+    else:
+        state = _STATE.__get__(_GENERATOR)
+    return _GENERATOR.lock.settled, state["state"]["key"].tobytes(), state["state"]["pos"]

@@ -1,0 +1,105 @@
+"""A graph on its way from files to operators: drafts of operators, and the key expressions that are to wire them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dataflow.graph.problems import Place
+from dataflow.graph.tree import Leaf, Table, Tree
+from dataflow.messages.base import Message
+from dataflow.operator import Operator
+
+
+@dataclass(frozen=True, slots=True)
+class Pattern:
+    """A key expression of an input: as written, absolute and canonical, and where it stands.
+
+    `scope` is the key prefix that the written text is relative to; `via` the place inside a nested graph, when the
+    expression was bound to a nested graph's input outside it.
+    """
+
+    text: str
+    key: str
+    place: Place
+    scope: str
+    via: Place | None = None
+
+
+@dataclass(slots=True)
+class Draft:
+    """One operator before its inputs are wired."""
+
+    name: str
+    place: Place
+    file: str
+    use: str
+    cls: type[Operator]
+    params: dict[str, Any]
+    inputs: dict[str, list[Pattern]]
+    input_places: dict[str, Place]
+    inputs_place: Place
+    process: Leaf | None
+    machine: Leaf | None
+    live: Tree | None
+    sync: Tree | None
+
+
+@dataclass(frozen=True, slots=True)
+class Alias:
+    """An exported output of a nested graph: `key` stands for the stream that `target` matches."""
+
+    key: str
+    target: Pattern
+
+
+@dataclass(frozen=True, slots=True)
+class GraphInput:
+    """A declared input of a nested graph, bound to expressions outside; `type` is what it promises to carry."""
+
+    patterns: tuple[Pattern, ...]
+    type: type[Message] | None
+    place: Place
+    """Where the nested graph declares it."""
+
+
+@dataclass(slots=True)
+class Expansion:
+    """All that the files say, flat."""
+
+    root: Table
+    name: str
+    namespace: str
+    drafts: list[Draft] = field(default_factory=list)
+    aliases: list[Alias] = field(default_factory=list)
+    graph_inputs: list[tuple[str, GraphInput]] = field(default_factory=list)
+    broken: list[str] = field(default_factory=list)
+    """Key prefixes of operators that could not be had: nothing is said about streams below them."""
+    names: set[str] = field(default_factory=set)
+    """Full names of operators and nested graphs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scope:
+    """Says where in the nesting a file stands. `prefix` is "" or "front/"; `key` the absolute key prefix."""
+
+    file: str
+    shown: str
+    prefix: str
+    key: str
+    given: Mapping[str, Tree]
+    bindings: Mapping[str, tuple[Place, list[Pattern]]]
+    use: Place | None
+    process: Leaf | None
+    machine: Leaf | None
+    stack: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Wired:
+    """A draft with the streams of its inputs; `places` says where each came from."""
+
+    draft: Draft
+    inputs: dict[str, tuple[str, ...]]
+    places: dict[tuple[str, str], Place]

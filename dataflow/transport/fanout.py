@@ -1,0 +1,130 @@
+"""What a process sends to others of its machine: one envelope to every link whose consumer takes its key."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+from dataflow.transport.codec import encode_head
+from dataflow.transport.envelope import Buffer, Envelope
+from dataflow.transport.links import Outgoing
+from dataflow.transport.pool import SharedPool
+from dataflow.transport.shared import THRESHOLD
+
+POOL_BYTES = 256 << 20
+MAPPED_WITHIN = 1.0
+
+
+class Fanout:
+    """The outgoing links of a process with the keys of their channels, and the pool that large messages lie in.
+
+    `pool_bytes`: its size; 0: messages travel whole.
+    """
+
+    def __init__(self, outgoing: Sequence[tuple[Sequence[str], Outgoing]], *, pool_bytes: int = POOL_BYTES) -> None:
+        self._links = [link for _, link in outgoing]
+        self._keys = [keys for keys, _ in outgoing]
+        takers: dict[str, list[tuple[Outgoing, int]]] = {}
+        for keys, link in outgoing:
+            for number, key in enumerate(keys):
+                takers.setdefault(key, []).append((link, number))
+        self.takers: Mapping[str, Sequence[tuple[Outgoing, int]]] = takers
+        """By key, the links whose consumers take it, and the number of its channel there."""
+        self._sent = [0, 0]
+        self._shared = [0, 0]
+        self._full = 0
+        self._pool_bytes = pool_bytes
+        self._pool: SharedPool | None = None
+
+    def send(
+        self, key: str, parts: Sequence[Buffer], *, envelope: Envelope | None = None, droppable: bool = True
+    ) -> int:
+        """Sends to all that take a key; returns how many those are.
+
+        `parts` are consecutive buffers, and those of `envelope`, where that is given: it may go through the pool.
+        `droppable`: a consumer of a live run that takes nothing for too long may miss it.
+        """
+        takers = self.takers.get(key)
+        if not takers:
+            return 0
+        size = sum(map(len, parts))
+        if size >= THRESHOLD and envelope is not None and self._pool_bytes:
+            self._lend(takers, parts, size, envelope, droppable=droppable)
+        else:
+            for link, channel in takers:
+                link.send(channel, parts, size, droppable=droppable)
+        self._sent[0] += 1
+        self._sent[1] += size
+        return len(takers)
+
+    def _lend(
+        self,
+        takers: Sequence[tuple[Outgoing, int]],
+        parts: Sequence[Buffer],
+        size: int,
+        envelope: Envelope,
+        *,
+        droppable: bool,
+    ) -> None:
+        pool = self._pool = self._pool or SharedPool(self._pool_bytes)
+        present = [(link, channel) for link, channel in takers if link.present()]
+        able = [(link, channel) for link, channel in present if not droppable or link.may_borrow(size, pool.free)]
+        for link, _ in present:
+            if all(link is not each for each, _ in able):
+                link.refuse()
+        if not able:
+            return
+        block = pool.write(parts, size, tuple(link.claim for link, _ in able))
+        if block is None:
+            self._full += 1
+            for link, channel in able:
+                link.send(channel, parts, size, droppable=droppable)
+            return
+        self._shared[0] += 1
+        self._shared[1] += size
+        reference = pool.reference(encode_head(envelope), block, size)
+        for link, channel in able:
+            link.send(channel, [reference], len(reference), droppable=droppable, block=block)
+
+    def flush(self) -> bool:
+        """Sends what has waited for room, as far as there is some; True when nothing is left."""
+        return not sum(not link.flush() for link in self._links if link.waiting)
+
+    def joined(self) -> list[tuple[Sequence[str], Outgoing]]:
+        """Returns the links, with their keys, whose consumer was replaced since the last look."""
+        found = []
+        for keys, link in zip(self._keys, self._links, strict=True):
+            if link.present() and link.joined:
+                link.joined = False
+                found.append((keys, link))
+        return found
+
+    def take_leave(self, number: int) -> None:
+        """The process at the other end of a link has died."""
+        self._links[number].take_leave()
+
+    def counters(self) -> dict[str, int]:
+        """Counts envelopes and bytes that were sent, those of them that went through the pool, the large ones that
+        travelled whole because it had no room, and those that did not reach a consumer that took nothing for too long.
+        """
+        return {
+            "sent_messages": self._sent[0],
+            "sent_bytes": self._sent[1],
+            "shared_messages": self._shared[0],
+            "shared_bytes": self._shared[1],
+            "shared_full": self._full,
+            "unsent": sum(link.dropped for link in self._links),
+        }
+
+    def close(self) -> None:
+        """Gives the pool back, once consumers that were just sent their first reference have mapped it (bounded)."""
+        if self._pool is None:
+            return
+        base, end = self._pool.base, time.monotonic() + MAPPED_WITHIN
+        waiting = self._pool.consumers()
+        while waiting and time.monotonic() < end:
+            waiting = {c for c in waiting if not c.mapped(base)}
+            if waiting:
+                time.sleep(0.002)
+        self._pool.close()
+        self._pool = None

@@ -1,0 +1,188 @@
+"""The pose of a frame: solved from its corners, refined by its depth, with what supports it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert, transform_points
+from operators.geometry.pinhole import Pixels, Points, project
+from operators.geometry.se3 import Matrix
+from operators.odometry.alignment import Freedom, PixelTerm, PlaneTerm, PriorTerm, align
+from operators.odometry.camera import RgbdCamera
+from operators.odometry.frame import Frame
+from operators.odometry.keyframe import Keyframe
+from operators.odometry.local_map import LocalMap
+from operators.odometry.motion import Motion
+from operators.odometry.movers import Movers
+from operators.odometry.noise import Noise
+from operators.odometry.settings import RgbdOdometryConfig
+
+# Share of the summed information that is believed. Neighbouring residuals err together (depth noise is smooth
+# over several pixels, tracks share motion blur), so they do not average like independent draws.
+PLANE_STRENGTH = 0.1
+PIXEL_STRENGTH = 0.2
+# Drift that no residual of one frame shows: variances are this much larger than residuals say (calibrated against
+# truth, see the benchmark). Calibration, rolling shutters and unsynchronised images err alike in every residual, so no
+# count averages them out, but tracks then miss by more than they jitter; and what moves may do so unnoticed.
+SYSTEMATIC = 0.75
+JITTER = 0.33  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
+MOVING = 10.0  # of the share of the view that moves
+
+STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """World points (N, 3) and where the frame sees them (N, 2), all in agreement with a pose."""
+
+    T_world_camera: Matrix
+    points_world: Points
+    pixels: Pixels
+    ages: NDArray[np.int64]
+    recognised: bool = False  # by descriptors, so the pose may lie far from the prediction
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """The refined pose and what supports it."""
+
+    T_world_camera: Matrix
+    information: Matrix  # (6, 6) of the measurements
+    prior: Matrix  # (6, 6) information of the prediction
+    inliers: int  # feature tracks
+    offered: int  # depth points the frame has, times the reference surfaces
+    compared: int  # of these, those that met a reference surface
+    agreeing: int  # of these, those that lie on it
+    noise: Noise
+    movers: Movers
+    sighting: Sighting | None
+
+    @property
+    def depth_inliers(self) -> float:
+        return self.agreeing / self.compared if self.compared else 0.0
+
+    @property
+    def depth_agrees(self) -> bool:
+        return self.compared > max(100, 0.1 * self.offered) and self.depth_inliers > 0.5
+
+    def certain(self, many: int, few: int) -> bool:
+        """Returns whether a recognised pose stands: by many features, or by few that depth confirms."""
+        met = self.compared > max(100, 0.1 * self.offered)
+        if self.inliers >= many:
+            return self.depth_agrees or not met
+        return self.inliers >= few and self.compared > 0.3 * self.offered and self.depth_inliers > 0.85
+
+    @property
+    def recognised(self) -> bool:
+        return self.sighting is not None and self.sighting.recognised
+
+    @property
+    def covariance(self) -> Matrix:
+        misfit = max(1.0, self.noise.pixel / JITTER) ** 4 + MOVING * self.movers.share
+        return SYSTEMATIC * misfit * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
+
+    @property
+    def weakest_sigma(self) -> float:
+        """Standard deviation, in metres or radians, along what the measurements alone determine least."""
+        return float(1.0 / np.sqrt(max(np.linalg.eigvalsh(self.information)[0], 1e-12)))
+
+
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """Fits poses of a camera, whose K_color is that of the working image, with the noise learnt so far."""
+
+    camera: RgbdCamera
+    config: RgbdOdometryConfig
+    noise: Noise
+
+    def solve(
+        self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
+    ) -> Sighting | None:
+        """RANSAC PnP; OpenCV seeds it alike at every call."""
+        if len(points_world) < fewest:
+            return None
+        threshold = max(threshold, 1.0)
+        ok, rotation, translation, inliers = cv2.solvePnPRansac(
+            points_world, pixels, self.camera.K_color, None, iterationsCount=300,
+            reprojectionError=threshold, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
+        )  # fmt: skip
+        if not ok or inliers is None:
+            return None
+        T_color_world = np.eye(4)
+        T_color_world[:3, :3] = cv2.Rodrigues(rotation)[0]
+        T_color_world[:3, 3] = translation.ravel()
+        error = project(transform_points(T_color_world, points_world), self.camera.K_color) - pixels
+        chosen = np.einsum("ij,ij->i", error, error) < threshold**2
+        if np.count_nonzero(chosen) < fewest:
+            return None
+        T_world_camera = invert(T_color_world) @ self.camera.T_color_depth
+        return Sighting(T_world_camera, points_world[chosen], pixels[chosen], ages[chosen])
+
+    def refine(
+        self,
+        frame: Frame,
+        sighting: Sighting | None,
+        motion: Motion,
+        T_predicted: Matrix,
+        known: LocalMap,
+        segment: int,
+    ) -> Fit:
+        """Refines a sighting's pose, or else the prediction, against the surfaces of a segment of the map."""
+        config = self.config
+        spread = motion.spread(frame.stamp, config.acceleration, config.angular_acceleration)
+        prior, freedom = PriorTerm(T_predicted, np.diag(1.0 / np.diag(spread))), Freedom.of(spread)
+        T, features = T_predicted, list[PixelTerm]()
+        sigma = self.noise.pixel
+        if sighting:
+            T = sighting.T_world_camera
+            if sighting.recognised:
+                prior, sigma = PriorTerm(T, 1e-3 * np.eye(6)), max(1.0, sigma)
+            features = [
+                PixelTerm(
+                    sighting.points_world, sighting.pixels, self.camera.K_color, self.camera.T_color_depth,
+                    sigma, PIXEL_STRENGTH,
+                )
+            ]  # fmt: skip
+            rough = align(T, features, prior, 4)
+            T = rough.T_world_camera
+            freedom = Freedom.of(np.asarray(np.linalg.inv(rough.information + prior.information), np.float64))
+        references = known.references(T, config.references, segment) if config.refine else []
+        shape = frame.surface.inverse_depth.shape
+        movers = Movers.none(frame.surface.K, (shape[0], shape[1]))
+        stages = ((4, 0.3, 8), *STAGES) if sighting and sighting.recognised else STAGES
+        for stride, gate, iterations in stages:
+            points = frame.surface.points(stride)
+            if stride == 2 and sighting and references:
+                earlier = [k for k in known.earlier(T, segment) if not any(k is r for r in references)]
+                terms = self._planes(points, [*references, *earlier], freedom, gate)
+                movers = Movers.between(frame.surface.K, (shape[0], shape[1]), points, terms, T)
+                points = points[~movers.hold(points)]
+            surfaces = self._planes(points, references, freedom, gate)
+            alignment = align(T, [*features, *surfaces], prior, iterations)
+            T = alignment.T_world_camera
+        corners, depth = alignment.terms[: len(features)], alignment.terms[len(features) :]
+        followed = corners if sighting and not sighting.recognised else ()
+        return Fit(
+            T_world_camera=T,
+            information=alignment.information,
+            prior=prior.information,
+            inliers=sum(part.inliers for part in corners),
+            offered=len(points) * len(depth),
+            compared=sum(part.seen for part in depth),
+            agreeing=sum(part.inliers for part in depth),
+            noise=self.noise.after(
+                followed[0].median if followed else None, depth[0].median if depth and followed else None
+            ),
+            movers=movers,
+            sighting=sighting,
+        )
+
+    def _planes(self, points: Points, references: Sequence[Keyframe], freedom: Freedom, gate: float) -> list[PlaneTerm]:
+        noise, scale = self.config.depth_noise, self.noise.depth
+        return [
+            PlaneTerm(points, k.surface, k.T_camera_world, noise, scale, freedom, gate, PLANE_STRENGTH)
+            for k in references
+        ]

@@ -1,0 +1,108 @@
+"""The keyframes that an odometry remembers."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from operators.geometry.pinhole import project
+from operators.geometry.se3 import Matrix, orthonormalised
+from operators.odometry.keyframe import Keyframe, view_distance
+from operators.odometry.surface import Surface
+
+RECENT = 5  # newest keyframes, never forgotten
+EARLIER = 6  # keyframes back, at most, to one that tells what has moved since
+REACH = 0.7  # radians of view change beyond which two views share too little to be compared
+
+
+class LocalMap:
+    """Keyframes in order of time; those that others make up for are forgotten first.
+
+    After a loss a new segment begins: keyframes whose place among the older ones is unknown until one of those is
+    recognised. Only keyframes of the newest segment are compared with directly.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self.keyframes: list[Keyframe] = []
+
+    @property
+    def newest(self) -> Keyframe:
+        return self.keyframes[-1]
+
+    @property
+    def elsewhere(self) -> list[Keyframe]:
+        """The keyframes of older segments."""
+        return [k for k in self.keyframes if k.segment != self.newest.segment]
+
+    def add(self, keyframe: Keyframe) -> None:
+        self.keyframes.append(keyframe)
+        if len(self.keyframes) > self.capacity:
+            del self.keyframes[self._redundant()]
+
+    def drop_newest_segment(self) -> None:
+        """Forgets a segment that never found its place."""
+        self.keyframes = self.elsewhere
+
+    def join(self, known: Keyframe, T_known_newest: Matrix) -> None:
+        """Moves the newest segment rigidly to where one of its motions in an older segment's world says it is."""
+        segment = self.newest.segment
+        self.keyframes = [
+            replace(
+                k,
+                T_world_camera=orthonormalised(T_known_newest @ k.T_world_camera),
+                covariance=known.covariance,
+                segment=known.segment,
+            )
+            if k.segment == segment
+            else k
+            for k in self.keyframes
+        ]
+
+    def nearby(self, T_world_camera: Matrix, count: int, segment: int, reach: float = REACH) -> list[Keyframe]:
+        """Returns a segment's newest keyframe, then those whose views are nearest to a pose's."""
+        *older, newest = (k for k in self.keyframes if k.segment == segment)
+        depth = typical_depth(newest.surface)
+        distances = [view_distance(k.T_world_camera, T_world_camera, depth) for k in older]
+        ranked = sorted(range(len(older)), key=distances.__getitem__)
+        return [newest, *(older[i] for i in ranked[: count - 1] if distances[i] < reach)]
+
+    def references(self, T_world_camera: Matrix, count: int, segment: int) -> list[Keyframe]:
+        """Returns keyframes of a segment with a surface, the newest such first, then the nearest views."""
+        return [k for k in self.nearby(T_world_camera, count + 2, segment) if k.surface.coverage > 0.02][:count]
+
+    def earlier(self, T_world_camera: Matrix, segment: int) -> list[Keyframe]:
+        """Returns the keyframe of a while ago that still shares a pose's view, if there is one."""
+        old = [k for k in self.keyframes if k.segment == segment][-EARLIER:-2]
+        near = [k for k in old if view_distance(k.T_world_camera, T_world_camera, 2.0) < 0.5 * REACH]
+        return near[:1]
+
+    def rendered(self, T_world_camera: Matrix, like: Surface) -> Surface:
+        """Returns what the map expects a depth camera at a pose to see, on the grid of a surface."""
+        h, w = like.inverse_depth.shape
+        seen = np.zeros(h * w, np.float32)
+        for keyframe in self.references(T_world_camera, 4, self.newest.segment):
+            points = keyframe.surface.points()
+            T = keyframe.T_camera_world @ T_world_camera
+            points = (points - T[:3, 3]) @ T[:3, :3]
+            points = points[points[:, 2] > 0.05]
+            u, v = np.rint(project(points, like.K)).astype(np.int64).T
+            inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+            np.maximum.at(seen, v[inside] * w + u[inside], (1.0 / points[inside, 2]).astype(np.float32))
+        inverse = seen.reshape(h, w)
+        return Surface(np.where(inverse > 0, inverse, cv2.dilate(inverse, np.ones((3, 3), np.uint8))), like.K)
+
+    def _redundant(self) -> int:
+        """Returns the index of the old keyframe whose neighbours in time see most nearly what it sees."""
+        old = self.keyframes[: max(len(self.keyframes) - RECENT, 1)]
+        gaps = [
+            view_distance(self.keyframes[i - 1].T_world_camera, self.keyframes[i + 1].T_world_camera, 2.0)
+            for i in range(1, len(old))
+        ]
+        return 1 + int(np.argmin(gaps)) if gaps else 0
+
+
+def typical_depth(surface: Surface) -> float:
+    """Returns the median depth of a view, metres; 2 m where nothing is known."""
+    known = surface.inverse_depth[surface.inverse_depth > 0]
+    return float(1.0 / np.median(known)) if known.size else 2.0

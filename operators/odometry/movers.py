@@ -1,0 +1,68 @@
+"""Parts of a view that stand in front of where the map has its surfaces: something has moved there."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.geometry.pinhole import Pixels, Points
+from operators.geometry.se3 import Matrix
+from operators.odometry.alignment import PlaneTerm
+
+TILE = 8  # patches on a side
+FEWEST = 4  # compared points that a tile is judged by
+
+
+@dataclass(frozen=True, eq=False)
+class Movers:
+    """Tiles of a surface's grid in which something moves, their neighbours included."""
+
+    tiles: NDArray[np.bool_]  # (rows, columns)
+    K: Matrix  # (3, 3) of the grid
+
+    @staticmethod
+    def none(K: Matrix, shape: tuple[int, int]) -> "Movers":
+        """Returns what a view of a world that stands still has."""
+        return Movers(np.zeros(_tiles(shape), np.bool_), K)
+
+    @staticmethod
+    def between(
+        K: Matrix, shape: tuple[int, int], points: Points, terms: Sequence[PlaneTerm], T_world_camera: Matrix
+    ) -> "Movers":
+        """Compares points (N, 3) of a view, on whose grid of a shape (h, w) K projects, with reference surfaces.
+
+        A tile moves where most of its points lie nearer than any of the references allows: an old one tells what
+        moves slowly. What lies farther was hidden by something that has left, and stands.
+        """
+        rows, columns = _tiles(shape)
+        tile = _tile_of(points, K, (rows, columns))
+        moving = np.zeros(rows * columns, np.bool_)
+        for term in terms:
+            seen, in_front, same = term.compare(T_world_camera)
+            nearer = np.bincount(tile[seen[in_front]], minlength=rows * columns)
+            compared = np.bincount(tile[seen[in_front | same]], minlength=rows * columns)
+            moving |= (nearer > 0.5 * compared) & (compared >= FEWEST)
+        grown = moving.reshape(rows, columns).astype(np.uint8)
+        return Movers(cv2.dilate(grown, np.ones((3, 3), np.uint8)) > 0, K)
+
+    def hold(self, points: Points) -> NDArray[np.bool_]:
+        """Returns which of the points (N, 3), in the view's depth camera, lie in a moving tile."""
+        return np.asarray(self.tiles.ravel()[_tile_of(points, self.K, self.tiles.shape)], np.bool_)
+
+    @property
+    def share(self) -> float:
+        return float(self.tiles.mean())
+
+
+def _tiles(shape: tuple[int, int]) -> tuple[int, int]:
+    return -(-shape[0] // TILE), -(-shape[1] // TILE)
+
+
+def _tile_of(points: Points, K: Matrix, tiles: tuple[int, ...]) -> NDArray[np.int64]:
+    """Returns the flat index of the tile that each point (N, 3) projects into; outside, the nearest one."""
+    pixels: Pixels = points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
+    column = np.clip((pixels[:, 0] + 0.5) // TILE, 0, tiles[1] - 1).astype(np.int64)
+    row = np.clip((pixels[:, 1] + 0.5) // TILE, 0, tiles[0] - 1).astype(np.int64)
+    return row * tiles[1] + column

@@ -1,0 +1,154 @@
+"""Bundle adjustment of a window of stereo frames: poses and points that best explain where points were seen.
+
+Gauss-Newton over left column, row and right column of every sighting, reweighted by Cauchy's function; points are
+eliminated by the Schur complement. Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
+
+A pair that is rectified imperfectly has disparities that are off by a constant, which scales all depths and, with
+them, the way. Near and far points then disagree on how far the camera came, so the constant is estimated as well.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
+from operators.geometry.pinhole import Points
+from operators.geometry.se3 import Matrix
+
+CAUCHY = 2.0  # residuals of this many sigmas count half
+SLOWNESS = 3.0  # windows that the disparity's offset is averaged over
+OFFSET_SIGMA = 0.3  # pixels of offset that an unknown rig may have
+NEAR = 0.3  # metres; nearer points are behind or in the lens
+
+
+@dataclass(frozen=True, eq=False)
+class StereoRig:
+    """A rectified pair: K (3, 3) of the left image, baseline in metres."""
+
+    K: Matrix
+    baseline: float
+
+    def __post_init__(self) -> None:
+        if self.K.shape != (3, 3) or not np.isfinite(self.K).all() or self.K[0, 0] <= 0 or self.K[1, 1] <= 0:
+            raise ValueError("StereoRig.K must be a finite (3, 3) matrix with positive focal lengths")
+        if not (np.isfinite(self.baseline) and self.baseline > 0):
+            raise ValueError(f"StereoRig.baseline must be positive metres, got {self.baseline}")
+
+    def project(self, points: Points) -> NDArray[np.float64]:
+        """Returns (N, 3) left column, row, right column of points (N, 3) in the left camera; z at least NEAR."""
+        z = np.maximum(points[:, 2], NEAR)
+        u = self.K[0, 0] * points[:, 0] / z + self.K[0, 2]
+        v = self.K[1, 1] * points[:, 1] / z + self.K[1, 2]
+        return np.column_stack([u, v, u - self.K[0, 0] * self.baseline / z])
+
+    def triangulate(self, sightings: NDArray[np.float64]) -> Points:
+        """Returns points (N, 3) in the left camera of sightings (N, 3) with a positive disparity."""
+        z = self.K[0, 0] * self.baseline / (sightings[:, 0] - sightings[:, 2])
+        x = (sightings[:, 0] - self.K[0, 2]) / self.K[0, 0] * z
+        y = (sightings[:, 1] - self.K[1, 2]) / self.K[1, 1] * z
+        return np.column_stack([x, y, z])
+
+    def jacobian(self, points: Points) -> NDArray[np.float64]:
+        """Returns d sighting / d point (N, 3, 3)."""
+        x, y = points[:, 0], points[:, 1]
+        z = np.maximum(points[:, 2], NEAR)
+        fx, fy = self.K[0, 0], self.K[1, 1]
+        J = np.zeros((len(points), 3, 3))
+        J[:, 0, 0] = J[:, 2, 0] = fx / z
+        J[:, 0, 2] = -fx * x / z**2
+        J[:, 2, 2] = -fx * (x - self.baseline) / z**2
+        J[:, 1, 1], J[:, 1, 2] = fy / z, -fy * y / z**2
+        return J
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """Who saw what where: frames (S,) and points (S,) by index, sightings (S, 3) in pixels."""
+
+    frames: NDArray[np.int64]
+    points: NDArray[np.int64]
+    pixels: NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """Poses (W, 4, 4), points (M, 3) in the world, squared errors (S,) in sigmas, information (6, 6) of the last
+    pose, and the offset of disparities in pixels."""
+
+    poses: NDArray[np.float64]
+    points: Points
+    squared: NDArray[np.float64]
+    information: Matrix
+    offset: float
+
+
+def adjust(
+    rig: StereoRig,
+    poses: NDArray[np.float64],
+    points: Points,
+    seen: Sightings,
+    offset: float,
+    sigma: float,
+    fixed: int,
+    iterations: int,
+) -> Adjusted:
+    """Improves poses T_world_camera (W, 4, 4) after the first `fixed` ones, and points (M, 3) in the world."""
+    poses, points, believed = poses.copy(), points.copy(), offset
+    count, size = len(poses), len(points)
+    for iteration in range(iterations + 1):
+        inverse = np.array([invert(T) for T in poses])
+        R = inverse[seen.frames, :3, :3]
+        p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.frames, :3, 3]
+        r = (rig.project(p) - seen.pixels + np.array([0.0, 0.0, offset])) / sigma
+        squared = np.einsum("si,si->s", r, r)
+        weight = np.where(p[:, 2] > NEAR, 1.0 / (1.0 + squared / (3.0 * CAUCHY**2)), 0.0)
+        D = rig.jacobian(p) / sigma
+        # d p / d x of the pose's right perturbation is [-I, [p]x]; of the point, R.
+        Jp = np.empty((len(p), 3, 6))
+        Jp[:, :, :3] = -D
+        Jp[:, :, 3:] = np.cross(D, p[:, None, :])
+        Jl = D @ R
+        WJp, WJl = weight[:, None, None] * Jp, weight[:, None, None] * Jl
+        H = np.zeros((count, 6, 6))
+        np.add.at(H, seen.frames, WJp.transpose(0, 2, 1) @ Jp)
+        if iteration == iterations:
+            break
+        b = np.zeros((count, 6))
+        np.add.at(b, seen.frames, np.einsum("sij,si->sj", WJp, r))
+        V, c = np.zeros((size, 3, 3)), np.zeros((size, 3))
+        np.add.at(V, seen.points, WJl.transpose(0, 2, 1) @ Jl)
+        np.add.at(c, seen.points, np.einsum("sij,si->sj", WJl, r))
+        V += 1e-6 * np.eye(3)
+        V_inverse = np.linalg.inv(V)
+        E = np.zeros((count, size, 6, 3))
+        E[seen.frames, seen.points] = WJp.transpose(0, 2, 1) @ Jl
+        # The offset is one more unknown, after the free poses; only right columns tell of it.
+        free = count - fixed
+        last = 6 * free
+        A = np.zeros((last + 1, size, 3))
+        A[:last] = E[fixed:].transpose(0, 2, 1, 3).reshape(last, size, 3)
+        np.add.at(A[last], seen.points, WJl[:, 2] / sigma)
+        B = np.einsum("amj,mjk->amk", A, V_inverse).reshape(last + 1, 3 * size)
+        S, g = np.zeros((last + 1, last + 1)), np.zeros(last + 1)
+        for i in range(free):
+            S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] = H[fixed + i]
+        cross = np.zeros((count, 6))
+        np.add.at(cross, seen.frames, WJp[:, 2] / sigma)
+        S[last, :last] = S[:last, last] = cross[fixed:].ravel()
+        S[last, last] = weight.sum() / sigma**2
+        g[:last], g[last] = b[fixed:].ravel(), (weight * r[:, 2]).sum() / sigma
+        S -= B @ A.reshape(last + 1, 3 * size).T
+        g -= B @ c.ravel()
+        told = SLOWNESS * max(float(S[last, last]), 0.0) + 1.0 / OFFSET_SIGMA**2
+        S[last, last] += told
+        g[last] += told * (offset - believed)
+        x_all = -np.linalg.solve(S + 1e-9 * np.eye(last + 1), g)
+        x = np.asarray(x_all[:last], np.float64).reshape(free, 6)
+        poses[fixed:] = np.array([T @ se3.exp(d) for T, d in zip(poses[fixed:], x, strict=True)])
+        points += np.einsum("mij,mj->mi", V_inverse, -c - np.einsum("amj,a->mj", A, x_all))
+        offset += float(x_all[last])
+        if np.abs(x).max() < 1e-5:
+            break
+    return Adjusted(np.array([se3.orthonormalised(T) for T in poses]), points, squared, H[-1], offset)

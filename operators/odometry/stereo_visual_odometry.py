@@ -1,0 +1,131 @@
+"""Stereo visual odometry as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+
+from dataflow.messages import CameraInfo, Diagnostics, Image, Odometry
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.geometry.calibration import check_calibration
+from operators.odometry.emission import outputs
+from operators.odometry.motion import Motion
+from operators.odometry.stereo_adjustment import Sightings, StereoRig
+from operators.odometry.stereo_odometry import StereoOdometry, StereoOdometryConfig, StereoState
+from operators.odometry.watch import Watch
+
+
+class StereoVisualOdometry(Operator):
+    """Tracks a rectified stereo pair by its corners; the first left camera is the origin.
+
+    The pose is that of the left camera's optical frame, at every frame; `status` says what it rests on, as
+    VisualOdometry's does. The images must be rectified: rows of the two correspond. A constant error of the
+    disparities, as an imperfect rectification leaves it, is estimated on the way.
+    """
+
+    left: In[Image] = In(doc="left image, rectified, grey or colour")
+    right: In[Image] = In(doc="right image of the same stamp")
+    left_info: Sampled[CameraInfo] = Sampled(doc="calibration of the left camera")
+    right_info: Sampled[CameraInfo] = Sampled(doc="calibration of the right camera; P holds the baseline")
+    odometry: Out[Odometry] = Out(doc="the left camera in the odometry frame, with covariance and velocity")
+    status: Out[Diagnostics] = Out(doc="tracking, relocalised, predicted or lost, with the reason; at every frame")
+
+    odometry_frame: str = Param("odom", min_length=1, doc="name of the frame that the first left camera defines")
+    corners: int = Param(350, ge=50, doc="most corners followed")
+    min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
+    window: int = Param(8, ge=3, le=30, doc="frames adjusted together")
+    patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
+
+    _tracker: StereoOdometry | None = None
+    _calibration: tuple[CameraInfo, CameraInfo] | None = None
+    _restored: StereoState | None = None
+
+    def setup(self) -> None:
+        self._frames: Counter[str] = Counter()
+
+    def process(self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo) -> dict[str, Any]:
+        """Raises ValueError where an image does not fit its calibration, or that holds no baseline."""
+        check_calibration("left", left, left_info)
+        check_calibration("right", right, right_info)
+        result = self._tracking(left_info, right_info).track(left.data, right.data, left.stamp)
+        self._frames[result.status.value] += 1
+        return outputs(result, self.odometry_frame, left.frame)
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew, so nothing before it can be compared with."""
+        self._tracker = self._calibration = self._restored = None
+
+    def snapshot(self) -> Mapping[str, Any]:
+        state = self._restored if self._tracker is None else self._tracker.snapshot()
+        return {} if state is None else _to_plain(state) | {"frames": dict(self._frames)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Taken up with the first pair, which brings the calibration."""
+        self._restored = _from_plain(state) if state else None
+        self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        """Returns the number of frames of each status."""
+        return dict(self._frames)
+
+    def _tracking(self, left_info: CameraInfo, right_info: CameraInfo) -> StereoOdometry:
+        """The tracker, made once for each calibration."""
+        given = (left_info, right_info)
+        if self._tracker is None or self._calibration != given:
+            config = StereoOdometryConfig(
+                corners=self.corners, min_inliers=self.min_inliers, window=self.window, patience_s=self.patience
+            )
+            self._tracker, self._calibration = StereoOdometry(rig_of(left_info, right_info), config), given
+            if self._restored is not None:
+                self._tracker.restore(self._restored)
+                self._restored = None
+        return self._tracker
+
+
+def rig_of(left: CameraInfo, right: CameraInfo) -> StereoRig:
+    """Returns the rig that two calibrations describe. Raises ValueError where they are no rectified pair."""
+    if right.P is None or right.P[0, 3] >= 0:
+        raise ValueError("right_info.P must be given, with P[0, 3] = -fx * baseline below 0")
+    K = left.K if left.P is None else left.P[:, :3]
+    if not np.allclose(K, right.P[:, :3], rtol=1e-3):
+        raise ValueError("left_info and right_info must describe a rectified pair: one K for both")
+    start = 0.0 if left.P is None else float(left.P[0, 3])
+    return StereoRig(np.array(K, np.float64), (start - float(right.P[0, 3])) / float(K[0, 0]))
+
+
+def _to_plain(state: StereoState) -> dict[str, Any]:
+    return {
+        "motion": None if state.motion is None else _fields_of(state.motion),
+        "covariance": state.covariance,
+        "left": state.left,
+        "watch": [_fields_of(watch) for watch in state.watch],
+        "poses": state.poses,
+        "points": state.points,
+        "pixels": state.pixels,
+        "seen": _fields_of(state.seen),
+        "offset": state.offset,
+    }
+
+
+def _from_plain(values: Mapping[str, Any]) -> StereoState:
+    motion = values["motion"]
+    first, second = (Watch(**watch) for watch in values["watch"])
+    return StereoState(
+        motion=None if motion is None else Motion(**motion),
+        covariance=values["covariance"],
+        left=values["left"],
+        watch=(first, second),
+        poses=values["poses"],
+        points=values["points"],
+        pixels=values["pixels"],
+        seen=Sightings(**values["seen"]),
+        offset=float(values["offset"]),
+    )
+
+
+def _fields_of(value: Motion | Watch | Sightings) -> dict[str, Any]:
+    return {field.name: getattr(value, field.name) for field in fields(value)}

@@ -1,0 +1,44 @@
+"""What every visual odometry says of a frame: a pose, how far it can be trusted, and what it rests on."""
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
+from operators.geometry.se3 import Matrix
+
+
+class Status(StrEnum):
+    """What a frame's pose rests on."""
+
+    TRACKING = "tracking"  # measurements of this frame
+    RELOCALISED = "relocalised"  # the same, in a map found again after a loss
+    PREDICTED = "predicted"  # the motion so far, helped by whatever direction is still measured
+    LOST = "lost"  # nothing for longer than the patience, or a new map whose place in the old one is unknown
+
+
+MEASURED = (Status.TRACKING, Status.RELOCALISED)
+
+
+@dataclass(frozen=True, eq=False)
+class TrackResult:
+    """The pose of one frame."""
+
+    stamp: int
+    T_world_camera: Matrix  # (4, 4): the camera's optical frame in that of the first frame
+    covariance: Matrix  # (6, 6) of x in T_world_camera exp(x), x = (metres, radians); grows with drift
+    velocity: NDArray[np.float64]  # (6,) m/s and rad/s in the camera's axes
+    status: Status
+    reason: str  # one line: what was measured, or why nothing was
+    inliers: int  # feature tracks that agree with the pose
+    depth_inliers: float  # share of compared depth points that agree with it
+    keyframe: bool  # whether this frame became a keyframe
+
+
+def moved_covariance(covariance: Matrix, T_world_a: Matrix, T_world_b: Matrix) -> Matrix:
+    """Carries a pose error (6, 6) of a, right perturbation, along rigidly to b."""
+    A = se3.adjoint(invert(T_world_b) @ T_world_a)
+    return A @ covariance @ A.T

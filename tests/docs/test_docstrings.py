@@ -1,0 +1,35 @@
+"""Docstrings of what others may use begin with a verb or their subject, not with a question word."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+OPENS_WITH_A_QUESTION = re.compile(r"(What|How|Where|Which|Whether)\b")
+
+
+def public_docstrings(path: Path) -> Iterator[tuple[int, str]]:
+    """Yields line and first line of the docstrings of a module and of what it has that is public."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Module):
+            line, name = 1, ""
+        elif isinstance(node, ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            line, name = node.lineno, node.name
+        else:
+            continue
+        docstring = ast.get_docstring(node)
+        if docstring and not (name.startswith("_") and not name.startswith("__")):
+            yield line, docstring.splitlines()[0]
+
+
+def test_no_public_docstring_opens_with_a_question_word(repository: Path) -> None:
+    found = [
+        f"{path.relative_to(repository)}:{line}: {first}"
+        for package in ("dataflow", "operators", "tools")
+        for path in sorted((repository / package).rglob("*.py"))
+        for line, first in public_docstrings(path)
+        if OPENS_WITH_A_QUESTION.match(first)
+    ]
+    assert not found, "\n".join(found)

@@ -1,0 +1,89 @@
+"""An inbox gives what its threads put there and what its rings bring, and wakes who waits for either."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from dataflow.process.inbox import Inbox
+from dataflow.transport import Incoming, Outgoing, PoolReader, make_board, make_ring
+
+LONG = 60.0
+"""Seconds that a test would take if nobody woke the one who waits."""
+
+
+class Wired:
+    """An inbox with one link to it."""
+
+    def __init__(self) -> None:
+        self.ring, self.board = make_ring(4096), make_board()
+        self.wake, self.back = (os.eventfd(0, os.EFD_NONBLOCK) for _ in range(2))
+        incoming = Incoming(self.ring, self.back, self.board, ["a", "b"], PoolReader())
+        self.inbox = Inbox(self.wake, [incoming])
+        self.producer = Outgoing(self.ring, self.wake, self.board, None)
+
+    def send(self, content: bytes, channel: int = 0) -> None:
+        self.producer.send(channel, [content], len(content))
+
+    def close(self) -> None:
+        for descriptor in (self.ring, self.board, self.wake, self.back):
+            os.close(descriptor)
+
+
+@pytest.fixture
+def wired() -> Iterator[Wired]:
+    made = Wired()
+    yield made
+    made.close()
+
+
+def test_what_rings_bring_and_threads_put_comes_in_order(wired: Wired) -> None:
+    wired.inbox.put(("control", "go", {}))
+    wired.send(b"1")
+    wired.send(b"2", channel=1)
+    assert not wired.inbox.empty()
+    wired.inbox.put(("control", "stop", {}))
+    found = [wired.inbox.get_nowait() for _ in range(4)]
+    assert found == [("control", "go", {}), ("envelope", "a", b"1"), ("envelope", "b", b"2"), ("control", "stop", {})]
+    assert wired.inbox.empty()
+    with pytest.raises(queue.Empty):
+        wired.inbox.get_nowait()
+
+
+def test_an_empty_inbox_is_waited_for_no_longer_than_asked(wired: Wired) -> None:
+    with pytest.raises(queue.Empty):
+        wired.inbox.get(timeout=0.001)
+    with pytest.raises(queue.Empty):
+        wired.inbox.get_until(deadline=0.0)
+
+
+@pytest.mark.parametrize("through", ["ring", "thread"])
+def test_who_waits_is_woken_by_what_arrives(wired: Wired, through: str) -> None:
+    act = (lambda: wired.send(b"x")) if through == "ring" else (lambda: wired.inbox.put(("control", "go", {})))
+    timer = threading.Timer(0.02, act)
+    timer.start()
+    assert wired.inbox.get(timeout=LONG)[0] in ("envelope", "control")
+    timer.join()
+
+
+def test_who_waits_is_woken_when_a_ring_that_was_full_has_room(wired: Wired) -> None:
+    sender = Inbox(wired.back)
+    while not wired.producer.waiting:
+        wired.send(bytes(900))
+    timer = threading.Timer(0.02, lambda: wired.inbox.get_nowait())
+    timer.start()
+    with pytest.raises(queue.Empty):
+        sender.get(timeout=LONG)
+    timer.join()
+    assert wired.producer.flush()
+
+
+def test_what_has_arrived_is_counted(wired: Wired) -> None:
+    wired.send(b"four")
+    wired.send(b"two")
+    assert wired.inbox.empty() is False
+    assert wired.inbox.counters() == {"received_messages": 2, "received_bytes": 7, "unresolved": 0}

@@ -1,0 +1,100 @@
+"""What an outlet sends to other processes, and when: nothing before its consumers listen, static messages again."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from dataflow.messages import FeatureVector
+from dataflow.process.outlet import Outlet
+from dataflow.sync import Entry
+from dataflow.transport import Fanout, Incoming, Kind, Outgoing, PoolReader, decode, make_board, make_ring
+
+INFO, FAST = "test/left/constant", "test/left/fast"
+
+
+def entry(stream: str, stamp: int, seq: int, incarnation: int = 0) -> Entry:
+    message = FeatureVector(stamp=stamp, vectors=np.zeros((1, 1), np.float32), model="test")
+    return Entry(stamp, message, seq, incarnation)
+
+
+class Linked:
+    """An outlet with one consumer in another process."""
+
+    def __init__(self, most: tuple[int, int] | None = None) -> None:
+        self.descriptors = make_ring(4096), os.eventfd(0, os.EFD_NONBLOCK), make_board()
+        link = Outgoing(*self.descriptors, most)
+        self.outlet = Outlet(
+            None,  # type: ignore[arg-type]
+            lambda stream: (),
+            fanout=Fanout([([INFO, FAST], link)]),
+            namespace="test",
+            static=frozenset([INFO]),
+            live=False,
+            box=None,
+            firings=False,
+            incarnations={},
+        )
+        self.start()
+
+    def start(self) -> None:
+        """The consumer, or what takes its place, begins to listen."""
+        self.consumer = Incoming(*self.descriptors, [INFO, FAST], PoolReader())
+
+    def taken(self) -> list[tuple[str, str, int]]:
+        found = []
+        for _ in range(10_000):
+            self.outlet.push()
+            arrived = [(key, decode(payload)) for key, payload in self.consumer.take()]
+            found += [(key.rpartition("/")[2], e.kind.name, e.seq) for key, e in arrived if e.kind is not Kind.PROBE]
+            if not arrived:
+                return found
+        raise AssertionError("it does not come to an end")
+
+
+@pytest.fixture
+def linked() -> Iterator[Linked]:
+    made = Linked()
+    yield made
+    for descriptor in made.descriptors:
+        os.close(descriptor)
+
+
+def test_nothing_is_sent_before_it_is_released_and_then_all_of_it_once(linked: Linked) -> None:
+    linked.outlet.message(INFO, entry(INFO, 0, 0))
+    linked.outlet.message(FAST, entry(FAST, 10, 0))
+    assert linked.taken() == []
+    linked.outlet.release()
+    assert linked.taken() == [("constant", "MESSAGE", 0), ("fast", "MESSAGE", 0)]
+    assert linked.outlet.sent == 2
+
+
+def test_who_was_started_again_is_sent_the_static_messages_again_and_they_count_as_sent(linked: Linked) -> None:
+    linked.outlet.release()
+    linked.outlet.message(INFO, entry(INFO, 0, 0))
+    linked.outlet.end(INFO, None, "over")
+    linked.outlet.message(FAST, entry(FAST, 10, 0))
+    first = linked.taken()
+    linked.outlet.consumer_gone(0)
+    linked.outlet.message(FAST, entry(FAST, 20, 1))  # for nobody
+    linked.start()
+    assert linked.taken() == [("constant", "MESSAGE", 0), ("constant", "END", 1)]
+    linked.outlet.message(FAST, entry(FAST, 30, 2))
+    assert linked.taken() == [("fast", "MESSAGE", 2)]
+    assert linked.outlet.sent == len(first) + 1 + 3
+
+
+def test_the_end_of_a_stream_reaches_a_consumer_that_missed_messages() -> None:
+    """With the frontier before it, by which the consumer believes it."""
+    linked = Linked(most=(3, 1 << 20))
+    linked.outlet.release()
+    for seq in range(200):
+        linked.outlet.message(FAST, entry(FAST, seq + 1, seq))
+    linked.outlet.end(FAST, 200, "over")
+    found = linked.taken()
+    assert found[-2:] == [("fast", "FRONTIER", 200), ("fast", "END", 200)]
+    assert linked.outlet.counters()["unsent"] == 200 + 2 - len(found)
+    assert linked.outlet.counters()["unsent"] > 0

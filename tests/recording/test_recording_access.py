@@ -1,0 +1,116 @@
+"""Random access to one stream gives what reading it whole gives."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from example_messages import example
+from mcap.writer import Writer
+
+from dataflow.messages import CameraInfo, Imu, Message, Odometry
+from dataflow.messages.base import is_built_in, message_types
+from dataflow.recording import Recording, RecordingError, RecordingWriter, access
+
+
+def imu(stamp: int, **fields: object) -> Imu:
+    return Imu(stamp=stamp, frame="imu", angular_velocity=[stamp, 0, 0], linear_acceleration=[0, 0, 9.81], **fields)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Recording:
+    path = tmp_path / "made.mcap"
+    with RecordingWriter(path, metadata={}, namespace="r") as writer:
+        writer.add_stream("r/imu", Imu)
+        writer.add_stream("r/odometry", Odometry)
+        writer.add_stream("r/info", CameraInfo, static=True)
+        writer.write("r/info", CameraInfo(stamp=0, frame="c", width=4, height=3, K=np.eye(3)), seq=0)
+        for i in range(5):
+            writer.write("r/imu", imu(100 + 10 * i, temperature=20.0 if i % 2 else None), seq=i)
+            pose = {"position": [i, 0, 0], "orientation": [0, 0, 0, 1], "linear": [i, 0, 0] if i else None}
+            writer.write("r/odometry", Odometry(stamp=101 + i, frame="odom", child_frame="base", **pose), seq=i)
+        writer.write("r/imu", imu(50), seq=0, incarnation=1)  # the clock has jumped back
+    return Recording(path)
+
+
+@pytest.mark.parametrize("stream", ["r/imu", "r/odometry", "r/info"])
+def test_messages_by_place_are_those_of_reading_in_order(recording: Recording, stream: str) -> None:
+    index, whole = recording.index(stream), list(recording.messages([stream]))
+
+    assert [index.read(i) for i in range(len(index))] == whole
+    assert index.stamps.tolist() == [item.stamp for item in whole]
+
+
+def test_an_interval_is_cut_as_in_reading(recording: Recording) -> None:
+    index = recording.index("r/imu", 110, 130)
+
+    assert index.stamps.tolist() == [110, 120, 130]
+    assert index.read(-1).stamp == 130
+
+
+@pytest.mark.parametrize("stream", ["r/imu", "r/odometry", "r/info"])
+def test_columns_are_the_fields_of_the_messages(recording: Recording, stream: str) -> None:
+    index = recording.index(stream)
+    messages = [index.read(place).message for place in range(len(index))]
+    names = [field.name for field in type(messages[0]).FIELDS]
+    found = index.columns(np.arange(len(index)), names)
+
+    for name in names:
+        for value, message in zip(found[name], messages, strict=True):
+            np.testing.assert_array_equal(value, getattr(message, name))
+
+
+@pytest.mark.parametrize("cls", [c for c in message_types().values() if is_built_in(c)], ids=lambda c: c.SCHEMA)
+def test_columns_of_any_type_are_exact(cls: type[Message], tmp_path: Path) -> None:
+    """Also where fields hold what plain JSON cannot: NaN with a payload, -0.0, large integers, empty sets."""
+    messages = [example(cls, seed).replace(stamp=seed + 1) for seed in (0, 1, 2, 3, 0, 4)]
+    messages = [message.replace(stamp=stamp) for stamp, message in enumerate(messages, 1)]
+    with RecordingWriter(tmp_path / "any.mcap", metadata={}) as writer:
+        writer.add_stream("any", cls)
+        for seq, message in enumerate(messages):
+            writer.write("any", message, seq=seq)
+    with Recording(tmp_path / "any.mcap") as recording:
+        columns = recording.index("any").columns(np.arange(6), [field.name for field in cls.FIELDS])
+
+    rebuilt = [{name: values[i] for name, values in columns.items()} for i in range(6)]
+    assert [cls(stamp=m.stamp, **fields) for m, fields in zip(messages, rebuilt, strict=True)] == messages
+
+
+def test_columns_of_many_messages_are_joined_from_batches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(access, "BATCH", 3)
+    with RecordingWriter(tmp_path / "many.mcap", metadata={}) as writer:
+        writer.add_stream("imu", Imu)
+        for i in range(8):
+            writer.write("imu", imu(i + 1, temperature=1.5 if i == 7 else None), seq=i)
+    with Recording(tmp_path / "many.mcap") as recording:
+        found = recording.index("imu").columns(np.arange(8), ["angular_velocity", "temperature"])
+
+    assert np.asarray(found["angular_velocity"])[:, 0].tolist() == [1, 2, 3, 4, 5, 6, 7, 8]
+    assert found["temperature"] == [None] * 7 + [1.5]
+
+
+@pytest.mark.parametrize("damage", [b'{"value":[1],"unit":""}', b'{"value":', b"[1]", b'{"_exact":3}'])
+def test_a_message_that_does_not_decode_is_named(tmp_path: Path, damage: bytes) -> None:
+    path = tmp_path / "damaged.mcap"
+    with path.open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        metadata = {"kind": "stream", "message_type": "Number", "static": "false", "incarnation": "0"}
+        schema = writer.register_schema("dataflow.Number", "jsonschema", b"{}")
+        channel = writer.register_channel("number", "json", schema, metadata)
+        for i, data in enumerate((b'{"value":1.0,"unit":""}', damage)):
+            writer.add_message(channel, log_time=i + 1, publish_time=i + 1, sequence=i, data=data)
+        writer.finish()
+
+    with Recording(path) as recording:
+        with pytest.raises(RecordingError, match="stream 'number', message 1 at 2") as one:
+            recording.index("number").read(1)
+        with pytest.raises(RecordingError) as many:
+            recording.index("number").columns(np.arange(2), ["value"])
+    assert str(many.value) == str(one.value)
+
+
+def test_unknown_streams_are_named(recording: Recording) -> None:
+    with pytest.raises(RecordingError, match="no stream 'r/gyro'"):
+        recording.index("r/gyro")

@@ -1,0 +1,214 @@
+"""The engine on a simulated machine: whole runs by seed, in one thread, and what must hold of each."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("greenlet", reason="simulated runs need the package greenlet (pip install -e '.[dev]')")
+
+from simulation import bindings
+from simulation.check import check
+from simulation.mutants import MUTANTS, Mutant
+from simulation.run import Happening, Machine, simulate
+from simulation.scenario import Scenario, scenario_of
+from simulation.shrink import shrink
+from simulation.world import Process, Violation, World
+
+from dataflow.supervision.plan import RunPlan
+
+PLAIN = Scenario(
+    seed=1,
+    graph="chain",
+    live=False,
+    count=6,
+    period=5_000_000,
+    work=0.0,
+    reading=0.0,
+    policy="",
+    placement="process_each",
+    window=256,
+    snapshots=False,
+    machine=Machine(1),
+)
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Path:
+    """A folder in memory, where there is one: simulated disks are as quick as that."""
+    shared = Path("/dev/shm") / f"simulation-{os.getpid()}"
+    if not shared.parent.is_dir():
+        return tmp_path
+    shared.mkdir(exist_ok=True)
+    return shared
+
+
+# The world
+
+
+def test_tasks_wait_on_simulated_time_and_are_woken() -> None:
+    world, seen = World(1), []
+    process = world.process("one")
+
+    def sleeper() -> None:
+        world.wait(3600.0)
+        seen.append(("slept", round(world.now)))
+        world.wake(other)
+
+    def waiter() -> None:
+        assert world.wait()
+        seen.append(("woken", round(world.now)))
+
+    world.start("sleeper", process, sleeper)
+    other = world.start("waiter", process, waiter)
+    world.run(lambda: len(seen) == 2, 4000.0)
+
+    assert seen == [("slept", 3600), ("woken", 3600)]
+
+
+def test_a_killed_process_does_nothing_more_and_a_frozen_one_goes_on_where_it_was() -> None:
+    world = World(1)
+    seen: Counter[str] = Counter()
+
+    def counting(process: Process) -> None:
+        while True:
+            world.wait(1.0)
+            seen[process.label] += 1
+
+    one, two = world.process("one"), world.process("two")
+    for process in (one, two):
+        world.start("main", process, lambda process=process: counting(process))
+    world.at(5.5, lambda: world.kill(one))
+    world.at(5.5, lambda: world.freeze(two))
+    world.at(8.0, lambda: world.thaw(two))
+    world.run(lambda: world.now > 12.0, 20.0)
+
+    assert seen["one"] == 5
+    assert 8 <= seen["two"] <= 10
+
+
+def test_who_spins_is_named() -> None:
+    world = World(1, preempt=0.0)
+
+    def spin() -> None:
+        while True:
+            world.clock()
+
+    world.start("main", world.process("one"), spin)
+    with pytest.raises(Violation, match="one: its task 'main' spins"):
+        world.run(lambda: False, 1000.0)
+
+
+def test_nothing_reads_the_clock_past_the_simulation() -> None:
+    """The engine reads time through the name `time` of each module: a function bound there would be the real one."""
+    names = {module for module, _ in bindings.clocks()}
+    assert {"dataflow.process.operator_process", "dataflow.supervision.supervisor", "dataflow.firing.live"} <= names
+    real = {time.monotonic, time.time, time.sleep, time.monotonic_ns, time.perf_counter}
+    for module in names:
+        bound = [name for name, thing in vars(sys.modules[module]).items() if callable(thing) and thing in real]
+        assert not bound, f"{module} binds {bound}"
+
+
+# Runs
+
+
+def test_a_seed_gives_one_course(memory: Path) -> None:
+    scenario = scenario_of(3)
+    courses = []
+    for _ in range(2):
+        path = memory / "once.mcap"
+        plan = RunPlan(scenario.load(), placement="process_each", record=path, overwrite=True)
+        outcome = simulate(plan, scenario.machine)
+        assert outcome.report is not None
+        courses.append((outcome.seconds, outcome.turns, outcome.calls, dict(outcome.report.streams)))
+
+    assert courses[0] == courses[1]
+
+
+def test_a_killed_process_of_a_live_run_comes_back_and_the_recording_is_whole(memory: Path) -> None:
+    policy = "restart: {max: 5, backoff: 10ms}"
+    kills = (Happening(0.03, "kill", "relay"), Happening(0.06, "kill", "left"))
+    scenario = replace(PLAIN, live=True, policy=policy, count=12, period=20_000_000, happenings=kills)
+
+    result = check(scenario, memory)
+
+    assert result.verdict == "identical"
+    assert result.outcome.report is not None
+    assert result.outcome.report.restarts == {"relay": 1, "left": 1}
+
+
+def test_a_full_disk_ends_the_run_and_leaves_a_readable_recording(memory: Path) -> None:
+    scenario = replace(PLAIN, machine=Machine(1, room=12_000))
+
+    result = check(scenario, memory)
+
+    assert result.outcome.disk_full
+    assert "No space left on device" in str(result.outcome.failure)
+
+
+def test_a_frozen_process_is_not_waited_for_without_end(memory: Path) -> None:
+    frozen = (Happening(0.001, "freeze", "relay", {"span": 1e6}),)
+
+    result = check(replace(PLAIN, happenings=frozen, window=2), memory)
+
+    assert "no progress for 20 s" in str(result.outcome.failure)
+    assert result.outcome.seconds < 60.0
+
+
+@pytest.mark.parametrize("first", range(0, 200, 25))
+def test_seeds(first: int, memory: Path) -> None:
+    """No hang, no loss without a count, recordings that verify, replays that are equal."""
+    for seed in range(first, first + 25):
+        scenario = scenario_of(seed)
+        try:
+            check(scenario, memory, replay=seed % 4 == 0)
+        except Violation as violation:
+            pytest.fail(f"{scenario.describe()}\n{violation}")
+
+
+# Planted faults
+
+FOUND_BY = {
+    "frontier": replace(PLAIN, graph="diamond", happenings=(Happening(0.01, "freeze", "two", {"span": 0.2}),)),
+    "C8": replace(
+        PLAIN,
+        graph="join",
+        live=True,
+        count=12,
+        machine=Machine(1, socket_room=4),
+        happenings=(
+            Happening(0.01, "freeze", "right", {"span": 1e6}),
+            Happening(0.1, "freeze", "smooth", {"span": 0.05}),
+        ),
+    ),
+}
+"""Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""
+
+
+@pytest.mark.parametrize("name", sorted(FOUND_BY))
+def test_a_planted_fault_is_found_and_its_plan_shrunk(name: str, memory: Path) -> None:
+    scenario = FOUND_BY[name]
+    check(scenario, memory, replay=False)
+
+    with MUTANTS[name].planted():
+        with pytest.raises(Violation) as broken:
+            check(scenario, memory, replay=False)
+        small, said = shrink(scenario, memory, broken.value, most=6)
+
+    assert said
+    assert len(small.happenings) < len(scenario.happenings)
+
+
+def test_planting_a_fault_leaves_nothing_behind() -> None:
+    places = {place: place[0].__dict__[place[1]] for mutant in MUTANTS.values() for place in mutant.replaced()}
+    for mutant in MUTANTS.values():
+        assert isinstance(mutant, Mutant)
+        with mutant.planted():
+            pass
+    assert all(cls.__dict__[name] is function for (cls, name), function in places.items())

@@ -1,0 +1,55 @@
+"""What names of the engine stand for while a run is simulated."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import pkgutil
+import sys
+import time
+from collections.abc import Iterator
+from typing import Any
+
+import dataflow
+
+ENGINE = ("chaos", "feeds", "firing", "process", "records", "recording", "reexecution", "supervision", "transport")
+
+Bindings = dict[tuple[str, str], Any]
+"""(module, name) → what it stands for."""
+
+
+def _load() -> None:
+    for name in ENGINE:
+        package = importlib.import_module(f"dataflow.{name}")
+        for module in pkgutil.iter_modules(package.__path__):
+            if module.name != "nursery_process":
+                importlib.import_module(f"{package.__name__}.{module.name}")
+
+
+def clocks() -> list[tuple[str, str]]:
+    """Every module of the engine that reads the clock, with the name under which it does."""
+    if not _LOADED:
+        _load()
+        _LOADED.append(dataflow)
+    prefixes = tuple(f"dataflow.{name}." for name in ENGINE)
+    return [
+        (name, "time")
+        for name, module in sorted(sys.modules.items())
+        if name.startswith(prefixes) and getattr(module, "time", None) is time
+    ]
+
+
+_LOADED: list[Any] = []
+
+
+@contextlib.contextmanager
+def bound(bindings: Bindings) -> Iterator[None]:
+    """Lets names of modules stand for something else."""
+    before = {place: getattr(sys.modules[place[0]], place[1]) for place in bindings}
+    try:
+        for (module, name), thing in bindings.items():
+            setattr(sys.modules[module], name, thing)
+        yield
+    finally:
+        for (module, name), thing in before.items():
+            setattr(sys.modules[module], name, thing)

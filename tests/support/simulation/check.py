@@ -1,0 +1,281 @@
+"""What must hold after every scenario, however it went.
+
+No hang: it is over in bounded simulated time. No loss without a count: what was made was taken, or dropped with a
+reason, or is counted as missed. The recording verifies as identical, or, where the run was cut short, as far as it
+goes. A replay, placed otherwise and on another machine, has the same digests.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import importlib
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from dataflow.graph import Graph
+from dataflow.graph.load import load_bundle
+from dataflow.recording import Recording, RecordingError
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.replay import plan_replay
+from dataflow.supervision.report import RunReport
+from dataflow.sync import messages_of
+from dataflow.verification.board import Board
+from dataflow.verification.processes import Call
+from dataflow.verification.report import VerifyReport
+from dataflow.verification.verify import verify
+from simulation.bindings import bound
+from simulation.run import Machine, Outcome, simulate
+from simulation.scenario import TIMEOUT, Scenario
+from simulation.world import Violation
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """What a scenario came to."""
+
+    outcome: Outcome
+    verdict: str
+    replayed: bool = False
+    drops: int = 0
+
+
+def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
+    """Runs a scenario and everything that must hold of it. Raises `Violation`."""
+    path = folder / "run.mcap"
+    path.unlink(missing_ok=True)
+    graph = scenario.load()
+    outcome = simulate(_plan(scenario, graph, path), scenario.machine, scenario.happenings)
+    if outcome.failure is not None and not scenario.may_fail:
+        raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
+    try:
+        verdict = _verify(path, outcome, scenario)
+        report = outcome.report
+        drops = 0
+        if report is not None:
+            drops = _check_losses(path, graph, report)
+            if not scenario.live:
+                _check_window(path, graph, scenario, report)
+        replayed = replay and report is not None and verdict == "identical" and _may_replay(scenario, report)
+        if replayed:
+            assert report is not None
+            _check_replay(scenario, path, report)
+    finally:
+        path.unlink(missing_ok=True)
+    return Result(outcome, verdict, replayed, drops)
+
+
+def _plan(scenario: Scenario, graph: Graph, path: Path) -> RunPlan:
+    return RunPlan(
+        graph,
+        placement=scenario.placement,  # type: ignore[arg-type]
+        record=path,
+        live=scenario.live,
+        faults=iter(scenario.faults) if scenario.faults and scenario.live else None,
+        window=(scenario.window, 1 << 20),
+        start_timeout=TIMEOUT,
+        stall_timeout=TIMEOUT,
+    )
+
+
+# Verification
+
+
+def _verify(path: Path, outcome: Outcome, scenario: Scenario) -> str:
+    """Verifies what was recorded. A run that failed may be cut, but what is there must be as it was."""
+    if not path.exists():
+        if outcome.failure is None:
+            raise Violation("there is no recording")
+        return "no recording"
+    try:
+        report = verified(path)
+    except (ReplayError, RecordingError) as error:
+        if outcome.failure is None:
+            raise Violation(f"the recording cannot be verified: {error}") from error
+        return "nothing to verify"
+    if outcome.failure is None:
+        if report.identical:
+            return "identical"
+        unchanged = all(report.verdict(v) in ("identical", "unverifiable") for v in report.operators)
+        if unchanged and not report.changed and _missed_by_recorder(outcome.report):
+            return "unverifiable"
+        raise Violation(f"verified as different:\n{_explained(report)}")
+    if any(v.first is not None for v in report.operators) or report.changed:
+        raise Violation(f"of a failed run, verified as different:\n{_explained(report)}")
+    if scenario.live and "@recorder" not in outcome.killed:
+        lost = [v for v in report.operators if v.lost_records or v.after_cut]
+        if lost:
+            raise Violation(f"records of a live run are lost:\n{_explained(report)}")
+    return "cut" if report.cut else "identical" if report.identical else "unverifiable"
+
+
+def _missed_by_recorder(report: RunReport | None) -> int:
+    """How many messages a link to the recorder has lost, as the run's report tells."""
+    assert report is not None
+    return sum(n for _, why, n in report.drops.get("@recorder", ()) if why == "missed")
+
+
+def _explained(report: VerifyReport) -> str:
+    lines = [f"  {report.verdict(v)}: {v.to_wire()}" for v in report.operators if report.verdict(v) != "identical"]
+    lines += [f"  changed: {stream.to_wire()}" for stream in report.changed]
+    lines += [f"  source: {each}" for each in report.stand_ins if not each.whole]
+    return "\n".join(lines)
+
+
+def verified(path: Path) -> VerifyReport:
+    """Verifies in this process: the workers' functions are called, one after the other."""
+    bindings = {
+        ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
+        ("dataflow.reexecution.recorded_run", "load_bundle"): _load_bundle,
+    }
+    importlib.import_module("dataflow.verification.verify")
+    with bound(bindings):
+        return verify(path, jobs=1, workers=_call_here)
+
+
+_load_bundle = functools.lru_cache(maxsize=1024)(load_bundle)
+"""The graph in a recording; the same ones come again and again."""
+
+
+def _call_here(calls: Sequence[Call], **options: Any) -> list[Any]:
+    answers = []
+    for call in calls:
+        module, _, name = call.function.partition(":")
+        function = getattr(importlib.import_module(module), name)
+        with _board(call) as board:
+            answers.append(function(call.request, board))
+    return answers
+
+
+@contextlib.contextmanager
+def _board(call: Call) -> Iterator[Board]:
+    descriptor = os.memfd_create("board")
+    try:
+        yield Board(descriptor, call.operators)
+    finally:
+        os.close(descriptor)
+
+
+# Losses
+
+Place = tuple[str, int, int]
+"""Stream, incarnation and number of a message."""
+
+
+def _check_losses(path: Path, graph: Graph, report: RunReport) -> int:
+    """Every message that was made is taken by each trigger it reaches, or dropped or missed and counted."""
+    counted = 0
+    with Recording(path) as recording:
+        log = FiringLog.read(recording)
+    for name, node in graph.nodes.items():
+        if node.source or report.restarts.get(name):
+            continue
+        triggers = {port.name for port in node.spec.inputs.values() if port.kind != "sampled"}
+        taken: set[Place] = set()
+        drops: Counter[str] = Counter()
+        unlisted = 0
+        for record in log.of(name):
+            for value in record.inputs.values():
+                taken |= {(m.stream, m.incarnation, m.seq) for m in messages_of(value)}
+            for drop in record.drops:
+                taken.add((drop.stream, drop.incarnation, drop.seq))
+                drops[drop.reason] += 1
+            unlisted += sum(number for _, _, number in record.detail.get("unlisted_drops", ()))
+        counted += drops.total() + unlisted
+        missed = sum(n for _, why, n in report.drops.get(name, ()) if why in ("missed", "reset"))
+        for input_name in triggers:
+            for stream in node.inputs.get(input_name, ()):
+                lost = _made(graph, log, stream, report) - taken
+                if len(lost) > missed + unlisted:
+                    raise Violation(
+                        f"{name}.{input_name} lost {len(lost)} messages of {stream}, and {missed} are counted: "
+                        f"{sorted(lost)[:5]}"
+                    )
+    return counted
+
+
+def _made(graph: Graph, log: FiringLog, stream: str, report: RunReport) -> set[Place]:
+    """The messages of a stream, by its maker's records; none of a static stream, or of a maker that was restarted."""
+    made = graph.streams[stream]
+    if made.static or report.restarts.get(made.node):
+        return set()
+    port = list(graph.nodes[made.node].outputs.values()).index(stream)
+    return {
+        (stream, record.incarnation, record.outputs[port].seq)  # type: ignore[union-attr]
+        for record in log.of(made.node)
+        if port < len(record.outputs) and record.outputs[port] is not None and record.outputs[port].seq >= 0  # type: ignore[union-attr]
+    }
+
+
+# Flow control
+
+
+def _check_window(path: Path, graph: Graph, scenario: Scenario, report: RunReport) -> None:
+    """Sources were never further ahead of the operators than their window; it grew only where the graph needs it."""
+    grown = any("further ahead than the window" in note for note in report.notes)
+    if grown:
+        if graph.name in NO_LOOK_AHEAD:
+            raise Violation(f"the window of graph {graph.name!r} had to grow, which looks no stamp ahead")
+        return
+    with Recording(path) as recording:
+        log = FiringLog.read(recording)
+    worked = [
+        (record.stamp, record.wall_start + record.duration)
+        for name, node in graph.nodes.items()
+        for record in log.of(name)
+        if not node.source and record.kind in ("fire", "tick")
+    ]
+    for label, nodes in graph.processes(scenario.placement).items():
+        given = sorted(
+            (record.wall_start, record.stamp, sum(1 for made in record.outputs if made is not None))
+            for name in nodes
+            for record in log.of(name)
+            if graph.nodes[name].source and record.kind == "fire"
+        )
+        for now, stamp, _ in given:
+            undone = min((s for s, when in worked if when > now and s < stamp), default=stamp)
+            ahead = sum(messages for when, s, messages in given if when < now and undone <= s < stamp)
+            if ahead >= scenario.window + MOST_OF_A_STEP:
+                raise Violation(f"{label}: {ahead} messages ahead of {undone}, with a window of {scenario.window}")
+
+
+NO_LOOK_AHEAD = ("chain", "diamond")
+"""Graphs whose operators can fire at each stamp as soon as it has come."""
+MOST_OF_A_STEP = 2
+"""Messages of one step, which is admitted whole."""
+
+
+# Replays
+
+
+def _may_replay(scenario: Scenario, report: RunReport) -> bool:
+    """Whether a replay is to give the same: not of a run that was stopped, nor of one whose clock went back."""
+    return not report.interrupted and all(fault.kind != "jump" for fault in scenario.faults)
+
+
+def _check_replay(scenario: Scenario, path: Path, report: RunReport) -> None:
+    """A replay has the digests of the run; of a live run, those of another replay."""
+    first = _replay(scenario, path, 1)
+    expected = _replay(scenario, path, 2).streams if scenario.live else report.streams
+    differing = [s for s, found in first.streams.items() if s in expected and expected[s] != found]
+    if differing or not first.streams.keys() <= expected.keys():
+        raise Violation(f"a replay differs in {', '.join(differing) or 'its streams'}")
+
+
+def _replay(scenario: Scenario, path: Path, number: int) -> RunReport:
+    graph = scenario.load()
+    with Recording(path) as recording:
+        log = plan_replay(recording, graph)
+    placement: Any = "process_each" if (scenario.placement == "one_process") == (number == 1) else "one_process"
+    plan = RunPlan(graph, placement=placement, log=log, window=(scenario.window, 1 << 20), stall_timeout=TIMEOUT)
+    machine = replace(Machine(scenario.seed + 7919 * number), preempt=0.05)
+    outcome = simulate(plan, machine, mode="replay")
+    if outcome.report is None:
+        raise Violation(f"a replay failed: {outcome.failure}\n{outcome.failure and outcome.failure.details}")
+    return outcome.report

@@ -1,0 +1,63 @@
+"""The simulated disk: files in memory, with a size that may be used up and writes that may take their time.
+
+What a file holds is kept in a real one (on a file system in memory), so that the code that reads recordings reads it.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from simulation.world import World
+
+
+class Disk:
+    """The module `os` for who writes files. `room`: bytes until it is full; `slow`: seconds that a write may take."""
+
+    def __init__(self, world: World, *, room: int | None = None, slow: float = 0.0) -> None:
+        self._world, self._room, self._slow = world, room, slow
+        self._written = 0
+        self._opened: dict[int, Callable[[], None]] = {}
+        self.full = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(os, name)
+
+    def open(self, path: Path, flags: int, mode: int) -> int:
+        self._world.effect()
+        descriptor = os.open(path, flags, mode)
+        task = self._world.task
+        if task is not None:
+            self._opened[descriptor] = close = lambda: os.close(descriptor)
+            task.process.closers.append(close)
+        return descriptor
+
+    def write(self, descriptor: int, data: memoryview) -> int:
+        """May take only a part, may take long, and may find no room."""
+        world = self._world
+        world.effect()
+        if self._slow:
+            world.wait(world.random.random() * self._slow)
+        count = len(data)
+        if world.random.random() < 0.1:
+            count = world.random.randint(1, count)
+        if self._room is not None and self._written + count > self._room:
+            count = self._room - self._written
+            if count <= 0:
+                self.full = True
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._written += count
+        return os.write(descriptor, data[:count])
+
+    def ftruncate(self, descriptor: int, size: int) -> None:
+        self._written -= os.fstat(descriptor).st_size - size
+        os.ftruncate(descriptor, size)
+
+    def close(self, descriptor: int) -> None:
+        task = self._world.task
+        if task is not None:
+            task.process.closers.remove(self._opened.pop(descriptor))
+        os.close(descriptor)

@@ -1,0 +1,186 @@
+"""Faults planted in the engine, to see how many seeds the simulation needs to find each."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from dataflow.feeds.window import Window
+from dataflow.firing.admission import AdmissionQueue, Patience
+from dataflow.firing.live import LiveRunner
+from dataflow.firing.ports import OutputPorts
+from dataflow.firing.runner import OperatorRunner
+from dataflow.process.channel import ChannelClosed, QueuedChannel
+from dataflow.process.inlet import Inlet
+from dataflow.sync import FOREVER
+
+
+class Mutant:
+    """A fault: methods that take the place of others, by class and name."""
+
+    said = ""
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        raise NotImplementedError
+
+    @contextlib.contextmanager
+    def planted(self) -> Iterator[None]:
+        """The engine has this fault while the block runs."""
+        places = self.replaced()
+        before = {(cls, name): cls.__dict__[name] for cls, name in places}
+        try:
+            for (cls, name), function in places.items():
+                setattr(cls, name, function)
+            yield
+        finally:
+            for (cls, name), function in before.items():
+                setattr(cls, name, function)
+
+
+class CreditLost(Mutant):
+    """A source does not hear of every fifth step that is done."""
+
+    said = "a credit is lost"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        right = Window.cover
+
+        def cover(self: Window, frontier: int) -> None:
+            self.heard = getattr(self, "heard", 0) + 1  # type: ignore[attr-defined]
+            if self.heard % 5:
+                right(self, frontier)
+
+        return {(Window, "cover"): cover}
+
+
+class EarlyAcknowledgement(Mutant):
+    """A source takes a step for done as soon as the one before it is."""
+
+    said = "an acknowledgement comes too early"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        right = Window.cover
+
+        def cover(self: Window, frontier: int) -> None:
+            right(self, frontier)
+            if self._outstanding:
+                right(self, self._outstanding[0][0])
+
+        return {(Window, "cover"): cover}
+
+
+class LateRecord(Mutant):
+    """A firing is recorded after its messages are sent."""
+
+    said = "a record is written after its message"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        right = OperatorRunner._record
+        publish = OutputPorts.publish
+
+        def record(self: OperatorRunner, *args: Any, **fields: Any) -> None:
+            publish(self.ports)
+            right(self, *args, **fields)
+
+        return {(OperatorRunner, "_record"): record}
+
+
+class HighFrontier(Mutant):
+    """An operator promises one nanosecond too much while it waits: the stamp that it cannot decide yet."""
+
+    said = "a frontier is too high"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        right = OutputPorts.promise
+
+        def promise(self: OutputPorts, frontier: int) -> None:
+            right(self, frontier + 1 if frontier < FOREVER - 1 else frontier)
+
+        return {(OutputPorts, "promise"): promise}
+
+
+class SpinningWait(Mutant):
+    """A live operator gives up waiting for a static stream, which cannot be given up: it spins (C1)."""
+
+    said = "C1: an operator spins on a static input that has not come"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        def exhausted(self: Patience, stamp: int, needs: Mapping[str, int]) -> dict[str, int]:
+            if stamp != self._stamp:
+                self._stamp, self._since = stamp, self.clock()
+            return {
+                name: frontier
+                for name, frontier in needs.items()
+                if (budget := self.wait.get(name)) is not None and self._left(stamp, budget) <= 0
+            }
+
+        def give_up(self: LiveRunner) -> bool:
+            held = self.aligner.waiting()
+            if held is None or not held.needs:
+                return False
+            given_up = self.patience.exhausted(held.stamp, held.needs)
+            for name, frontier in given_up.items():
+                self.aligner.force(name, frontier)
+                self._timeouts[name] += 1
+            return bool(given_up)
+
+        return {(Patience, "exhausted"): exhausted, (LiveRunner, "_give_up"): give_up}
+
+
+class BlockingSupervisor(Mutant):
+    """The supervisor waits until a process has taken what is sent to it, each version of it (C8)."""
+
+    said = "C8: the supervisor waits for a process that is frozen"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        right = QueuedChannel.send
+
+        def send(self: QueuedChannel, kind: str, fields: dict[str, Any], *, replaces: bool = False) -> None:
+            right(self, kind, fields)
+            self._socket.setblocking(True)
+            with contextlib.suppress(ChannelClosed):
+                while self._queue:
+                    self.flush()
+            self._socket.setblocking(False)
+
+        return {(QueuedChannel, "send"): send}
+
+
+class SilentGap(Mutant):
+    """A gap in a stream is not told to the supervisor."""
+
+    said = "a gap is not counted"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        right = Inlet._lost
+
+        def lost(self: Inlet, stream: str, first: int, following: int) -> None:
+            if not self.live:
+                right(self, stream, first, following)
+
+        return {(Inlet, "_lost"): lost}
+
+
+class SilentDrop(Mutant):
+    """A queue that overflows drops without a word."""
+
+    said = "a drop is not recorded"
+
+    def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
+        def drop(self: AdmissionQueue, stream: str, arrival: Any, reason: str = "overflow") -> None:
+            return None
+
+        return {(AdmissionQueue, "_drop"): drop}
+
+
+MUTANTS: Mapping[str, Mutant] = {
+    "credit": CreditLost(),
+    "acknowledgement": EarlyAcknowledgement(),
+    "record": LateRecord(),
+    "frontier": HighFrontier(),
+    "C1": SpinningWait(),
+    "C8": BlockingSupervisor(),
+    "gap": SilentGap(),
+    "drop": SilentDrop(),
+}

@@ -1,0 +1,276 @@
+"""One run of the engine on a simulated machine: the supervisor, its processes and the recorder, as they ship."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
+from typing import Any
+
+from dataflow.supervision.nursery import Child
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.report import RunFailed, RunReport
+from dataflow.supervision.run import _metadata
+from dataflow.supervision.supervisor import Supervisor
+from dataflow.transport import make_ring
+from simulation import bindings, machine, memory, network, operators
+from simulation.disk import Disk
+from simulation.processes import SUPERVISOR, Nursery
+from simulation.world import Process, Violation, World
+
+LIMIT = 200.0
+"""Simulated seconds after which a run hangs: far above the sum of all timeouts."""
+MEGABYTES = 50_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Happening:
+    """What happens to a run from outside, `at` so many seconds after its sources were released.
+
+    `kill`, `freeze` (for `span` s) and `kill_before` (before the `effect`-th thing that it does and others can see, of
+    the `life`-th process with that label) happen to the process `target`; `stop` asks for an orderly end.
+    """
+
+    at: float
+    kind: str
+    target: str = ""
+    fields: dict[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        more = " ".join(f"{name}={value}" for name, value in self.fields.items())
+        return " ".join(part for part in (f"{self.at:.4f} s", self.kind, self.target, more) if part)
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """What kind of machine it is: how slow to notice anything, how often threads give way, and its disk."""
+
+    seed: int
+    pace: float = 1.0
+    preempt: float = 0.02
+    room: int | None = None
+    slow_disk: float = 0.0
+    socket_room: int = 278
+    """Messages that fit into a socket pair: 278 on a real machine, with Linux's defaults."""
+    ring_bytes: int = 1 << 20
+
+
+@dataclass(slots=True)
+class Outcome:
+    """What came of a run."""
+
+    report: RunReport | None = None
+    failure: RunFailed | None = None
+    seconds: float = 0.0
+    """Simulated seconds that it took."""
+    turns: int = 0
+    calls: int = 0
+    words: list[str] = field(default_factory=list)
+    killed: set[str] = field(default_factory=set)
+    """Processes that died before their time, whoever killed them."""
+    disk_full: bool = False
+
+
+def simulate(plan: RunPlan, machine_: Machine, happenings: Sequence[Happening] = (), *, mode: str = "run") -> Outcome:
+    """Runs a plan to its end. Raises `Violation` when it never comes to one."""
+    return Simulation(plan, machine_, happenings, mode).run()
+
+
+class Simulation:
+    """A world with one run in it."""
+
+    def __init__(self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str) -> None:
+        self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
+        self.system = machine.System(self.world, socket_room=machine_.socket_room)
+        self._ring_bytes = machine_.ring_bytes
+        self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
+        self.outcome = Outcome()
+        self._plan, self._happenings, self._mode = plan, happenings, mode
+        self._supervisor: Supervisor | None = None
+        self._lives: dict[str, int] = {}
+
+    def run(self) -> Outcome:
+        interval = sys.getswitchinterval()
+        with contextlib.ExitStack() as stack:
+            stack.callback(sys.setswitchinterval, interval)
+            stack.enter_context(bindings.bound(self._bindings()))
+            stack.enter_context(contextlib.redirect_stderr(_Words(self)))  # type: ignore[type-var]
+            time = machine.Time(self.world)
+            before = operators.Effort.sleep, operators.Effort.now
+            operators.Effort.sleep, operators.Effort.now = time.sleep, time.time
+            stack.callback(_restore_effort, *before)
+            stack.callback(self.world.close)
+            self._play()
+        world = self.world
+        self.outcome.seconds, self.outcome.turns, self.outcome.calls = world.now, world.turns, world.calls
+        self.outcome.disk_full = self.disk.full
+        return self.outcome
+
+    def _play(self) -> None:
+        plan = self._plan
+        if plan.record is not None:
+            plan = replace(plan, metadata=_metadata(plan, self._mode))
+        self._supervisor = Supervisor(plan, on_output=lambda label, line: self.outcome.words.append(f"{label}: {line}"))
+        process = self.world.process(SUPERVISOR)
+        process.on_line = lambda line: self.outcome.words.append(line)
+        ended: list[bool] = []
+        self.world.start("main", process, lambda: self._supervise(ended))
+        self.world.run(lambda: bool(ended), LIMIT)
+
+    def _released(self, *_: Any, **__: Any) -> Any:
+        """The graph is announced: its sources are released."""
+        for happening in self._happenings:
+            self.world.after(happening.at, functools.partial(self._happen, happening))
+        return contextlib.nullcontext()
+
+    def _supervise(self, ended: list[bool]) -> None:
+        assert self._supervisor is not None
+        try:
+            self.outcome.report = self._supervisor.run()
+        except RunFailed as failure:
+            self.outcome.failure = failure
+        except Exception as error:
+            self.world.violation = Violation(f"the supervisor failed: {type(error).__name__}: {error}")
+            self.world.violation.__cause__ = error
+        ended.append(True)
+
+    def _bindings(self) -> bindings.Bindings:
+        world, system = self.world, self.system
+        time, threads = machine.Time(world), machine.Threading(world)
+        process, supervision = "dataflow.process", "dataflow.supervision"
+        endpoints = SimpleNamespace(close=lambda: None)
+        facts = {"threads": {}}
+        return {
+            **dict.fromkeys(bindings.clocks(), time),
+            (f"{process}.main", "threading"): threads,
+            (f"{process}.main", "os"): system,
+            (f"{process}.channel", "socket"): machine.Sockets(system),
+            (f"{process}.channel", "threading"): threads,
+            (f"{process}.watchdog", "threading"): threads,
+            (f"{process}.watchdog", "psutil"): SimpleNamespace(Process=_Resident, Error=OSError),
+            (f"{process}.live_sources", "threading"): threads,
+            (f"{process}.inbox", "os"): system,
+            (f"{process}.inbox", "select"): machine.Select(system),
+            (f"{process}.operator_process", "Bus"): network.Bus,
+            (f"{process}.operator_process", "TapServer"): network.Nobody,
+            (f"{process}.operator_process", "OutsidePublisher"): network.Nobody,
+            (f"{process}.runners", "BlackBox"): memory.black_box(world),
+            ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
+            ("dataflow.transport.ring", "os"): system,
+            (f"{supervision}.rings", "os"): system,
+            (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
+            (f"{process}.operator_process", "limit_threads"): _nothing,
+            (f"{supervision}.supervisor", "os"): system,
+            (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
+            (f"{supervision}.supervisor", "Nursery"): lambda environment: Nursery(system, self._named, self._born),
+            (f"{supervision}.supervisor", "Words"): _Shown,
+            (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
+            (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
+            (f"{supervision}.supervisor", "environment"): _nothing,
+            (f"{supervision}.nursery", "os"): system,
+            (f"{supervision}.nursery", "select"): machine.Select(system),
+            (f"{supervision}.nursery", "signal"): machine.Signals(system),
+            ("dataflow.process.handed", "BACKLOG"): (1, 1),
+            (f"{supervision}.run", "machine_facts"): lambda environment: facts,
+            ("dataflow.recording.container", "os"): self.disk,
+            ("dataflow.firing.source", "Tripwire"): _NoTripwire,
+        }
+
+    # Processes
+
+    def _named(self, child: Child) -> str:
+        assert self._supervisor is not None
+        return next(label for label, each in self._supervisor._children.items() if each is child)
+
+    def _born(self, process: Process) -> None:
+        life = self._lives[process.label] = self._lives.get(process.label, 0) + 1
+        for happening in self._happenings:
+            fields = happening.fields
+            if happening.kind == "kill_before" and happening.target == process.label and fields["life"] == life:
+                process.dies_at = fields["effect"]
+        end = process.on_end
+
+        def ended(code: int) -> None:
+            if code:
+                self.outcome.killed.add(process.label)
+            end(code)
+
+        process.on_end = ended
+
+    def _happen(self, happening: Happening) -> None:
+        world, fields = self.world, happening.fields
+        process = next((p for p in world.processes if p.label == happening.target and not p.dead), None)
+        match happening.kind:
+            case "stop":
+                assert self._supervisor is not None
+                self._supervisor.stop()
+            case "kill" if process is not None:
+                world.kill(process)
+            case "freeze" if process is not None:
+                world.freeze(process)
+                world.after(fields["span"], lambda: world.thaw(process))
+
+
+class _Words:
+    """`sys.stderr`: what a process prints is its own."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+
+    def write(self, text: str) -> int:
+        task = self._simulation.world.task
+        for line in text.splitlines():
+            if task is None:
+                self._simulation.outcome.words.append(line)
+            elif not task.process.dead:
+                task.process.on_line(line)
+        return len(text)
+
+    def flush(self) -> None:
+        """Nothing is kept back."""
+
+    def fileno(self) -> int:
+        raise OSError("no file")
+
+
+class _Shown:
+    """The supervisor's words, shown at once."""
+
+    def __init__(self, show: Any) -> None:
+        self.put = show
+
+    def close(self) -> None:
+        """Everything is shown."""
+
+
+class _Resident:
+    """A process as psutil shows it."""
+
+    def memory_info(self) -> Any:
+        return SimpleNamespace(rss=MEGABYTES)
+
+
+class _NoTripwire:
+    """Processes of a real machine do not share generators; here all do, and each call seeds them anew."""
+
+    def set(self) -> None:
+        """Nothing is compared."""
+
+    def check(self, source: str) -> None:
+        """Nothing is compared."""
+
+
+def _nothing(*_: Any, **__: Any) -> dict[str, str]:
+    return {}
+
+
+def _reserved(reserved: Any, number: int) -> Any:
+    reserved.endpoints = [f"tcp/127.0.0.1:{7000 + k}" for k in range(number)]
+    return reserved
+
+
+def _restore_effort(sleep: Any, now: Any) -> None:
+    operators.Effort.sleep, operators.Effort.now = staticmethod(sleep), staticmethod(now)

@@ -1,0 +1,206 @@
+"""What is run, on which machine, and what happens to it: a scenario, made from a seed."""
+
+from __future__ import annotations
+
+import functools
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from dataflow.chaos.plan import Fault
+from dataflow.graph import Graph, load_text
+from simulation.run import Happening, Machine
+
+_USE = "use: simulation.operators"
+_SOURCE = f"{_USE}:Counter, params: {{count: COUNT, period: PERIOD, work: READING}}"
+_DEVICE = f"{_USE}:Device, params: {{count: COUNT, period: PERIOD}}RESTARTED"
+_WORK = "params: {work: WORK}"
+
+GRAPHS: Mapping[str, str] = {
+    "chain": f"""
+  left: {{SOURCE}}
+  relay: {{{_USE}:Relay, inputs: {{x: left/fast}}, {_WORK}LIVE}}
+  sum: {{{_USE}:Sum, inputs: {{x: relay/y}}, {_WORK}LIVE}}
+""",
+    "join": f"""
+  left: {{SOURCE}}
+  right: {{SOURCE}}
+  mount: {{{_USE}:Pose, inputs: {{x: left/slow}}LIVE}}
+  mix:
+    {_USE}:Mix
+    inputs: {{a: left/fast, b: right/fast, constant: mount/mount, feedback: smooth/y, recent: right/fast}}
+    {_WORK}LINE
+  smooth: {{{_USE}:Smooth, inputs: {{x: mix/y}}LIVE}}
+""",
+    "diamond": f"""
+  left: {{SOURCE}}
+  one: {{{_USE}:Relay, inputs: {{x: left/fast}}, {_WORK}LIVE}}
+  two: {{{_USE}:Smooth, inputs: {{x: left/fast}}LIVE}}
+  merge: {{{_USE}:Merge, inputs: {{all: [one/y, two/y, left/slow]}}, {_WORK}LIVE}}
+""",
+}
+_RESTART = "restart: {max: 5, backoff: 10ms}"
+POLICIES = (
+    "",
+    _RESTART,
+    "queue: block, size: 16",
+    "queue: newest, size: 1",
+    "queue: oldest, size: 2, wait: 15ms",
+    f"queue: block, size: 16, {_RESTART}",
+    f"queue: newest, size: 1, {_RESTART}",
+    f"queue: newest, size: 16, wait: forever, {_RESTART}",
+    f"queue: oldest, size: 2, wait: 15ms, deadline: 200ms, {_RESTART}",
+    "wait: 0ms, restart: {max: 1, backoff: 100ms}",
+)
+FOREVER = 1e6
+"""Seconds that a process is frozen for good."""
+PATIENCE = 2.5
+"""Seconds of a freeze that every run outlives."""
+TIMEOUT = 20.0
+"""Seconds allowed for the start, and without progress."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One run to be simulated. `live` operators have the policy `policy`, YAML fields of `live:`."""
+
+    seed: int
+    graph: str
+    live: bool
+    count: int
+    period: int
+    work: float
+    reading: float
+    policy: str
+    placement: str
+    window: int
+    snapshots: bool
+    machine: Machine
+    happenings: tuple[Happening, ...] = ()
+    faults: tuple[Fault, ...] = ()
+
+    def load(self) -> Graph:
+        return load(
+            self.graph, self.live, self.count, self.period, self.work, self.reading, self.policy, self.snapshots
+        )
+
+    @property
+    def may_fail(self) -> bool:
+        """Whether anything happens that the run need not outlive."""
+        ends = any(h.kind.startswith("kill") or h.fields.get("span", 0) > PATIENCE for h in self.happenings)
+        ends = ends or sum(h.kind == "stop" for h in self.happenings) > 1
+        return ends or self.machine.room is not None or any(f.kind in ("raise", "hang") for f in self.faults)
+
+    def describe(self) -> str:
+        """Tells what is run, and what happens, one line each."""
+        how = f"live ({self.policy or 'default policies'})" if self.live else "not live"
+        machine = self.machine
+        lines = [
+            f"seed {self.seed}: graph {self.graph!r}, {how}, {self.placement}, {self.count} steps of "
+            f"{self.period / 1e6:g} ms, work up to {self.work:g} s, window {self.window}"
+            + (", snapshots" if self.snapshots else ""),
+            f"  machine: seed {machine.seed}, pace {machine.pace:g}, gives way {machine.preempt:g}"
+            + ("" if machine.room is None else f", disk of {machine.room} bytes")
+            + (f", writes take up to {machine.slow_disk:g} s" if machine.slow_disk else "")
+            + (f", sockets hold {machine.socket_room} messages" if machine.socket_room != 278 else "")
+            + (f", rings of {machine.ring_bytes} bytes" if machine.ring_bytes != 1 << 20 else ""),
+        ]
+        lines += [f"  {happening}" for happening in self.happenings]
+        lines += [f"  {f.at:.4f} s after the release {f.kind} {f.operator} {dict(f.fields)}" for f in self.faults]
+        return "\n".join(lines)
+
+
+@functools.lru_cache(maxsize=4096)
+def load(
+    graph: str, live: bool, count: int, period: int, work: float, reading: float, policy: str, snapshots: bool
+) -> Graph:
+    """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
+    record = "record: {snapshots: 60ms}\n" if snapshots else ""
+    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{GRAPHS[graph]}"
+    words = {
+        "SOURCE": _DEVICE if live else _SOURCE,
+        "LIVE": f", live: {{{policy}}}" if policy else "",
+        "LINE": f"\n    live: {{{policy}}}" if policy else "",
+        "RESTARTED": f", live: {{{_RESTART}}}" if "restart" in policy else "",
+        "COUNT": str(count),
+        "PERIOD": str(period),
+        "READING": str(reading),
+        "WORK": str(work),
+    }
+    for word, meaning in words.items():
+        text = text.replace(word, meaning)
+    return load_text(text)
+
+
+def scenario_of(seed: int) -> Scenario:
+    """Returns the scenario of a seed."""
+    r = random.Random(f"scenario {seed}")
+    live = r.random() < 0.5
+    graph = r.choice(sorted(GRAPHS))
+    machine = Machine(
+        seed,
+        pace=r.choice((0.3, 1.0, 5.0)),
+        preempt=r.choice((0.0, 0.02, 0.2)),
+        room=r.choice((6_000, 12_000)) if r.random() < 0.05 else None,
+        slow_disk=r.choice((0.01, 0.2)) if r.random() < 0.1 else 0.0,
+        socket_room=r.choice((278, 12)),
+        ring_bytes=r.choice((1 << 20, 4096)),
+    )
+    plain = Scenario(
+        seed=seed,
+        graph=graph,
+        live=live,
+        count=r.choice((6, 12)),
+        period=r.choice((5_000_000, 20_000_000)),
+        work=r.choice((0.0, 0.05)),
+        reading=0.005 if not live and r.random() < 0.3 else 0.0,
+        policy=r.choice(POLICIES) if live else "",
+        placement=r.choice(("process_each", "process_each", "one_process")),
+        window=r.choice((2, 4, 256)),
+        snapshots=r.random() < 0.3,
+        machine=machine,
+    )
+    return _with_events(plain, r)
+
+
+def _with_events(plain: Scenario, r: random.Random) -> Scenario:
+    graph = plain.load()
+    labels = [*graph.processes(plain.placement)]
+    happenings = [_happening(plain, labels, r) for _ in range(r.choice((0, 0, 1, 1, 2, 3)))]
+    faults = [_fault(graph, r) for _ in range(r.choice((0, 0, 1, 2)))] if plain.live else []
+    return replace(
+        plain,
+        happenings=tuple(sorted(happenings, key=lambda h: h.at)),
+        faults=tuple(sorted(faults, key=lambda f: f.at)),
+    )
+
+
+def _happening(plain: Scenario, labels: list[str], r: random.Random) -> Happening:
+    at = round(r.random() * 0.4, 4) if r.random() < 0.75 else 0.0
+    kinds = ("freeze", "freeze", "kill_before", "kill", "stop")
+    kind, target = r.choice(kinds), r.choice(labels) if r.random() < 0.9 else "@recorder"
+    match kind:
+        case "freeze":
+            return Happening(at, kind, target, {"span": r.choice((0.05, 0.2, 1.0, 2.0, 6.0, FOREVER))})
+        case "kill_before":
+            return Happening(0.0, kind, target, {"effect": r.randint(1, 150), "life": r.choice((1, 1, 1, 2))})
+        case "stop":
+            return Happening(at, kind)
+        case _:
+            return Happening(at, kind, target)
+
+
+def _fault(graph: Graph, r: random.Random) -> Fault:
+    at = round(r.random() * 0.4, 4)
+    sources = [name for name, node in graph.nodes.items() if node.source]
+    others = [name for name, node in graph.nodes.items() if not node.source]
+    kind = r.choice(("raise", "slow", "stop", "flood", "jump", "past", "malformed", "hang"))
+    target = r.choice(sources if kind in ("stop", "flood", "jump", "past") else others)
+    fields = {
+        "slow": {"by": 0.05, "span": 0.1},
+        "stop": {"span": 0.1},
+        "flood": {"factor": 5, "span": 0.05},
+        "jump": {"by": 0.2, "back": True},
+        "past": {"by": 0.1, "back": True},
+    }
+    return Fault(at, kind, target, fields.get(kind, {}))
