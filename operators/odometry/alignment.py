@@ -6,6 +6,7 @@ Point-to-plane with projective association: Chen and Medioni, 1992; Newcombe et 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -19,6 +20,7 @@ from operators.odometry.surface import DepthNoise, Surface
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
 SLACK = 0.02  # metres along a ray that a tilted or rough surface makes up within one patch
+NOTHING: Vector = np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +30,17 @@ class Normal:
     H: Matrix  # (6, 6) information
     b: Vector  # (6,) gradient
     seen: int  # measurements that could be compared
-    inliers: int  # of these, within three sigmas
-    median: float | None  # squared residual in the median, in units of sigma; None without any
+    squared: Vector  # (N,) squared residuals, in units of sigma, of those within the gate
+
+    @property
+    def inliers(self) -> int:
+        """Measurements within three sigmas."""
+        return int(np.count_nonzero(self.squared < 9.0))
+
+    @property
+    def median(self) -> float | None:
+        """Squared residual in the median, in units of sigma; None without any."""
+        return float(np.median(self.squared)) if len(self.squared) else None
 
 
 class Term(Protocol):
@@ -84,7 +95,7 @@ class PlaneTerm:
         near = r * r < np.minimum(9.0 * (variance + self.freedom.variance(q[:, 2])), self.gate**2)
         seen = len(r)
         if not near.any():
-            return Normal(np.zeros((6, 6)), np.zeros(6), seen, 0, None)
+            return Normal(np.zeros((6, 6)), np.zeros(6), seen, NOTHING)
         inside, normals, r, variance = inside[near], normals[near], r[near], variance[near]
         e2 = r * r / variance
         weight = self.strength / (variance * (1.0 + e2 / CAUCHY**2))
@@ -96,7 +107,7 @@ class PlaneTerm:
         J[:, 4] = p[:, 2] * m[:, 0] - p[:, 0] * m[:, 2]
         J[:, 5] = p[:, 0] * m[:, 1] - p[:, 1] * m[:, 0]
         JW = J.T * weight
-        return Normal(JW @ J, JW @ r, seen, int(np.count_nonzero(e2 < 9.0)), float(np.median(e2)))
+        return Normal(JW @ J, JW @ r, seen, e2)
 
     def compare(self, T_world_camera: Matrix) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
         """Returns the indices (M,) of points that meet the reference, which lie before it, and which on it."""
@@ -143,7 +154,7 @@ class PixelTerm:
         JW = J.transpose(2, 0, 1) * weight[:, None]
         H = np.tensordot(JW, J, axes=((1, 2), (0, 1)))
         b = np.tensordot(JW, r, axes=((1, 2), (0, 1)))
-        return Normal(H, b, len(r), int(np.count_nonzero(e2 < 9.0)), float(np.median(e2)) if len(r) else None)
+        return Normal(H, b, len(r), e2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +165,12 @@ class PriorTerm:
     information: Matrix
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
-        x = se3.log(invert(self.T_world_camera) @ T_world_camera)
-        return Normal(self.information, self.information @ x, 0, 0, None)
+        x = se3.log(self.T_camera_world @ T_world_camera)
+        return Normal(self.information, self.information @ x, 0, NOTHING)
+
+    @cached_property
+    def T_camera_world(self) -> Matrix:
+        return invert(self.T_world_camera)
 
 
 def reprojection_jacobian(points_color: Points, K: Matrix, T_color_depth: Matrix) -> NDArray[np.float64]:
@@ -178,25 +193,34 @@ def reprojection_jacobian(points_color: Points, K: Matrix, T_color_depth: Matrix
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """The pose found, its information (6, 6), prior excluded, and the last state of every term."""
+    """The pose found, and what supports it."""
 
     T_world_camera: Matrix
-    information: Matrix
-    terms: tuple[Normal, ...]
+    terms: tuple[Term, ...]
+    last: tuple[Normal, ...]  # of a last step that hardly moved the pose; empty if none was so small
+
+    @cached_property
+    def normals(self) -> tuple[Normal, ...]:
+        """The state of every term; worked out when somebody asks, for a rough pose needs none."""
+        return self.last or tuple(term.linearise(self.T_world_camera) for term in self.terms)
+
+    @property
+    def information(self) -> Matrix:
+        """(6, 6), prior excluded."""
+        return np.asarray(sum((normal.H for normal in self.normals), np.zeros((6, 6))))
 
 
 def align(T_world_camera: Matrix, terms: Sequence[Term], prior: Term, iterations: int) -> Alignment:
     """Gauss-Newton from an initial pose until a step is below 0.1 mm and 0.1 mrad."""
     T = T_world_camera
-    for iteration in range(iterations + 1):
-        parts = tuple(term.linearise(T) for term in terms)
-        information: Matrix = np.sum([np.zeros((6, 6)), *(part.H for part in parts)], axis=0)
-        if iteration == iterations:
-            break
-        anchor = prior.linearise(T)
-        gradient: Vector = np.sum([anchor.b, *(part.b for part in parts)], axis=0)
-        step: Vector = -np.asarray(np.linalg.solve(information + anchor.H, gradient), np.float64)
+    for _ in range(iterations):
+        anchor, normals = prior.linearise(T), tuple(term.linearise(T) for term in terms)
+        H, b = anchor.H.copy(), anchor.b.copy()
+        for normal in normals:
+            H += normal.H
+            b += normal.b
+        step = -np.asarray(np.linalg.solve(H, b), np.float64)
         T = T @ se3.exp(step)
         if np.abs(step).max() < 1e-4:
-            break
-    return Alignment(se3.orthonormalised(T), information, parts)
+            return Alignment(se3.orthonormalised(T), tuple(terms), normals)
+    return Alignment(se3.orthonormalised(T), tuple(terms), ())
