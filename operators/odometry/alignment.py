@@ -16,7 +16,7 @@ from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.geometry.pinhole import Pixels, Points, project
 from operators.geometry.se3 import Matrix, Vector
-from operators.odometry.surface import DepthNoise, Surface
+from operators.odometry.surface import Array32, DepthNoise, Surface
 
 CAUCHY = 2.0  # residuals of this many sigmas count half
 SLACK = 0.02  # metres along a ray that a tilted or rough surface makes up within one patch
@@ -69,7 +69,11 @@ class Freedom:
 
 @dataclass(frozen=True, eq=False)
 class PlaneTerm:
-    """Points (N, 3) seen by the camera lie on the surface of a reference view."""
+    """Points (N, 3) seen by the camera lie on the surface of a reference view.
+
+    It works in single precision, one coordinate of all points in one piece: depths are no more precise, and this is
+    what most of a frame's time is spent on.
+    """
 
     points: Points
     reference: Surface
@@ -81,55 +85,92 @@ class PlaneTerm:
     strength: float  # of the information: neighbouring depths err together
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
-        T = self.T_reference_world @ T_world_camera
-        R = T[:3, :3]
-        inside, cells, q = self._meet(T)
-        planes = self.reference.planes[cells]
-        known = planes[:, 3] != 0
-        inside, planes, q = inside[known], planes[known].astype(np.float64), q[known]
-        normals = planes[:, :3]
-        r = np.einsum("ij,ij->i", normals, q) - planes[:, 3]
+        T_exact = self.T_reference_world @ T_world_camera
+        T = T_exact.astype(np.float32)
+        cells, rotated = self._meet(T)
+        planes = self.reference.bordered_planes.take(cells, axis=0)
+        known = np.flatnonzero(planes[:, 3])
+        normals = np.ascontiguousarray(planes.take(known, axis=0).T)  # (4, M): n and d
+        s = rotated.take(known, axis=1)
+        z = s[2] + T[2, 3]
+        # Of the distance r, by the pose: in the reference's axes, about the camera's centre; the last row is r.
+        J = np.empty((7, len(known)), np.float32)
+        n = J[:3] = normals[:3]
+        np.subtract(s[1] * n[2], s[2] * n[1], out=J[3])
+        np.subtract(s[2] * n[0], s[0] * n[2], out=J[4])
+        np.subtract(s[0] * n[1], s[1] * n[0], out=J[5])
+        distance = n[0] * s[0]
+        distance += n[1] * s[1]
+        distance += n[2] * s[2]
+        distance += T[:3, 3] @ n
+        r = np.subtract(distance, normals[3], out=J[6])
         # Both depths err along their rays; the distance sees that error's part along the normal.
-        along = np.abs(np.einsum("ij,ij->i", normals, q)) / q[:, 2]
-        variance = 2.0 * (self.scale * self.noise.sigma(q[:, 2]) * along) ** 2
-        near = r * r < np.minimum(9.0 * (variance + self.freedom.variance(q[:, 2])), self.gate**2)
-        seen = len(r)
-        if not near.any():
-            return Normal(np.zeros((6, 6)), np.zeros(6), seen, NOTHING)
-        inside, normals, r, variance = inside[near], normals[near], r[near], variance[near]
-        e2 = r * r / variance
-        weight = self.strength / (variance * (1.0 + e2 / CAUCHY**2))
-        m = normals @ R
-        p = self.points[inside]
-        J = np.empty((len(r), 6))
-        J[:, :3] = m
-        J[:, 3] = p[:, 1] * m[:, 2] - p[:, 2] * m[:, 1]
-        J[:, 4] = p[:, 2] * m[:, 0] - p[:, 0] * m[:, 2]
-        J[:, 5] = p[:, 0] * m[:, 1] - p[:, 1] * m[:, 0]
-        JW = J.T * weight
-        return Normal(JW @ J, JW @ r, seen, e2)
+        z2 = z * z
+        sigma = self.noise.quadratic * z2
+        sigma += self.noise.floor
+        sigma *= distance
+        sigma /= z
+        variance = sigma * sigma
+        variance *= 2.0 * self.scale**2
+        variance += 1e-12
+        r2 = r * r
+        # Three sigmas, squared, of what depth noise and the freedom to move allow.
+        z2 *= 9.0 * self.freedom.rotation**2
+        z2 += 9.0 * self.freedom.translation**2
+        z2 += 9.0 * variance
+        near = r2 < np.minimum(z2, self.gate**2, out=z2)
+        r2 /= variance
+        weight = r2 * (1.0 / CAUCHY**2)
+        weight += 1.0
+        weight *= variance
+        np.divide(near, weight, out=weight)
+        J *= np.sqrt(weight, out=weight)
+        A = self.strength * (J @ J.T).astype(np.float64)
+        # The axes of the camera instead of the reference's.
+        R = np.zeros((6, 6))
+        R[:3, :3] = R[3:, 3:] = T_exact[:3, :3]
+        return Normal(R.T @ A[:6, :6] @ R, A[:6, 6] @ R, len(known), r2[near].astype(np.float64))
 
-    def compare(self, T_world_camera: Matrix) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+    def compare(self, T_world_camera: Matrix) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.bool_]]:
         """Returns the indices (M,) of points that meet the reference, which lie before it, and which on it."""
-        inside, cells, q = self._meet(self.T_reference_world @ T_world_camera)
-        inverse = self.reference.inverse_depth.ravel()[cells]
-        known = inverse > 0
-        inside, z = inside[known], q[known, 2]
-        nearer = 1.0 / inverse[known] - z
+        T = (self.T_reference_world @ T_world_camera).astype(np.float32)
+        cells, rotated = self._meet(T)
+        inverse = self.reference.bordered.ravel().take(cells)
+        known = np.flatnonzero(inverse)
+        z = rotated[2].take(known) + T[2, 3]
+        nearer = 1.0 / inverse.take(known) - z
         variance = 2.0 * (self.scale * self.noise.sigma(z)) ** 2 + self.freedom.variance(z)
         width = 3.0 * np.sqrt(variance) + SLACK
-        return inside, nearer > width, np.abs(nearer) <= width
+        return known, nearer > width, np.abs(nearer) <= width
 
-    def _meet(self, T_reference_camera: Matrix) -> tuple[NDArray[np.int64], NDArray[np.int64], Points]:
-        """Returns which points (M,) fall into the reference's grid, in which cells (M,), and where (M, 3) they are."""
-        K, (h, w) = self.reference.K, self.reference.inverse_depth.shape
-        q = self.points @ T_reference_camera[:3, :3].T + T_reference_camera[:3, 3]
-        z = q[:, 2]
-        ahead = np.maximum(z, 0.05)
-        u = np.rint(q[:, 0] / ahead * K[0, 0] + K[0, 2])
-        v = np.rint(q[:, 1] / ahead * K[1, 1] + K[1, 2])
-        inside = np.flatnonzero((z > 0.05) & (u >= 0) & (v >= 0) & (u < w) & (v < h))
-        return inside, (v[inside] * w + u[inside]).astype(np.int64), q[inside]
+    def _meet(self, T_reference_camera: Array32) -> tuple[NDArray[np.int32], Array32]:
+        """Returns the cell (N,) of the reference's bordered grid that each point falls into, and R p (3, N)."""
+        h, w = self.reference.inverse_depth.shape
+        R, t = T_reference_camera[:3, :3], T_reference_camera[:3, 3]
+        rotated = R @ self.columns
+        # To pixels of the bordered grid, where truncation rounds.
+        K = self.reference.K.astype(np.float32)
+        z = rotated[2] + t[2]
+        behind = z.min(initial=1.0) < 0.05
+        ahead = np.maximum(z, np.float32(0.05)) if behind else z
+        u, v = rotated[0] + t[0], rotated[1] + t[1]
+        for x, f, c, size in ((u, K[0, 0], K[0, 2], w), (v, K[1, 1], K[1, 2], h)):
+            x /= ahead
+            x *= f
+            x += c + np.float32(1.5)
+            np.maximum(x, 0.0, out=x)
+            np.minimum(x, size + 1, out=x)
+        cells = v.astype(np.int32)
+        cells *= w + 2
+        cells += u.astype(np.int32)
+        if behind:
+            cells[z < 0.05] = 0
+        return cells, rotated
+
+    @cached_property
+    def columns(self) -> Array32:
+        """The points (3, N), each coordinate in one piece."""
+        return np.ascontiguousarray(self.points.T, np.float32)
 
 
 @dataclass(frozen=True, eq=False)

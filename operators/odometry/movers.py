@@ -65,6 +65,6 @@ def _tiles(shape: tuple[int, int]) -> tuple[int, int]:
 def _tile_of(points: Points, K: Matrix, tiles: tuple[int, ...]) -> NDArray[np.int64]:
     """Returns the flat index of the tile that each point (N, 3) projects into; outside, the nearest one."""
     x, y, z = points.T
-    column = np.clip((x / z * K[0, 0] + K[0, 2] + 0.5) / TILE, 0, tiles[1] - 1).astype(np.int64)
-    row = np.clip((y / z * K[1, 1] + K[1, 2] + 0.5) / TILE, 0, tiles[0] - 1).astype(np.int64)
+    column: NDArray[np.int64] = np.clip((x / z * K[0, 0] + K[0, 2] + 0.5) / TILE, 0, tiles[1] - 1).astype(np.int64)
+    row: NDArray[np.int64] = np.clip((y / z * K[1, 1] + K[1, 2] + 0.5) / TILE, 0, tiles[0] - 1).astype(np.int64)
     return row * tiles[1] + column

@@ -78,8 +78,11 @@ class Surface:
         return np.column_stack([x[::stride][u] * z, y[::stride][v] * z, z])
 
     @cached_property
-    def planes(self) -> Array32:
-        """(h·w, 4): unit normal n towards the camera and d = n·p of each patch; zeros where not smooth."""
+    def bordered_planes(self) -> Array32:
+        """((h + 2)·(w + 2), 4): unit normal n towards the camera and d = n·p of each patch; zeros where not smooth.
+
+        Around the grid lies a border of zeros, for points that fall beside it.
+        """
         q = self.inverse_depth
         h, w = q.shape
         x, y = self.rays
@@ -98,9 +101,16 @@ class Surface:
         scale = 1.0 / np.sqrt(a * a + b * b + c * c + np.float32(1e-12))
         grazing = smooth_q * scale < 0.17 * np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
         bad = (hole > 0) | rough | grazing
-        planes = np.stack([-a * scale, -b * scale, -c * scale, -scale], axis=-1)
-        planes[bad] = 0.0
-        return planes.reshape(h * w, 4)
+        scale[bad] = 0.0
+        planes = np.zeros((h + 2, w + 2, 4), np.float32)
+        for i, part in enumerate((a, b, c, 1.0)):
+            np.multiply(part, -scale, out=planes[1:-1, 1:-1, i])
+        return planes.reshape(-1, 4)
+
+    @cached_property
+    def bordered(self) -> Array32:
+        """The inverse depth (h + 2, w + 2) with a border of no patches."""
+        return np.pad(self.inverse_depth, 1)
 
     @property
     def depth(self) -> Array32:
