@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
-from operators.geometry.pinhole import Pixels, Points, project
+from operators.geometry.pinhole import Pixels, Points
 from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.surface import Array32, DepthNoise, Surface
 
@@ -127,8 +127,7 @@ class PlaneTerm:
         J *= np.sqrt(weight, out=weight)
         A = self.strength * (J @ J.T).astype(np.float64)
         # The axes of the camera instead of the reference's.
-        R = np.zeros((6, 6))
-        R[:3, :3] = R[3:, 3:] = T_exact[:3, :3]
+        R = _both(T_exact[:3, :3])
         return Normal(R.T @ A[:6, :6] @ R, A[:6, 6] @ R, len(known), r2[near].astype(np.float64))
 
     def compare(self, T_world_camera: Matrix) -> tuple[NDArray[np.intp], NDArray[np.bool_], NDArray[np.bool_]]:
@@ -185,17 +184,30 @@ class PixelTerm:
     strength: float
 
     def linearise(self, T_world_camera: Matrix) -> Normal:
+        (fx, _, cx), (_, fy, cy), _ = self.K_color
         T = self.T_color_depth @ invert(T_world_camera)
-        p = self.points_world @ T[:3, :3].T + T[:3, 3]
-        r = project(p, self.K_color) - self.pixels
-        e2 = np.einsum("ij,ij->i", r, r) / self.sigma**2
-        weight = self.strength / (self.sigma**2 * (1.0 + e2 / CAUCHY**2))
-        weight[p[:, 2] <= 0.05] = 0.0
-        J = reprojection_jacobian(p, self.K_color, self.T_color_depth)
-        JW = J.transpose(2, 0, 1) * weight[:, None]
-        H = np.tensordot(JW, J, axes=((1, 2), (0, 1)))
-        b = np.tensordot(JW, r, axes=((1, 2), (0, 1)))
-        return Normal(H, b, len(r), e2)
+        p = T[:3, :3] @ self.points_world.T + T[:3, 3:]
+        behind = p[2] <= 0.05
+        x, y, z = p[0], p[1], np.where(behind, 1.0, p[2])
+        # Of the residuals, by the pose: in the colour camera's axes, about the centre of the depth camera, from which s
+        # points to each point; the last row holds the residuals.
+        s = p - self.T_color_depth[:3, 3:]
+        J = np.zeros((7, 2, len(z)))
+        # d is a pixel's derivative by its point: (du, 0, duz) and (0, dv, dvz). The rows are -d and d × s.
+        du, duz = fx / z, -fx * x / z**2
+        dv, dvz = fy / z, -fy * y / z**2
+        J[0, 0], J[2, 0] = -du, -duz
+        J[1, 1], J[2, 1] = -dv, -dvz
+        J[3, 0], J[4, 0], J[5, 0] = -duz * s[1], duz * s[0] - du * s[2], du * s[1]
+        J[3, 1], J[4, 1], J[5, 1] = dv * s[2] - dvz * s[1], dvz * s[0], -dv * s[0]
+        J[6, 0], J[6, 1] = x * du + cx - self.pixels[:, 0], y * dv + cy - self.pixels[:, 1]
+        e2 = (J[6, 0] ** 2 + J[6, 1] ** 2) / self.sigma**2
+        e2[behind] = np.inf
+        J *= np.sqrt(self.strength / (self.sigma**2 * (1.0 + e2 / CAUCHY**2)))
+        flat = J.reshape(7, -1)
+        A = flat @ flat.T
+        R = _both(self.T_color_depth[:3, :3])
+        return Normal(R.T @ A[:6, :6] @ R, A[:6, 6] @ R, len(z), e2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,22 +226,11 @@ class PriorTerm:
         return invert(self.T_world_camera)
 
 
-def reprojection_jacobian(points_color: Points, K: Matrix, T_color_depth: Matrix) -> NDArray[np.float64]:
-    """d pixel / d x (N, 2, 6), x perturbing the depth camera's pose; points (N, 3) in the colour camera."""
-    x, y = points_color[:, 0], points_color[:, 1]
-    z = np.where(points_color[:, 2] > 0.05, points_color[:, 2], 1.0)
-    D = np.zeros((len(z), 2, 3))
-    D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * x / z**2
-    D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z, -K[1, 1] * y / z**2
-    D = D @ T_color_depth[:3, :3]
-    p = (points_color - T_color_depth[:3, 3]) @ T_color_depth[:3, :3]  # in the depth camera
-    J = np.empty((len(z), 2, 6))
-    J[:, :, :3] = -D
-    # d p / d w = [p]x, so each row d of D gives d [p]x = (d × p).
-    J[:, :, 3] = D[:, :, 1] * p[:, None, 2] - D[:, :, 2] * p[:, None, 1]
-    J[:, :, 4] = D[:, :, 2] * p[:, None, 0] - D[:, :, 0] * p[:, None, 2]
-    J[:, :, 5] = D[:, :, 0] * p[:, None, 1] - D[:, :, 1] * p[:, None, 0]
-    return J
+def _both(R: Matrix) -> Matrix:
+    """Returns the (6, 6) that turns the axes of a translation and of a rotation alike."""
+    both = np.zeros((6, 6))
+    both[:3, :3] = both[3:, 3:] = R
+    return both
 
 
 @dataclass(frozen=True, eq=False)
