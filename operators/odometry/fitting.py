@@ -163,7 +163,7 @@ class Fitter:
             surfaces = self._planes(points, references, freedom, gate)
             alignment = align(T, [*features, *surfaces], prior, iterations)
             T = alignment.T_world_camera
-        corners, depth = alignment.terms[: len(features)], alignment.terms[len(features) :]
+        corners, depth = alignment.normals[: len(features)], alignment.normals[len(features) :]
         followed = corners if sighting and not sighting.recognised else ()
         return Fit(
             T_world_camera=T,

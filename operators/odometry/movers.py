@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.geometry.pinhole import Pixels, Points
+from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 from operators.odometry.alignment import PlaneTerm
 
@@ -49,6 +49,8 @@ class Movers:
 
     def hold(self, points: Points) -> NDArray[np.bool_]:
         """Returns which of the points (N, 3), in the view's depth camera, lie in a moving tile."""
+        if not self.tiles.any():
+            return np.zeros(len(points), np.bool_)
         return np.asarray(self.tiles.ravel()[_tile_of(points, self.K, self.tiles.shape)], np.bool_)
 
     @property
@@ -62,7 +64,7 @@ def _tiles(shape: tuple[int, int]) -> tuple[int, int]:
 
 def _tile_of(points: Points, K: Matrix, tiles: tuple[int, ...]) -> NDArray[np.int64]:
     """Returns the flat index of the tile that each point (N, 3) projects into; outside, the nearest one."""
-    pixels: Pixels = points[:, :2] / points[:, 2:] * [K[0, 0], K[1, 1]] + [K[0, 2], K[1, 2]]
-    column = np.clip((pixels[:, 0] + 0.5) // TILE, 0, tiles[1] - 1).astype(np.int64)
-    row = np.clip((pixels[:, 1] + 0.5) // TILE, 0, tiles[0] - 1).astype(np.int64)
+    x, y, z = points.T
+    column: NDArray[np.int64] = np.clip((x / z * K[0, 0] + K[0, 2] + 0.5) / TILE, 0, tiles[1] - 1).astype(np.int64)
+    row: NDArray[np.int64] = np.clip((y / z * K[1, 1] + K[1, 2] + 0.5) / TILE, 0, tiles[0] - 1).astype(np.int64)
     return row * tiles[1] + column

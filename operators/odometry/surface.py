@@ -41,17 +41,22 @@ class Surface:
         Where returns are sparse, blocks are wider, so that each holds some.
         """
         valid = cv2.inRange(depth, near, far)  # 255 or 0; a NaN compares false
-        density = _block_mean(valid / np.float32(255), max(depth.shape[1] // 16, 1), max(depth.shape[0] // 16, 1))
+        # One full-size array, written over at each step: new ones cost as much as the arithmetic.
+        full: Array32 = valid / np.float32(255)
+        density = _block_mean(full, max(depth.shape[1] // 16, 1), max(depth.shape[0] // 16, 1))
         found = density[density > 0.02]
         per_pixel = float(found.mean()) if found.size else 1.0
         fewest = 0.25
         while per_pixel * block * block < 2.5 and block < 16:
             block, fewest = 2 * block, 0.02
         h, w = depth.shape[0] // block, depth.shape[1] // block
-        depth, valid = depth[: h * block, : w * block], valid[: h * block, : w * block]
-        inverse = np.zeros_like(depth)
-        cv2.copyTo(cv2.divide(1.0, depth), valid, inverse)
-        mean, square, share = (_block_mean(x, w, h) for x in (inverse, inverse * inverse, valid / np.float32(255)))
+        whole = np.s_[: h * block, : w * block]
+        depth, valid, full = depth[whole], valid[whole], full[whole]
+        share = _block_mean(full, w, h)
+        cv2.divide(1.0, depth, full)
+        inverse: Array32 = np.asarray(cv2.bitwise_and(full, full, mask=valid), np.float32)
+        mean = _block_mean(inverse, w, h)
+        square = _block_mean(np.multiply(inverse, inverse, out=full), w, h)
         enough = share >= fewest
         share[~enough] = 1.0
         mean /= share
@@ -78,8 +83,11 @@ class Surface:
         return np.column_stack([x[::stride][u] * z, y[::stride][v] * z, z])
 
     @cached_property
-    def planes(self) -> Array32:
-        """(h·w, 4): unit normal n towards the camera and d = n·p of each patch; zeros where not smooth."""
+    def bordered_planes(self) -> Array32:
+        """((h + 2)·(w + 2), 4): unit normal n towards the camera and d = n·p of each patch; zeros where not smooth.
+
+        Around the grid lies a border of zeros, for points that fall beside it.
+        """
         q = self.inverse_depth
         h, w = q.shape
         x, y = self.rays
@@ -98,9 +106,16 @@ class Surface:
         scale = 1.0 / np.sqrt(a * a + b * b + c * c + np.float32(1e-12))
         grazing = smooth_q * scale < 0.17 * np.sqrt(1.0 + x[None, :] ** 2 + y[:, None] ** 2)
         bad = (hole > 0) | rough | grazing
-        planes = np.stack([-a * scale, -b * scale, -c * scale, -scale], axis=-1)
-        planes[bad] = 0.0
-        return planes.reshape(h * w, 4)
+        scale[bad] = 0.0
+        planes = np.zeros((h + 2, w + 2, 4), np.float32)
+        for i, part in enumerate((a, b, c, 1.0)):
+            np.multiply(part, -scale, out=planes[1:-1, 1:-1, i])
+        return planes.reshape(-1, 4)
+
+    @cached_property
+    def bordered(self) -> Array32:
+        """The inverse depth (h + 2, w + 2) with a border of no patches."""
+        return np.pad(self.inverse_depth, 1)
 
     @property
     def depth(self) -> Array32:
