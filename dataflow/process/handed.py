@@ -1,4 +1,4 @@
-"""What a process inherits from the supervisor, by the order of the descriptors."""
+"""Holds what a process inherits from the supervisor, by the order of the descriptors."""
 
 from __future__ import annotations
 

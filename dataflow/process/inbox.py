@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import queue
 import select
-import time
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -56,17 +55,8 @@ class Inbox:
             raise queue.Empty
         return self._items.popleft()
 
-    def get_until(self, deadline: float) -> Item:
-        """Returns the next item, or raises `queue.Empty` when there is none by `deadline` (s, monotonic)."""
-        while True:
-            try:
-                return self.get(max(0.0, deadline - time.monotonic()))
-            except queue.Empty:
-                if time.monotonic() >= deadline:
-                    raise
-
     def empty(self) -> bool:
-        """Whether there is nothing, in the rings either."""
+        """Tells whether there is nothing, in the rings either."""
         for ring in self._incoming:
             if ring.arrived():
                 self._items.extend(("envelope", key, payload) for key, payload in ring.take())

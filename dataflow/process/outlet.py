@@ -198,7 +198,7 @@ class Outlet:
             network.taps.offer(stream, envelope)
 
     def _is_taken(self, stream: str) -> bool:
-        """Whether anybody outside this process takes a stream; before `release` somebody still may."""
+        """Tells whether anybody outside this process takes a stream; before `release` somebody still may."""
         return self._held is not None or stream in self._fanout.takers or self._listened(stream) is not None
 
     def frontier(self, stream: str, frontier: int) -> None:

@@ -1,4 +1,4 @@
-"""What a process sends to others of its machine: one envelope to every link whose consumer takes its key."""
+"""Holds what a process sends to others of its machine: one envelope to every link whose consumer takes its key."""
 
 from __future__ import annotations
 

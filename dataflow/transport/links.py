@@ -94,12 +94,12 @@ class Outgoing:
             self._begin_anew()
 
     def present(self) -> bool:
-        """Whether somebody is there to take what is sent, or is believed to be."""
+        """Tells whether somebody is there to take what is sent, or is believed to be."""
         self._new_reader()
         return not self.away
 
     def may_borrow(self, size: int, free: Callable[[], int]) -> bool:
-        """Whether the consumer may be lent another block.
+        """Tells whether the consumer may be lent another block.
 
         Where messages may be dropped, one that has taken nothing for `STILL` seconds may hold as much of the pool as is
         free, so that one that is stopped leaves room for the others.
@@ -114,7 +114,7 @@ class Outgoing:
         return sum(held for _, _, held in self._lent) + size <= free()
 
     def _takes(self) -> bool:
-        """Whether the consumer has taken something of late, or all that there is."""
+        """Tells whether the consumer has taken something of late, or all that there is."""
         taken, now = self._ring.taken(), time.monotonic()
         if taken != self._taken or taken == self._ring.written:
             self._taken, self._took_at = taken, now
@@ -185,7 +185,7 @@ class Outgoing:
                 self.claim.drop(entry.block)
 
     def _new_reader(self) -> bool:
-        """Whether another process has taken the consumer's place since the last look."""
+        """Tells whether another process has taken the consumer's place since the last look."""
         reader = self._ring.reader()
         if reader == self._reader:
             return False
@@ -215,7 +215,7 @@ class Incoming:
         """What was taken so far, and how much of it lies in memory that could not be opened."""
 
     def arrived(self) -> bool:
-        """Whether there is something to take."""
+        """Tells whether there is something to take."""
         return self._ring.arrived()
 
     def sleep(self) -> bool:

@@ -47,7 +47,7 @@ def make_ring(capacity: int = CAPACITY) -> int:
 
 
 class _End:
-    """What both ends share: the mapped memory and its words."""
+    """Holds what both ends share: the mapped memory and its words."""
 
     def __init__(self, descriptor: int) -> None:
         size = os.fstat(descriptor).st_size
@@ -82,7 +82,7 @@ class RingWriter(_End):
 
     @property
     def written(self) -> int:
-        """How many bytes have ever been written."""
+        """Tells how many bytes have ever been written."""
         return self._head
 
     def taken(self) -> int:
@@ -141,7 +141,7 @@ class RingReader(_End):
         self._words[_BLOCKED] = 0
 
     def arrived(self) -> bool:
-        """Whether there is something to take."""
+        """Tells whether there is something to take."""
         return bool(self._words[_HEAD] != self._tail)
 
     def take(self, limit: int) -> list[tuple[int, bytes]]:
@@ -185,5 +185,5 @@ class RingReader(_End):
 
 
 def _room(size: int) -> int:
-    """What a frame takes of the ring: its head and content, in whole words, so that a head never wraps."""
+    """Returns what a frame takes of the ring: its head and content, in whole words, so that a head never wraps."""
     return (_FRAME.size + size + 7) & ~7

@@ -51,7 +51,7 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Freedom:
-    """How far a pose may still be off before it is refined: standard deviations, metres and radians."""
+    """Says how far a pose may still be off before it is refined: standard deviations, metres and radians."""
 
     translation: float = 1.0
     rotation: float = 1.0

@@ -28,7 +28,7 @@ class Frame:
 
     @property
     def flaws(self) -> str:
-        """What is wrong with the images, or nothing."""
+        """Returns what is wrong with the images, or nothing."""
         named = (("image", self.image_flaw), ("depth", self.depth_flaw))
         return "; ".join(f"{name} {flaw}" for name, flaw in named if flaw)
 

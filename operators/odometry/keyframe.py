@@ -43,7 +43,7 @@ class Keyframe:
 
     @property
     def empty(self) -> bool:
-        """Whether nothing can be measured against it."""
+        """Tells whether nothing can be measured against it."""
         return len(self.points) < 6 and self.surface.coverage < 0.05
 
 

@@ -1,4 +1,4 @@
-"""How a LiDAR moved, how it will, and how far that can be wrong."""
+"""Says how a LiDAR moved, how it will, and how far that can be wrong."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a LiDAR is, scan by scan, in a map that it makes; and whether that is known."""
+"""Says where a LiDAR is, scan by scan, in a map that it makes; and whether that is known."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _STARTS, _LOST_STARTS = 3, 4  # of which a pose is fitted
 
 
 class State(StrEnum):
-    """What the pose of a scan rests on."""
+    """Holds what the pose of a scan rests on."""
 
     TRACKING = "tracking"  # this scan, or it begins the map
     RELOCALISED = "relocalised"  # this scan, in the map found again after a loss

@@ -1,4 +1,4 @@
-"""How noisy a camera's measurements are, learnt from the residuals of the frames so far."""
+"""Says how noisy a camera's measurements are, learnt from the residuals of the frames so far."""
 
 from dataclasses import dataclass
 

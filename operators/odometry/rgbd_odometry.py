@@ -38,7 +38,7 @@ RECALL_EVERY = 3  # frames, while a new map is tracked
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What an odometry remembers between frames."""
+    """Holds what an odometry remembers between frames."""
 
     motion: Motion | None
     covariance: Matrix

@@ -52,7 +52,7 @@ class StereoOdometryConfig:
 
 @dataclass(frozen=True, eq=False)
 class StereoState:
-    """What an odometry remembers between frames."""
+    """Holds what an odometry remembers between frames."""
 
     motion: Motion | None
     covariance: Matrix

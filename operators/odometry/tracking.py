@@ -1,4 +1,4 @@
-"""What every visual odometry says of a frame: a pose, how far it can be trusted, and what it rests on."""
+"""Holds what every visual odometry says of a frame: a pose, how far it can be trusted, and what it rests on."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +12,7 @@ from operators.geometry.se3 import Matrix
 
 
 class Status(StrEnum):
-    """What a frame's pose rests on."""
+    """Holds what a frame's pose rests on."""
 
     TRACKING = "tracking"  # measurements of this frame
     RELOCALISED = "relocalised"  # the same, in a map found again after a loss

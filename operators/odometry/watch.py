@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 class Flaw(StrEnum):
-    """Why an image is not used."""
+    """Says why an image is not used."""
 
     BLACK = "is black"
     BLANK = "has no contrast"

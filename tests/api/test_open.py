@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from mcap.writer import Writer
 
 import dataflow
 from dataflow.api.names import StreamNameError
-from dataflow.messages import Imu
+from dataflow.messages import Imu, Message
 from dataflow.recording import RecordingError, reader
 
 
@@ -54,13 +55,13 @@ def test_nothing_is_decoded_before_it_is_asked_for(
     recording: dataflow.RecordedStreams, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read: list[int] = []
-    decode = reader.Recording._decode
+    decoded = reader.decoded
 
-    def noting(self: reader.Recording, name: str, channel: object, raw: reader.RawMessage, extra: object) -> object:
+    def noting(path: Path, name: str, channel: Any, raw: reader.RawMessage, extra: Any) -> Message:
         read.append(raw.log_time)
-        return decode(self, name, channel, raw, extra)  # type: ignore[arg-type]
+        return decoded(path, name, channel, raw, extra)
 
-    monkeypatch.setattr(reader.Recording, "_decode", noting)
+    monkeypatch.setattr(reader, "decoded", noting)
     part = recording.between(0.02, 0.08)["imu"][2:]
     assert len(part) == 5
     assert part.stamps.tolist() == [START + 10 * MS * i for i in range(4, 9)]

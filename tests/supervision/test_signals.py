@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import signal
 import subprocess
 import sys
 
@@ -22,7 +24,9 @@ def asked(*ignored: str) -> list[str]:
     """What each signal does to a run in a process that was begun with some signals ignored."""
     ignore = "; ".join(f"trap '' {name}" for name in ignored) or ":"
     command = ["sh", "-c", f'{ignore}; exec "$@"', "sh", sys.executable, "-c", ASKS]
-    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=30).stdout.splitlines()
+    heard = functools.partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)  # this test may run under nohup itself
+    found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=30, preexec_fn=heard)
+    return found.stdout.splitlines()
 
 
 def test_a_run_is_asked_to_end_by_each_of_three_signals() -> None:

@@ -98,7 +98,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Look:
-    """What a person wears, as patches that are added to the parts of the body: trunk, hips and head."""
+    """Holds what a person wears, as patches that are added to the parts of the body: trunk, hips and head."""
 
     skin: Material
     hair: Material

@@ -98,7 +98,7 @@ def add_chooser(builder: Builder, rng: Rng, wall: Wall, low: float, high: float)
 
 
 def _is(state: Callable[[float], object], value: object, t: float) -> bool:
-    """Whether a state has a value at a time."""
+    """Tells whether a state has a value at a time."""
     return state(t) == value
 
 
@@ -116,7 +116,8 @@ def _facing(wall: Wall) -> float:
 
 
 def _chosen(rng: Rng, candidates: list[Candidate]) -> list[Candidate]:
-    """What is chosen, one after the other and again and again: each thing at least once, none twice in a row."""
+    """Returns what is chosen, one after the other and again and again: each thing at least once, none twice in a
+    row."""
     while True:
         extra = rng.integers(len(candidates), size=_ERRANDS - len(candidates))
         order = rng.permutation([*range(len(candidates)), *extra])

@@ -1,4 +1,4 @@
-"""What movers are to do: acts one after the other, and the ways along which they do it."""
+"""Holds what movers are to do: acts one after the other, and the ways along which they do it."""
 
 from __future__ import annotations
 

@@ -140,7 +140,7 @@ def _inhabit(builder: Builder, rng: Rng, back: Wall, length: float, half: float)
 
 
 def _furnish(builder: Builder, rng: Rng, length: float, half: float) -> None:
-    """What stands in the yard: bushes and a table in its middle, boxes and bins along the fences."""
+    """Returns what stands in the yard: bushes and a table in its middle, boxes and bins along the fences."""
     for k in range(3):
         angle = 2 * math.pi * (k / 3 + rng.uniform(-0.05, 0.05))
         put_on_floor(
