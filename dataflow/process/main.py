@@ -101,14 +101,14 @@ def _report(channel: Channel, error: BaseException, phase: str) -> None:
         print(text, file=sys.stderr)
 
 
-def _await_leave(inbox: Inbox) -> str:
+def await_leave(inbox: Inbox) -> str:
     """After a failure: waits (bounded) until the supervisor has dealt with it; returns the outcome it names."""
     deadline = time.monotonic() + LEAVE_WITHIN
     while (left := deadline - time.monotonic()) > 0:
         try:
             item = inbox.get(timeout=left)
         except queue.Empty:
-            break
+            continue  # something else has woken it, or the time is up
         if item[0] == "control" and item[1] in ("leave", "lost"):
             return str(item[2].get("outcome", "the supervisor is gone"))
     return "the supervisor did not answer"
@@ -144,7 +144,7 @@ def main(descriptor: int, handed: Sequence[int]) -> int:
         code = FAILED
         _hand_over(process)
         _report(channel, error, phase)
-        _await_leave(inbox)
+        await_leave(inbox)
     facts: Any = {}
     try:
         if process is not None:

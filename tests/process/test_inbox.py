@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from dataflow.process.inbox import Inbox
+from dataflow.process.main import await_leave
 from dataflow.transport import Incoming, Outgoing, PoolReader, make_board, make_ring
 
 LONG = 60.0
@@ -57,8 +58,6 @@ def test_what_rings_bring_and_threads_put_comes_in_order(wired: Wired) -> None:
 def test_an_empty_inbox_is_waited_for_no_longer_than_asked(wired: Wired) -> None:
     with pytest.raises(queue.Empty):
         wired.inbox.get(timeout=0.001)
-    with pytest.raises(queue.Empty):
-        wired.inbox.get_until(deadline=0.0)
 
 
 @pytest.mark.parametrize("through", ["ring", "thread"])
@@ -87,3 +86,18 @@ def test_what_has_arrived_is_counted(wired: Wired) -> None:
     wired.send(b"two")
     assert wired.inbox.empty() is False
     assert wired.inbox.counters() == {"received_messages": 2, "received_bytes": 7, "unresolved": 0}
+
+
+def test_a_failed_process_waits_for_the_supervisor_whatever_else_wakes_it() -> None:
+    class Woken:
+        """An inbox that is woken twice for nothing."""
+
+        def __init__(self) -> None:
+            self.items: list[object] = [None, None, ("control", "leave", {"outcome": "failed"})]
+
+        def get(self, timeout: float) -> object:
+            if (item := self.items.pop(0)) is None:
+                raise queue.Empty
+            return item
+
+    assert await_leave(Woken()) == "failed"  # type: ignore[arg-type]
