@@ -16,7 +16,7 @@ class Runner:
     """One operator with inputs, driven step by step on one thread."""
 
     keeps_time = False
-    """Whether it may have something to do though nothing arrives (`next_due`)."""
+    """True when it may have something to do though nothing arrives (`next_due`)."""
 
     def __init__(self, node: Node, operator: Operator, emitter: Emitter, *, lossy: bool = False) -> None:
         self.node, self.operator, self.emitter = node, operator, emitter
@@ -34,7 +34,7 @@ class Runner:
         self.absent: set[str] = set()
         """Streams whose operator is gone at the moment; only a live run asks."""
         self.awake = True
-        """Whether it is to be asked for a step; so until somebody drives it who asks only those that are."""
+        """True when it is to be asked for a step; it stays so where nobody asks by `Ready`."""
         self.place = 0
         self.wakes_in: list[Runner] = []
         """Its place in the graph and where it puts itself when it wakes (`dataflow.firing.ready`)."""

@@ -21,14 +21,14 @@ class Supervised:
     since: float = 0.0
     life: Life = Life.STARTING
     attempt: int = 0
-    """How many processes had this place before."""
+    """The number of processes that had this place before."""
     unseen: set[str] = field(default_factory=set)
     """Keys on which it has not seen a probe yet."""
     done: dict[str, int] = field(default_factory=dict)
-    """How far it is: by operator, or for the recorder and the like of a live run by source."""
+    """The stamp up to which it is done: by operator, or for the recorder and the like of a live run by source."""
     report: dict[str, Any] | None = None
     facts: dict[str, Any] = field(default_factory=dict)
-    """What it says when it has closed."""
+    """The facts that it gave when it closed."""
     words: deque[str] = field(default_factory=lambda: deque(maxlen=WORDS_KEPT))
     cause: str = ""
     """Why it was killed or told to leave."""

@@ -18,9 +18,9 @@ class Sampled:
         self.many = spec.many
         self.required = spec.required
         self.stale = False
-        """Whether the last choice withheld a message as older than `max_age`."""
+        """True when the last choice withheld a message as older than `max_age`."""
         self.late = False
-        """Whether the last choice holds a message that an earlier firing should have had."""
+        """True when the last choice holds a message that an earlier firing should have had."""
         self._delay = spec.before or 0
         self._max_age = spec.max_age
         self._lanes = tuple(lanes)

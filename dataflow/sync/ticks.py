@@ -20,13 +20,13 @@ class Ticks:
         self._lanes = tuple(lanes)
         self._next = NEVER
         self.started = False
-        """Whether `stamp` is on the grid for certain, or only a lower bound of the first tick."""
+        """True when `stamp` is on the grid for certain, False when it is only a lower bound of the first tick."""
         self.latest_start: int | None = None
         """A grid point at or after the first tick; None while no stream has had a message."""
         self.stamp = NEVER
         """The next tick, or a stamp before which there is none; FOREVER once ticks are over."""
         self.confirmed = False
-        """Whether there is a tick at `stamp`."""
+        """True when there is a tick at `stamp`."""
         self.reach = NEVER
         """The farthest that any bounding stream is known to go, which ticks do not exceed."""
 

@@ -44,7 +44,7 @@ class Candidate:
     label: str
     stand: float
     place: Point
-    """Where the hand grips it, or where the pelvis is on it."""
+    """The place at which the hand grips it, or of the pelvis on it."""
 
 
 def add_chooser(builder: Builder, rng: Rng, wall: Wall, low: float, high: float) -> tuple[float, float]:

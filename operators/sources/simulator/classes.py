@@ -40,7 +40,7 @@ ACTIVITIES = (
     "driving",
     "resting",
 )
-"""What a mover can be doing.
+"""The activities of movers.
 
 Persons stand (upright, feet still), walk, sit down, sit, stand up (the two transitions), reach (a hand goes to an
 object or puts it back) and drink (the held mug is away from the table). Balls roll or rest; robots drive, or rest
