@@ -117,7 +117,7 @@ def replay(
     """
     began = time.monotonic()
     from dataflow.graph import load_graph
-    from dataflow.interop.opening import is_foreign
+    from dataflow.interop.opening import is_foreign, open_bag
     from dataflow.recording import Recording
     from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
     from dataflow.supervision.replay import plan_replay
@@ -134,6 +134,7 @@ def replay(
             from dataflow.cli.bags import replay_bag
 
             if graph is None:
+                open_bag(recording).close()
                 raise fail(f"{recording} does not hold the graph that made it: name one with --graph")
             if complete is not None:
                 raise fail("--complete needs the firing records of a run, which bags do not hold")

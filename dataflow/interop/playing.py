@@ -79,7 +79,7 @@ def match(path: Path, graph: Graph, words: Sequence[str]) -> Matching:
 
 
 def readings_of(bag: Bag, names: Collection[str] | None = None) -> tuple[Reading, ...]:
-    """How the topics of a bag can be read."""
+    """Returns how the topics of a bag can be read."""
     return tuple(Reading(bag, topic) for name, topic in bag.topics.items() if names is None or name in names)
 
 

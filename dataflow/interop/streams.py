@@ -29,7 +29,7 @@ I64 = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, slots=True)
 class Played:
-    """Which topic stands in for a stream: as which message type, and whether as one message, valid always."""
+    """A topic that stands in for a stream: as which message type, and whether as one message, valid always."""
 
     topic: str
     type: str
@@ -116,7 +116,7 @@ class BagStreams:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What of the file is damaged or unusual, for people."""
+        """Notes of what in the file is damaged or unusual, for people."""
         return self._bag.notes
 
     def left_out(self, topic: str) -> tuple[str, ...]:
@@ -129,7 +129,7 @@ class BagStreams:
         return {"played": played, "clock": self.clock.kind}
 
     def facts(self) -> dict[str, str]:
-        """What a recording made of this bag says of it."""
+        """Returns the metadata that a recording made of this bag has of it."""
         repairs = {name: found.facts() for name, found in self.repairs.items()}
         return {
             "file": self.path.name,

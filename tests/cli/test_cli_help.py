@@ -70,7 +70,7 @@ def test_our_own_tracebacks_are_shown_only_when_asked_for(dataflow, small: Path,
     told = CliRunner().invoke(app, ["--traceback", "info", str(small)])
     assert told.exit_code == 2
     assert "Traceback (most recent call last)" in told.stderr
-    assert "is no bag" in told.stderr
+    assert "not an MCAP file" in told.stderr
 
 
 @pytest.mark.parametrize("asked", ["0", "1"])

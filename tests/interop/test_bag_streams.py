@@ -140,7 +140,7 @@ def test_what_cannot_be_opened_is_refused_with_a_reason(tmp_path: Path) -> None:
             open_bag(path)
         return str(caught.value)
 
-    assert "is no bag: it begins with 68 65" in refused("a.txt", b"hello")
+    assert "nor another kind of bag: it begins with 68 65" in refused("a.txt", b"hello")
     assert "it is empty" in refused("empty.mcap", b"")
     assert "rename it so that it ends in .bag" in refused("a.log", b"#ROSBAG V2.0\n")
     assert "a.bag" in refused("a.bag", b"#ROSBAG V2.0\n garbage")
