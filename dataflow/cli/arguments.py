@@ -30,7 +30,9 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
 ]
-GraphFile = Annotated[Path, typer.Argument(metavar="GRAPH", help="A graph file (.yaml).")]
+GraphFile = Annotated[
+    Path, typer.Argument(metavar="GRAPH", help="A graph file (.yaml), or the name of one of `dataflow graphs`.")
+]
 RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
 Start = Annotated[
     float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the recording's first message.")
@@ -79,6 +81,15 @@ def existing(path: Path, what: str) -> Path:
         raise fail(f"no file {path}: there is no folder {folder}")
     near = nearest(path.name, sorted(p.name for p in folder.iterdir() if p.is_file()))
     raise fail(f"no file {path}" + (f"; did you mean {folder / near}?" if near else f"; expected {what}"))
+
+
+def graph_file(path: Path) -> Path:
+    """`path` as a graph file: one that is there, or one that comes with dataflow, by its name."""
+    from dataflow.shipped import graph
+
+    if not path.exists() and (found := graph(path.as_posix().removeprefix("graphs/"))) is not None:
+        return found.path
+    return existing(path, "a graph file (dataflow graphs lists those that come with it)")
 
 
 def find_modules_in(folders: Sequence[Path] | None) -> None:

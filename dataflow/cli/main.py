@@ -12,7 +12,21 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli import inspection, latency, live, param, recordings, replay, run, top, verification, viewing
+from dataflow.cli import (
+    demo,
+    doctor,
+    inspection,
+    latency,
+    live,
+    logs,
+    param,
+    recordings,
+    replay,
+    run,
+    top,
+    verification,
+    viewing,
+)
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
@@ -92,12 +106,15 @@ def _add(
     to.command(name, rich_help_panel=panel, help=text, context_settings=dict(settings))(function)
 
 
+_add(demo.demo, _MAKE)
 _add(run.run, _MAKE)
 _add(replay.replay, _MAKE)
 _add(verification.verify, _MAKE)
 _add(inspection.check, _LOOK)
 _add(inspection.show, _LOOK)
+_add(doctor.doctor, _LOOK)
 _add(inspection.operators, _LOOK)
+_add(demo.graphs, _LOOK)
 _add(recordings.info, _LOOK)
 _add(recordings.diff, _LOOK)
 _add(latency.latency, _LOOK)
@@ -106,6 +123,7 @@ _add(live.list_running, _FOLLOW, "list")
 _add(live.echo, _FOLLOW)
 _add(live.hz, _FOLLOW)
 _add(top.top, _FOLLOW)
+_add(logs.logs, _FOLLOW)
 parameters = typer.Typer(no_args_is_help=True, help="Read and change the parameters of a running graph.")
 _add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
 _add(param.get, None, to=parameters)

@@ -23,6 +23,7 @@ from dataflow.messages.base import Message
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.pace import Pace
+from dataflow.process.speech import SOURCE_THREAD
 
 MISSED_AFTER = 0.2
 """Seconds after which a step of a restarted source counts as missed."""
@@ -50,7 +51,7 @@ class Reader:
         self._last: int | None = None
         self._owner, self._faults, self._behind = owner, faults, behind
         self._lost = 0
-        self._thread = threading.Thread(target=self._run, name=f"source {runner.node.name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"{SOURCE_THREAD}{runner.node.name}", daemon=True)
         self._thread.start()
 
     def join(self, timeout: float) -> bool:
