@@ -17,6 +17,7 @@ from dataflow.cli import (
     doctor,
     inspection,
     latency,
+    lint,
     live,
     logs,
     param,
@@ -118,6 +119,7 @@ _add(demo.graphs, _LOOK)
 _add(recordings.info, _LOOK)
 _add(recordings.diff, _LOOK)
 _add(latency.latency, _LOOK)
+_add(lint.lint, _LOOK)
 _add(viewing.view, _LOOK)
 _add(live.list_running, _FOLLOW, "list")
 _add(live.echo, _FOLLOW)

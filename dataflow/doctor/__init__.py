@@ -1,1 +1,1 @@
-"""What of this machine and this installation a graph needs, looked at: the checks behind `dataflow doctor`."""
+"""Looks at this machine and this installation for what a graph needs: the checks behind `dataflow doctor`."""

@@ -6,7 +6,7 @@ import json
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
 
 from dataflow.doctor.finding import Finding, State
@@ -35,10 +35,13 @@ _REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(?:\[[\w,-]+\])?\s*(?P<bounds>[^;]*
 _EXTRA = re.compile(r"extra\s*==\s*['\"](\w+)['\"]")
 
 _LOAD = """
-import importlib, json, sys
+import ctypes, importlib, importlib.util, json, sys
 found = {}
 for name in sys.argv[1:]:
     try:
+        if name == "open3d" and importlib.util.find_spec("libusb_package"):  # Open3D links to libusb
+            usb = importlib.import_module("libusb_package").get_library_path()
+            ctypes.CDLL(str(usb), mode=ctypes.RTLD_GLOBAL)
         module = importlib.import_module(name)
         found[name] = ""
         if name == "onnxruntime":
@@ -64,9 +67,8 @@ def _declared() -> list[str]:
         return []
 
 
-def check_versions(declared: list[str], version_of: object) -> Iterator[Finding]:
+def check_versions(declared: list[str], version_of: Callable[[str], str]) -> Iterator[Finding]:
     """A finding for every package that is missing or does not fit, and one for all that do."""
-    assert callable(version_of)
     fitting, missing = 0, dict[str, list[str]]()
     for text in declared:
         match = _REQUIREMENT.match(text)
@@ -76,7 +78,7 @@ def check_versions(declared: list[str], version_of: object) -> Iterator[Finding]
         extra = found[1] if found else ""
         name, bounds = match["name"], match["bounds"].strip(" ()")
         try:
-            installed = str(version_of(name))
+            installed = version_of(name)
         except PackageNotFoundError:
             if not extra:
                 hint = f"pip install '{name}{bounds}'"
@@ -85,10 +87,8 @@ def check_versions(declared: list[str], version_of: object) -> Iterator[Finding]
                 missing.setdefault(extra, []).append(name)
             continue
         if (broken := unmet(installed, bounds)) is not None:
-            state = State.WARNING
-            yield Finding(
-                GROUP, name, state, f"{installed} is installed; {broken} is needed", f"pip install '{name}{bounds}'"
-            )
+            text = f"{installed} is installed; {broken} is needed"
+            yield Finding(GROUP, name, State.WARNING, text, f"pip install '{name}{bounds}'")
         else:
             fitting += 1
     if not declared:
@@ -127,7 +127,7 @@ def load(modules: tuple[str, ...]) -> Mapping[str, str]:
     except subprocess.TimeoutExpired:
         return dict.fromkeys(modules, f"does not load within {LOAD_WITHIN:g} s, alone or with the others")
     try:
-        return dict(json.loads(done.stdout.rpartition("\n{")[2].join(("{", ""))))
+        return dict(json.loads(done.stdout.strip().rpartition("\n")[2]))
     except ValueError:
         last = (done.stderr.strip() or f"exit code {done.returncode}").rpartition("\n")[2]
         return {"libraries": f"loading them ended the process: {last}"}

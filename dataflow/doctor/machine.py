@@ -12,7 +12,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil  # type: ignore[import-untyped]
@@ -62,7 +62,7 @@ def check_system() -> Iterator[Finding]:
 
 
 def check_shared_memory() -> Iterator[Finding]:
-    """What processes of a run need of each other: sealed anonymous memory, eventfd, pidfd."""
+    """Tries what processes of a run need of each other: sealed anonymous memory, eventfd, pidfd."""
     group = "shared memory"
     try:
         descriptor = os.memfd_create("dataflow-doctor", os.MFD_ALLOW_SEALING)
@@ -76,7 +76,11 @@ def check_shared_memory() -> Iterator[Finding]:
         yield Finding(group, "memfd", State.FAULT, f"{_size(SHARED)} cannot be had: {error}", hint)
     else:
         yield Finding(group, "memfd", State.OK, f"{_size(SHARED)} of anonymous memory was given and taken back")
-    for name, make in (("eventfd", lambda: os.eventfd(0)), ("pidfd", lambda: os.pidfd_open(os.getpid()))):
+    makers: dict[str, Callable[[], int]] = {
+        "eventfd": lambda: os.eventfd(0),
+        "pidfd": lambda: os.pidfd_open(os.getpid()),
+    }
+    for name, make in makers.items():
         try:
             os.close(make())
         except (AttributeError, OSError) as error:
@@ -131,7 +135,7 @@ def check_clocks() -> Iterator[Finding]:
 
 
 def wall_clock() -> tuple[bool, float] | None:
-    """Whether the kernel's clock is synchronised, and the largest error (s) it may have; None where nobody knows."""
+    """Tells whether the kernel's clock is synchronised, and its largest error (s); None where nobody knows."""
     with contextlib.suppress(AttributeError, OSError):
         buffer = ctypes.create_string_buffer(512)  # struct timex, all zero: only read
         state = ctypes.CDLL(None, use_errno=True).adjtimex(buffer)

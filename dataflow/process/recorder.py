@@ -86,7 +86,7 @@ class RecorderSink:
         self._diagnosed += 1
 
     def log(self, line: LogLine) -> None:
-        """What is said before the first message is stored at its stamp, as the first firing records are."""
+        """A line that is said before the first message is stored at its stamp, as the first firing records are."""
         if self._clock > 0 or line.stamp is not None:
             self.writer.write_log(line.stamp or self._clock, line)
         else:

@@ -22,7 +22,7 @@ SUFFIX, OLDER = ".log", ".log.1"
 
 
 class Line(Protocol):
-    """What can be written to it."""
+    """A line that can be written to it."""
 
     def to_json(self) -> dict[str, Any]: ...
 
@@ -76,7 +76,7 @@ class LogFollower:
         self._rest: dict[Path, str] = {}
 
     def lines(self) -> Iterator[dict[str, Any]]:
-        """What is new since the last look, in the order of each file. Lines that cannot be read are left out."""
+        """Yields what is new since the last look, in the order of each file. Lines that cannot be read are left out."""
         folder = registry_folder()
         for path in sorted(folder.glob(f"{self._pid}-*{OLDER}")):
             if path not in self._open and path.with_suffix("") not in self._open:

@@ -48,7 +48,7 @@ def test_missing_and_old_packages_are_told_from_missing_extras() -> None:
         "gone>=3",
         "old>=2,<3",
         'open3d>=0.19; extra == "sim"',
-        'robot-dataflow[sim]; extra == "dev"',
+        'robot-dataflow[x]; extra == "dev"',
     ]
     found = list(check_versions(declared, version))
 
