@@ -20,6 +20,7 @@ from dataflow.cli import (
     lint,
     live,
     logs,
+    new,
     param,
     recordings,
     replay,
@@ -126,6 +127,11 @@ _add(live.echo, _FOLLOW)
 _add(live.hz, _FOLLOW)
 _add(top.top, _FOLLOW)
 _add(logs.logs, _FOLLOW)
+beginnings = typer.Typer(no_args_is_help=True, help="Begin an operator, a graph or a project, with tests that pass.")
+_add(new.operator, None, to=beginnings)
+_add(new.graph, None, to=beginnings)
+_add(new.project, None, to=beginnings)
+app.add_typer(beginnings, name="new", rich_help_panel=_MAKE)
 parameters = typer.Typer(no_args_is_help=True, help="Read and change the parameters of a running graph.")
 _add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
 _add(param.get, None, to=parameters)

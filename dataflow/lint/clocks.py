@@ -191,7 +191,7 @@ def agreed(differences: Mapping[str, ClockDifference], tolerance: float) -> str:
     """
     best, weight = "", 0.0
     for name, centre in differences.items():
-        near = {other: each for other, each in differences.items() if _agree(each.minus(centre), tolerance)}
+        near = {other: each for other, each in differences.items() if _agree(each, centre, tolerance)}
         total = sum(min(1.0, tolerance / (2 * each.offset_deviation + 1e-9)) for each in near.values())
         if total > weight * (1 + 1e-6):
             surest = min(near, key=lambda other: near[other].offset_deviation)
@@ -199,6 +199,7 @@ def agreed(differences: Mapping[str, ClockDifference], tolerance: float) -> str:
     return best
 
 
-def _agree(difference: ClockDifference, tolerance: float) -> bool:
-    apart = abs(difference.offset) + abs(difference.drift) * difference.duration / 2
-    return apart <= tolerance + 2 * difference.offset_deviation + difference.drift_deviation * difference.duration
+def _agree(one: ClockDifference, centre: ClockDifference, tolerance: float) -> bool:
+    """Tells whether one fits a centre, as far as its own uncertainty goes: an uncertain centre would fit them all."""
+    apart = abs(one.offset - centre.offset) + abs(one.drift - centre.drift) * one.duration / 2
+    return apart <= tolerance + 2 * one.offset_deviation + one.drift_deviation * one.duration
