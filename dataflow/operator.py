@@ -219,6 +219,9 @@ class Source(Operator, abstract=True):
         """Yields what is emitted at one stamp: a mapping from port to message. Stamps strictly increase."""
         raise TypeError(f"{type(self).__name__} is a source without stream()")
 
+    def stop_reading(self) -> None:
+        """Called on another thread when a live run ends: makes a `stream()` that waits for its device return."""
+
     def length(self) -> int | None:
         """Tells how many times `stream()` will yield, if known: for progress bars."""
         return None

@@ -11,6 +11,7 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, existing
+from dataflow.cli.completion import running_operators
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import INTERRUPTED, fail, friendly_errors, out, print_json_line, say
 
@@ -29,7 +30,13 @@ def logs(
     ] = None,
     operators: Annotated[
         list[str] | None,
-        typer.Option("--operator", "-o", metavar="NAME", help="Only this operator or process. May be repeated."),
+        typer.Option(
+            "--operator",
+            "-o",
+            metavar="NAME",
+            autocompletion=running_operators,
+            help="Only this operator or process. May be repeated.",
+        ),
     ] = None,
     level: Annotated[
         str, typer.Option("--level", metavar="LEVEL", help="Only this level and worse: " + ", ".join(LEVELS) + ".")

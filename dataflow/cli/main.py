@@ -13,6 +13,7 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli import (
+    completion,
     demo,
     doctor,
     inspection,
@@ -22,6 +23,7 @@ from dataflow.cli import (
     logs,
     new,
     param,
+    pub,
     recordings,
     replay,
     run,
@@ -115,6 +117,7 @@ _add(verification.verify, _MAKE)
 _add(inspection.check, _LOOK)
 _add(inspection.show, _LOOK)
 _add(doctor.doctor, _LOOK)
+_add(completion.completion, _LOOK)
 _add(inspection.operators, _LOOK)
 _add(demo.graphs, _LOOK)
 _add(recordings.info, _LOOK)
@@ -132,6 +135,7 @@ _add(new.operator, None, to=beginnings)
 _add(new.graph, None, to=beginnings)
 _add(new.project, None, to=beginnings)
 app.add_typer(beginnings, name="new", rich_help_panel=_MAKE)
+_add(pub.pub, _FOLLOW)
 parameters = typer.Typer(no_args_is_help=True, help="Read and change the parameters of a running graph.")
 _add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
 _add(param.get, None, to=parameters)
@@ -143,6 +147,7 @@ app.add_typer(parameters, name="param", rich_help_panel=_FOLLOW)
 
 def main() -> None:
     """Calls the command that the arguments name."""
+    completion.prepare()
     try:
         app()
     except OutputFailed:

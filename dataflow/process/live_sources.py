@@ -279,14 +279,25 @@ class LiveSources:
 
     def finish(self, reason: str) -> None:
         """Ends the streams of all sources; their threads are to stop."""
-        self.stopping.set()
+        self._stop_reading()
         for runner in self.runners:
             runner.finish(reason)
+
+    def _stop_reading(self) -> None:
+        """Tells all threads to stop, and sources that wait for a device to let go of it; once."""
+        if self.stopping.is_set():
+            return
+        self.stopping.set()
+        for runner in self.runners:
+            try:
+                runner.source.stop_reading()
+            except Exception as error:  # its thread may return all the same, and the run ends anyway
+                print(f"{runner.node.name}: stop_reading(): {type(error).__name__}: {error}", file=sys.stderr)
 
     def await_readers(self) -> tuple[set[str], list[OperatorFailure]]:
         """Waits (bounded) for the threads; returns the sources whose thread did not return, and what went wrong in
         those that did."""
-        self.stopping.set()
+        self._stop_reading()
         deadline = time.monotonic() + RETURN_WITHIN
         late = {name for name, reader in self._readers.items() if not reader.join(deadline - time.monotonic())}
         for name in sorted(late):
