@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dataflow.cli.completion import shipped_graphs
 from dataflow.cli.output import fail, seconds
 
 if TYPE_CHECKING:
@@ -31,7 +32,12 @@ Settings = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
 ]
 GraphFile = Annotated[
-    Path, typer.Argument(metavar="GRAPH", help="A graph file (.yaml), or the name of one of `dataflow graphs`.")
+    Path,
+    typer.Argument(
+        metavar="GRAPH",
+        autocompletion=shipped_graphs,
+        help="A graph file (.yaml), or a name that `dataflow graphs` lists.",
+    ),
 ]
 RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
 Start = Annotated[

@@ -42,6 +42,16 @@ def test_a_proposed_contract_is_kept_and_a_stricter_one_is_not(demo: Path, tmp_p
     assert "error   contract  robot/imu: is of type Imu; the contract wants Imu2" in told
 
 
+def test_the_contract_on_the_page_can_be_read(repository: Path, tmp_path: Path) -> None:
+    page = (repository / "docs" / "recordings.md").read_text(encoding="utf-8")
+    file = tmp_path / "robot.yaml"
+    file.write_text(page.split("```yaml\ncontract")[1].split("```")[0].join(("contract", "")))
+    contract = load_contract(file)
+    assert contract.terms_of("robot1/robot/imu", "robot1").max_gap == pytest.approx(0.03)
+    assert contract.terms_of("robot1/camera/left", "robot1").allow == ("gap",)
+    assert contract.clocks.max_offset == pytest.approx(0.01)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
