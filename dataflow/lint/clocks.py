@@ -57,8 +57,8 @@ class ClockDifference:
             float(np.hypot(self.offset_deviation, other.offset_deviation)),
             self.drift - other.drift,
             float(np.hypot(self.drift_deviation, other.drift_deviation)),
-            self.duration,
-            self.likeness,
+            max(self.duration, other.duration),
+            min(self.likeness, other.likeness),
         )
 
 

@@ -19,7 +19,8 @@ from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
 from dataflow.remote import Remote
 from dataflow.transport import Bus
-from dataflow.transport.codec import DecodeError, decode
+from dataflow.transport.codec import decode
+from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import runtime_key
 
 
