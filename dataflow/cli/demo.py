@@ -38,6 +38,7 @@ def demo(
         ),
     ] = 21.0,
     quiet: Quiet = False,
+    json: Json = False,
 ) -> None:
     """Show a robot's perception at work: the bundled recording through all operators, in the viewer.
 
@@ -74,9 +75,11 @@ def demo(
             outputs,
             None,
             began=began,
-            json=False,
+            json=json,
             quiet=quiet,
         )
+    if json:
+        return
     if outputs.view_file is not None:
         out.print(Text(f"look at it where there is a display: rerun {outputs.view_file}"), soft_wrap=True)
     out.print(Text(f"the graph: dataflow graphs {GRAPH}; all graphs: dataflow graphs"), soft_wrap=True)
