@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, Overwrite, RecordingFile, existing, output_file
+from dataflow.cli.arguments import FLAG, AnyRecording, Json, Overwrite, existing, existing_recording, output_file
 from dataflow.cli.output import DIFFERENT, count, fail, friendly_errors, out, plural, print_json, table
 
 if TYPE_CHECKING:
     from dataflow.lint.look import Report
+    from dataflow.lint.material import Material
 
 _STYLES = {"error": "bold red", "warning": "yellow", "note": "dim"}
 
 
 def lint(
-    recording: RecordingFile,
+    recording: AnyRecording,
     contract: Annotated[
         Path | None,
         typer.Option("--contract", metavar="FILE.yaml", help="What the recording has to hold, kept with your code."),
@@ -51,11 +54,10 @@ def lint(
       dataflow lint run.mcap
       dataflow lint run.mcap --write-contract robot.yaml
       dataflow lint run.mcap --contract robot.yaml --json
+      dataflow lint rosbag2_folder --quick
     """
     from dataflow.lint.contract import ContractError, load_contract, proposed
     from dataflow.lint.look import lint as look
-    from dataflow.lint.material import RecordedMaterial
-    from dataflow.recording import Recording
 
     with friendly_errors():
         if write is not None:
@@ -64,8 +66,7 @@ def lint(
             terms = None if contract is None else load_contract(existing(contract, "a contract"))
         except ContractError as error:
             raise fail(str(error)) from None
-        with Recording(existing(recording, "a recording")) as opened:
-            material = RecordedMaterial(opened)
+        with _material(existing_recording(recording)) as material:
             report = look(material, terms, clocks=not quick)
             if write is not None:
                 name, namespace = recording.stem, material.namespace
@@ -74,11 +75,27 @@ def lint(
     if json:
         print_json(report.to_json())
     else:
-        _print(report, f"{material.namespace}/")
+        _print(report, f"{material.namespace}/" if material.namespace else "")
         if write is not None:
             out.print(Text(f"wrote {write}: look it over, and keep it with your code"), soft_wrap=True)
     if not report.sound:
         raise typer.Exit(DIFFERENT)
+
+
+@contextmanager
+def _material(path: Path) -> Iterator[Material]:
+    """A recording of ours, or a bag."""
+    from dataflow.interop.opening import is_foreign, open_bag
+    from dataflow.lint.bags import BagMaterial
+    from dataflow.lint.material import RecordedMaterial
+    from dataflow.recording import Recording
+
+    if is_foreign(path):
+        with closing(open_bag(path)) as bag:
+            yield BagMaterial(bag)
+    else:
+        with Recording(path) as opened:
+            yield RecordedMaterial(opened)
 
 
 def _print(report: Report, prefix: str) -> None:
