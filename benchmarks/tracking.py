@@ -193,9 +193,7 @@ def main() -> None:
     made = sequences(truths(options.venv, 600, 20), range(REPORTED, REPORTED + options.seeds))
     figures = judged(options.venv, made, {"ours": BoxTrackerSettings()}, peers)
     print(f"{len(made)} sequences, {sum(len(s['frames']) for s in made.values())} frames")
-    print(
-        "| tracker | HOTA | IDF1 | MOTA | worst HOTA | ours - it: HOTA | IDF1 | MOTA |\n| --- " * 1 + "| --- " * 7 + "|"
-    )
+    print("| tracker | HOTA | IDF1 | MOTA | worst HOTA | ours - it: HOTA | IDF1 | MOTA |\n" + "| --- " * 8 + "|")
     for label, found in figures.items():
         row = [f"{mean(found, m):.3f}" for m in ("HOTA", "IDF1", "MOTA")]
         row.append(f"{min(f['HOTA'] for f in found.values()):.3f}")

@@ -134,7 +134,7 @@ class BoxTracker3D:
 
     def _noise(self, found: Solids, k: int) -> Array:
         floor = np.eye(3) * (self._settings.position * (2 - found.scores[k])) ** 2
-        return floor if found.covariances is None else floor + found.covariances[k]
+        return np.asarray(floor if found.covariances is None else floor + found.covariances[k])
 
     def _matches(self, rows: list[int], columns: list[int], found: Solids) -> dict[int, int]:
         if not rows or not columns:

@@ -134,7 +134,7 @@ class MultiObjectTracker(Operator):
             self._counts["features not used"] += features is not None
             return None
         vectors = features.vectors[rows].astype(np.float64)
-        return vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12)
+        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
 
     def _message(self, detections: Detections2D, tracks: list[BoxTrack]) -> Tracks:
         now = detections.stamp
