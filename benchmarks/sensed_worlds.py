@@ -74,18 +74,10 @@ def sense(kind: str, seed: int) -> World:
     )
     for operator in (robot, builder, detector, segmenter):
         operator.setup()
-    static: dict[str, Any] = {}
-    latest: dict[str, Any] = {}
+    static: dict[str, Any] = dict(robot.static_outputs())
     frames = []
     for messages in robot.stream():
-        static |= {k: m for k, m in messages.items() if k in ("image_info", "depth_info", "extrinsics")}
-        for name, message in messages.items():
-            latest[name] = message
-        names = ("image", "depth", "ground_truth", "true_base", "objects", "boxes", "masks", "scene", "activities")
-        if not all(n in latest for n in names) or len({latest[n].stamp for n in names}) > 1:
-            continue
-        m = latest
-        latest = {}
+        m: dict[str, Any] = dict(messages)
         cloud = builder.process(
             m["depth"], m["image"], static["depth_info"], static["image_info"], static["extrinsics"]
         )
@@ -96,7 +88,7 @@ def sense(kind: str, seed: int) -> World:
                 cloud=cloud,
                 camera=m["ground_truth"],
                 base=m["true_base"],
-                **{n: m[n] for n in names[4:]},
+                **{n: m[n] for n in ("objects", "boxes", "masks", "scene", "activities")},
             )
         )
     robot.close()
