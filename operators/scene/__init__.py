@@ -1,5 +1,6 @@
 """Objects in space, the map of what is where, and the graph of how things relate."""
 
 from operators.scene.object_lifter import ObjectLifter
+from operators.scene.semantic_map import SemanticMap
 
-__all__ = ["ObjectLifter"]
+__all__ = ["ObjectLifter", "SemanticMap"]

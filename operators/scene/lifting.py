@@ -69,9 +69,17 @@ def lift(
     reach beyond the box do not. Points go to the box that they fit best, once.
     """
     candidates: list[Lifted] = []
+    inside = np.flatnonzero(seen.inside)
+    order = inside[np.argsort(seen.pixels[inside, 0], kind="stable")]
+    columns = seen.pixels[order, 0]
     for k, box in enumerate(boxes):
-        rows = np.flatnonzero(seen.inside & _within(seen.pixels, box))
-        rows = _foreground(seen, rows, box, mask_classes[k], background, s)
+        size = (box[2:] - box[:2]) * 0.15 + 2
+        first, last = np.searchsorted(columns, [box[0] - size[0], box[2] + size[0]], side="left")
+        near = order[first:last]
+        v = seen.pixels[near, 1]
+        near = near[(v >= box[1] - size[1]) & (v <= box[3] + size[1])]
+        own = _within(seen.pixels[near], box)
+        rows = _foreground(seen, np.sort(near[own]), near[~own], mask_classes[k], background, s)
         found = _object(seen, rows, box, s)
         if found is not None:
             candidates.append(Lifted(k, found[0], shape_of(seen.points[found[0]], seen.up), found[1]))
@@ -92,7 +100,7 @@ def _within(pixels: Array, box: Array) -> Mask:
 
 
 def _foreground(
-    seen: Seen, rows: Indices, box: Array, wanted: int, background: Sequence[int], s: LiftSettings
+    seen: Seen, rows: Indices, ring: Indices, wanted: int, background: Sequence[int], s: LiftSettings
 ) -> Indices:
     if seen.classes is not None and wanted >= 0:
         of_class = rows[seen.classes[rows] == wanted]
@@ -100,17 +108,12 @@ def _foreground(
             return of_class
     if seen.classes is not None:
         rows = rows[~np.isin(seen.classes[rows], background)]
-    return _off_support(seen, rows, box, s)
+    return _off_support(seen, rows, ring, s)
 
 
-def _off_support(seen: Seen, rows: Indices, box: Array, s: LiftSettings) -> Indices:
-    """Returns the points that are not on a level surface which goes on beside the box."""
-    if not len(rows):
-        return rows
-    size = (box[2:] - box[:2]) * 0.15 + 2
-    wide = np.concatenate([box[:2] - size, box[2:] + size])
-    ring = np.flatnonzero(seen.inside & _within(seen.pixels, wide) & ~_within(seen.pixels, box))
-    if len(ring) < s.min_points:
+def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> Indices:
+    """Returns the points that are not on a level surface which goes on in the ring around the box."""
+    if not len(rows) or len(ring) < s.min_points:
         return rows
     heights, around = seen.points[rows] @ seen.up, seen.points[ring] @ seen.up
     near = np.abs(np.linalg.norm(seen.points[ring], axis=1) - np.median(np.linalg.norm(seen.points[rows], axis=1))) < 1
@@ -147,8 +150,9 @@ def _object(seen: Seen, rows: Indices, box: Array, s: LiftSettings) -> tuple[Ind
 
 
 def _image_overlap(seen: Seen, rows: Indices, box: Array) -> float:
-    uv = seen.pixels[rows]
-    own = np.concatenate([np.percentile(uv, 1, axis=0), np.percentile(uv, 99, axis=0)])
+    uv = np.sort(seen.pixels[rows], axis=0)
+    cut = len(rows) // 100  # one in a hundred may stray
+    own = np.concatenate([uv[cut], uv[len(rows) - 1 - cut]])
     return float(overlap(own[None], box[None])[0, 0])
 
 

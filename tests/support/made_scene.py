@@ -35,7 +35,7 @@ def camera(stamp: int, position: Sequence[float] = (0, 0, 1.0), yaw: float = 0.0
 def look(
     pose: Pose, solids: Sequence[Solid], *, wall: float = 5.0, noise: float = 0.0, score: float = 0.9
 ) -> tuple[PointCloud, Detections2D, SegmentationMap]:
-    """Casts a ray through every second pixel at the floor, a wall and boxes; detects what has 20 such pixels or more."""
+    """Casts a ray through every second pixel at the floor, a wall and boxes; detects what shows 20 of them."""
     T = pose.matrix()
     u, v = np.meshgrid(np.arange(0, WIDTH, 2.0), np.arange(0, HEIGHT, 2.0))
     rays = np.stack([(u - 159.5) / FOCAL, (v - 119.5) / FOCAL, np.ones_like(u)], axis=-1).reshape(-1, 3) @ T[:3, :3].T

@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_scene import INFO, Solid, camera, look
 
 from dataflow.firing.failure import OperatorFailure
 from dataflow.messages import Boxes3D, CameraInfo, Clusters, Diagnostics, PointCloud, Transforms
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter
-from made_scene import INFO, Solid, camera, look
 
 CRATE: Solid = ((2.5, 0.4, 0.25), (0.5, 0.4, 0.5), 0.4, 0)
 BEHIND: Solid = ((3.6, 0.1, 0.4), (0.5, 0.5, 0.8), 0.0, 0)
