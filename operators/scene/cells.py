@@ -72,7 +72,7 @@ class Cells:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""
         if not len(self):
             return self.points
-        least = 0.2 * float(np.percentile(self.hits, 75))
+        least = 0.3 * float(np.percentile(self.hits, 75))
         return self.points[(self.hits >= least) & (self.hits > self.free)]
 
     def near(self, points: Array, distance: float) -> float:

@@ -173,7 +173,7 @@ class ObjectMap:
             return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
         if self.is_mover(object) or each.class_id in self._movers:
             return 0.0
-        loose = float(np.clip(0.25 * np.linalg.norm(np.ptp(cells.points, axis=0)), s.voxel, 0.12))
+        loose = _tolerance(np.ptp(cells.points, axis=0))
         if same:
             share = object.cells.near(cells.points, loose)
             return 0.9 * share + 0.1 * _color_likeness(each.color, object.color) if share >= s.overlap else 0.0
@@ -270,8 +270,7 @@ class ObjectMap:
         if a.class_id == b.class_id:
             if all(movers):
                 return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-            loose = float(np.clip(0.2 * np.linalg.norm(small.size), s.voxel, 0.1))
-            return large.cells.near(small.cells.points, loose) >= 0.4
+            return large.cells.near(small.cells.points, _tolerance(small.size)) >= 0.4
         if any(movers):
             return False
         shares = (a.cells.near(b.cells.points, s.voxel), b.cells.near(a.cells.points, s.voxel))
@@ -314,6 +313,11 @@ class ObjectMap:
         for stamp, row in state["gone"]:
             old = _unpacked(row, side)
             self.gone[old.id] = (int(stamp), old)
+
+
+def _tolerance(extent: Array) -> float:
+    """Returns how near points of one object are: a third of its middle extent, so that rows of books stay apart."""
+    return float(np.clip(0.35 * np.sort(extent)[1], 0.015, 0.12))
 
 
 def _direction(eye: Array, cells: Cells) -> Array:
