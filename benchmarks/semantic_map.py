@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from sensed_worlds import World, sensed
 
-from dataflow.messages import Boxes3D, Detections2D, SegmentationMap
+from dataflow.messages import Boxes3D, Detections2D, SceneGraph, SegmentationMap
 from dataflow.messages.geometry import yaw_of
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.box_overlap import upright_iou
@@ -26,12 +26,12 @@ from operators.scene.box_overlap import upright_iou
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5
 
 
-def mapped(world: World, *, true: bool, **params: Any) -> tuple[list[Boxes3D], list[Boxes3D]]:
-    """Returns what was lifted from each frame (in the world) and the map after each."""
+def mapped(world: World, *, true: bool, **params: Any) -> tuple[list[Boxes3D], list[SceneGraph]]:
+    """Returns the map after each frame, as boxes and as nodes."""
     lifter, known = ObjectLifter(), SemanticMap(**params)
     lifter.setup()
     known.setup()
-    lifted, maps = [], []
+    maps, nodes = [], []
     for frame in world.frames:
         detections: Detections2D = frame.objects if true else frame.detections
         masks: SegmentationMap = frame.masks if true else frame.segmentation
@@ -39,9 +39,10 @@ def mapped(world: World, *, true: bool, **params: Any) -> tuple[list[Boxes3D], l
             enough = (frame.objects.visible >= 0.2) & (frame.objects.pixel_counts >= 100)
             detections = chosen(frame.objects, enough)
         found = lifter.process(detections, frame.cloud, world.image_info, world.extrinsics, masks, frame.camera)
-        lifted.append(found["boxes"])
-        maps.append(known.process(found["boxes"], found["clusters"], frame.cloud, frame.camera)["objects"])
-    return lifted, maps
+        made = known.process(found["boxes"], found["clusters"], frame.cloud, frame.camera)
+        maps.append(made["objects"])
+        nodes.append(made["nodes"])
+    return maps, nodes
 
 
 def chosen(objects: Detections2D, rows: Any) -> Detections2D:
@@ -139,7 +140,7 @@ def main() -> None:
     figures: dict[bool, list[Any]] = {True: [], False: []}
     for world in sensed(range(options.first, options.first + options.worlds), options.cache):
         for true in (True, False):
-            result = scored(world, mapped(world, true=true)[1][-1])
+            result = scored(world, mapped(world, true=true)[0][-1])
             figures[true].append(result)
             print(
                 f"{world.name} {'truth-fed' if true else 'sensors'}: {result['must']} objects, "

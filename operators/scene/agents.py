@@ -144,4 +144,4 @@ class GoalInference:
     @staticmethod
     def _near(here: Array, candidate: Body) -> float:
         """Returns the prior cost of a candidate: nearer ones are likelier."""
-        return 0.4 * float(np.hypot(*(candidate.center[:2] - here)))
+        return 2.0 * float(np.hypot(*(candidate.center[:2] - here)))

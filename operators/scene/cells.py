@@ -23,14 +23,19 @@ def keys_of(points: Array, side: float) -> Keys:
 
 
 class Cells:
-    """A set of voxels with the mean of the points in each, the views that saw it (`hits`) and saw through it."""
+    """A set of voxels with the mean of the points in each, and counts of views.
+
+    `hits` are the views in which it was the object's, `other` those in which the object was seen and this surface too,
+    as something else, `free` those that saw through it.
+    """
 
     def __init__(self, side: float) -> None:
         self.side = side
-        self._keys = np.zeros(0, np.int64)
-        self.points = np.zeros((0, 3))
-        self.hits = np.zeros(0)
-        self.free = np.zeros(0)
+        self._keys: Keys = np.zeros(0, np.int64)
+        self.points: Array = np.zeros((0, 3))
+        self.hits: Array = np.zeros(0)
+        self.free: Array = np.zeros(0)
+        self.other: Array = np.zeros(0)
         self._tree: cKDTree | None = None
 
     @classmethod
@@ -40,8 +45,8 @@ class Cells:
         keys = keys_of(points, side)
         made._keys, of, counts = np.unique(keys, return_inverse=True, return_counts=True)
         sums = np.stack([np.bincount(of, column, len(counts)) for column in points.T], axis=1)
-        made.points = sums / counts[:, None]
-        made.hits, made.free = np.ones(len(counts)), np.zeros(len(counts))
+        made.points = np.asarray(sums / counts[:, None])
+        made.hits, made.free, made.other = np.ones(len(counts)), np.zeros(len(counts)), np.zeros(len(counts))
         return made
 
     def __len__(self) -> int:
@@ -52,11 +57,12 @@ class Cells:
         keys, of = np.unique(np.concatenate([self._keys, other._keys]), return_inverse=True)
         hits = np.concatenate([self.hits, other.hits])
         weighted = np.concatenate([self.points, other.points]) * hits[:, None]
-        self.hits = np.bincount(of, hits, len(keys))
+        self.hits = np.asarray(np.bincount(of, hits, len(keys)))
         sums = np.stack([np.bincount(of, column, len(keys)) for column in weighted.T], axis=1)
         self.points = sums / np.maximum(self.hits, 1e-9)[:, None]
         # a voxel that is seen again was not free after all
         self.free = np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)).clip(min=0)
+        self.other = np.bincount(of, np.concatenate([self.other, other.other]), len(keys))
         self._keys, self._tree = keys, None
 
     def carve(self, free: NDArray[np.bool_]) -> None:
@@ -65,15 +71,27 @@ class Cells:
         gone = (self.free >= 3) & (self.free > 0.5 * self.hits)
         if gone.any():
             self._keys, self.points = self._keys[~gone], self.points[~gone]
-            self.hits, self.free = self.hits[~gone], self.free[~gone]
+            self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
             self._tree = None
+
+    def doubt(self, confirmed: NDArray[np.bool_], points: Array) -> None:
+        """Counts the confirmed voxels that are not near the points (N, 3) which the object showed in the same view."""
+        if len(points) and confirmed.any():
+            apart, _ = cKDTree(points).query(self.points, distance_upper_bound=1.5 * self.side)
+            self.other = self.other + (confirmed & ~np.isfinite(apart))
 
     def sure(self) -> Array:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""
         if not len(self):
             return self.points
-        least = 0.3 * float(np.percentile(self.hits, 75))
-        return self.points[(self.hits >= least) & (self.hits > self.free)]
+        least = 0.25 * float(np.percentile(self.hits, 75))
+        kept = (self.hits >= least) & (self.hits > self.free) & (self.hits >= self.other)
+        return self.points[kept] if kept.any() else self.points
+
+    @property
+    def middle(self) -> Array:
+        """Mean (3,) of the voxels."""
+        return np.asarray(self.points.mean(axis=0))
 
     def near(self, points: Array, distance: float) -> float:
         """Returns the share of points (N, 3), of 100 of many, that lie within a distance of a voxel's mean."""
@@ -93,12 +111,13 @@ class Cells:
         return bool((low - high <= distance).all())
 
     def snapshot(self) -> dict[str, Any]:
-        return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free}
+        return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free, "other": self.other}
 
     def restore(self, state: dict[str, Any]) -> None:
         self._keys = np.array(state["keys"], np.int64)
         self.points = np.array(state["points"], np.float64).reshape(-1, 3)
         self.hits, self.free = np.array(state["hits"], np.float64), np.array(state["free"], np.float64)
+        self.other = np.array(state["other"], np.float64)
         self._tree = None
 
 

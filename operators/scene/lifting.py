@@ -78,8 +78,8 @@ def lift(
         near = order[first:last]
         v = seen.pixels[near, 1]
         near = near[(v >= box[1] - size[1]) & (v <= box[3] + size[1])]
-        own = _within(seen.pixels[near], box)
-        rows = _foreground(seen, np.sort(near[own]), near[~own], mask_classes[k], background, s)
+        inner = _within(seen.pixels[near], box)
+        rows = _foreground(seen, np.sort(near[inner]), near[~inner], mask_classes[k], background, s)
         found = _object(seen, rows, box, s)
         if found is not None:
             candidates.append(Lifted(k, found[0], shape_of(seen.points[found[0]], seen.up), found[1]))
@@ -105,7 +105,7 @@ def _foreground(
     if seen.classes is not None and wanted >= 0:
         of_class = rows[seen.classes[rows] == wanted]
         if len(of_class) >= max(s.min_points, s.mask_share * len(rows)):
-            return of_class
+            return np.asarray(of_class)
     if seen.classes is not None:
         rows = rows[~np.isin(seen.classes[rows], background)]
     return _off_support(seen, rows, ring, s)

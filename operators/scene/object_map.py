@@ -33,7 +33,8 @@ class MapSettings:
     views: int = 3
     vacated: float = 1.0
     missed: float = 0.12
-    miss_range: float = 3.5
+    miss_angle: float = 0.1
+    gain: float = 0.3
     mover_reach: float = 0.5
     mover_speed: float = 1.5
     mover_memory: float = 8.0
@@ -133,10 +134,11 @@ class ObjectMap:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 self._begin(each, cells[k], stamp, view.origin)
-        matched = set(joined.values())
+        shown = {i: k for k, i in joined.items()}
         for object in list(self.objects.values()):
             if object.born != stamp:
-                self._look(object, view, object.id in matched, seconds)
+                own = cells[shown[object.id]].points if object.id in shown else None
+                self._look(object, view, own, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
 
@@ -176,7 +178,9 @@ class ObjectMap:
         loose = _tolerance(np.ptp(cells.points, axis=0))
         if same:
             share = object.cells.near(cells.points, loose)
-            return 0.9 * share + 0.1 * _color_likeness(each.color, object.color) if share >= s.overlap else 0.0
+            close = _closeness(cells, object.cells)
+            alike = _color_likeness(each.color, object.color)
+            return 0.5 * share + 0.4 * close + 0.1 * alike if share >= s.overlap and close > 0 else 0.0
         if float(np.abs(object.size - np.ptp(cells.points, axis=0)).max()) > 0.5 * float(object.size.max()):
             return 0.0
         share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
@@ -197,7 +201,7 @@ class ObjectMap:
         else:
             object.cells.add(cells)
         object.votes[each.class_id] += each.score
-        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score), _MOST)
+        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), _MOST)
         object.seen = stamp
         if each.color is not None:
             known = np.isfinite(object.color).all()
@@ -208,7 +212,7 @@ class ObjectMap:
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
         votes[each.class_id] = each.score
-        made = MapObject(self._next, cells, votes, _log_odds(each.score), stamp, stamp)
+        made = MapObject(self._next, cells, votes, _log_odds(each.score, self._settings.gain), stamp, stamp)
         if each.color is not None:
             made.color = each.color
         made.view = _direction(eye, cells)
@@ -216,8 +220,8 @@ class ObjectMap:
         self.objects[made.id] = made
         self._next += 1
 
-    def _look(self, object: MapObject, view: RangeView, matched: bool, seconds: float) -> None:
-        """Takes what a view says of an object's place."""
+    def _look(self, object: MapObject, view: RangeView, own: Array | None, seconds: float) -> None:
+        """Takes what a view says of an object's place; `own` are its points (N, 3) in this view, None for none."""
         s = self._settings
         if not len(object.cells):
             object.evidence = -1.0
@@ -225,9 +229,11 @@ class ObjectMap:
         sight = view.of(object.cells.points, s.margin)
         looked = int(sight.looked.sum())
         if not self.is_mover(object):
+            if own is not None:
+                object.cells.doubt(view.of(object.cells.points, 0.5 * s.margin).confirmed, own)
             object.cells.carve(sight.free)
             object.most = max(object.most, len(object.cells))
-        if matched:
+        if own is not None:
             return
         if len(object.cells) < _LEFT * object.most:
             object.evidence = -1.0
@@ -238,7 +244,7 @@ class ObjectMap:
         distance = float(np.linalg.norm(object.center - view.origin))
         if sight.free.sum() >= 0.6 * looked:
             object.evidence -= s.vacated * (3 if self.is_mover(object) else 1)
-        elif sight.confirmed.sum() >= 0.6 * len(sight.looked) and distance <= s.miss_range:
+        elif sight.confirmed.sum() >= 0.6 * len(sight.looked) and object.size.max() >= s.miss_angle * distance:
             object.evidence -= s.missed
 
     def _join_doubles(self, changed: list[int]) -> None:
@@ -270,7 +276,8 @@ class ObjectMap:
         if a.class_id == b.class_id:
             if all(movers):
                 return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-            return large.cells.near(small.cells.points, _tolerance(small.size)) >= 0.4
+            near = large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel)
+            return near >= 0.5 and _closeness(small.cells, large.cells) > 0.3
         if any(movers):
             return False
         shares = (a.cells.near(b.cells.points, s.voxel), b.cells.near(a.cells.points, s.voxel))
@@ -320,15 +327,24 @@ def _tolerance(extent: Array) -> float:
     return float(np.clip(0.35 * np.sort(extent)[1], 0.015, 0.12))
 
 
+def _closeness(cells: Cells, known: Cells) -> float:
+    """Returns 1 for small things whose middles agree, 0 for ones a middle extent apart; 0.5 for what may be a part."""
+    extent = np.sort(np.ptp(cells.points, axis=0))
+    if extent[2] > 0.4:
+        return 0.5
+    away = float(np.linalg.norm(cells.middle - known.middle))
+    return max(0.0, 1 - away / (max(float(extent[1]), 0.03) + 0.02))
+
+
 def _direction(eye: Array, cells: Cells) -> Array:
     """Returns the horizontal direction (2,) from the viewer to an object."""
     way = (cells.points.mean(axis=0) - eye)[:2]
     return np.asarray(way / max(float(np.hypot(*way)), 1e-6))
 
 
-def _log_odds(score: float) -> float:
+def _log_odds(score: float, least: float) -> float:
     bounded = min(max(score, 0.02), 0.95)
-    return max(math.log(bounded / (1 - bounded)), 0.1)
+    return max(math.log(bounded / (1 - bounded)), least)
 
 
 def _color_likeness(first: Array | None, second: Array) -> float:
@@ -355,5 +371,5 @@ def _packed(object: MapObject) -> dict[str, Any]:
 def _unpacked(state: Mapping[str, Any], side: float) -> MapObject:
     cells = Cells(side)
     cells.restore(state["cells"])
-    arrays = {name: np.array(state[name], np.float64) for name in _ARRAYS}
-    return MapObject(cells=cells, **{name: state[name] for name in _PLAIN}, **arrays)
+    fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
+    return MapObject(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)

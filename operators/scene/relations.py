@@ -140,7 +140,7 @@ def _close_pairs(things: Sequence[Body], reach: float) -> dict[int, list[Body]]:
     close: dict[int, list[Body]] = {}
     for k, body in enumerate(things):
         apart = np.linalg.norm(centers - centers[k], axis=1) - radii - radii[k]
-        close[body.id] = [things[j] for j in np.flatnonzero(apart <= reach) if j != k]
+        close[body.id] = [things[j] for j in np.flatnonzero(apart <= reach).tolist() if j != k]
     return close
 
 

