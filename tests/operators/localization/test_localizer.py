@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_room import Drive, mounts, room
 
 from dataflow.messages import LandmarkSightings, OccupancyGrid, PointCloud, Pose
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.testing import Played, play
 from operators.localization import ParticleFilterLocalizer
 from operators.localization.map_file import read_map, write_map
-from tests.operators.localization.made_room import Drive, mounts, room
 
 
 def localized(drive: Drive, sensors: dict[str, Any], **params: Any) -> tuple[Played, ParticleFilterLocalizer]:
