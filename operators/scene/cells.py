@@ -61,7 +61,7 @@ class Cells:
         sums = np.stack([np.bincount(of, column, len(keys)) for column in weighted.T], axis=1)
         self.points = sums / np.maximum(self.hits, 1e-9)[:, None]
         # a voxel that is seen again was not free after all
-        self.free = np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)).clip(min=0)
+        self.free = np.maximum(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)), 0.0)
         self.other = np.bincount(of, np.concatenate([self.other, other.other]), len(keys))
         self._keys, self._tree = keys, None
 
