@@ -1,4 +1,4 @@
-"""What is done with every image of one camera: undistorted, turned, cropped, scaled, its brightness made even."""
+"""Preparation of the images of one camera: undistorted, turned, cropped, scaled, its brightness made even."""
 
 from __future__ import annotations
 
