@@ -16,12 +16,13 @@ from dataflow.messages import (
     Detections2D,
     Image,
     Message,
+    RelativeDepth,
     SegmentationMap,
     Tracks,
 )
 
 COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
-DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth)
+DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 
 _TRUTH = {"truth", "groundtruth", "gt"}

@@ -3,5 +3,6 @@
 from operators.odometry.lidar_odometry import LidarOdometry
 from operators.odometry.stereo_visual_odometry import StereoVisualOdometry
 from operators.odometry.visual_odometry import VisualOdometry
+from operators.odometry.wheel_odometry import WheelOdometry
 
-__all__ = ["LidarOdometry", "StereoVisualOdometry", "VisualOdometry"]
+__all__ = ["LidarOdometry", "StereoVisualOdometry", "VisualOdometry", "WheelOdometry"]
