@@ -30,7 +30,7 @@ class MapSettings:
     margin: float = 0.1
     bin: float = 0.012
     overlap: float = 0.25
-    confirm: float = 2.0
+    confirm: float = 1.0
     views: int = 3
     vacated: float = 1.0
     missed: float = 0.12
