@@ -110,7 +110,8 @@ class ConsistencyMetrics(Operator):
         self._figures[f"{name}_nees_mean"] = float(ratio.mean())
         self._figures[f"{name}_nees_median"] = float(np.median(ratio))
         self._figures[f"{name}_above_95_percent"] = float((found > chi2.ppf(0.95, freedom)).mean() * 100)
-        chosen_samples, last = [], -self.apart
+        chosen_samples: list[int] = []
+        last = 0
         for k, stamp in enumerate(times):
             if not chosen_samples or stamp - last >= self.apart:
                 chosen_samples.append(k)
