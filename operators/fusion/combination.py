@@ -32,7 +32,7 @@ class Place:
 
     def pull(self, point: Array) -> tuple[Array, Array]:
         """Returns the way (3,) from a point to where the sensor puts it, and its information (3, 3)."""
-        return self.position - point, np.linalg.inv(self.covariance)
+        return self.position - point, inverted(self.covariance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,6 +62,11 @@ class RigidPose:
     information: Array
 
 
+def inverted(matrix: Array) -> Array:
+    """Returns the inverse (N, N): covariance of an information, and the other way round."""
+    return np.asarray(np.linalg.inv(matrix), np.float64)
+
+
 def placed(seen: Sequence[Place | Bearing], largest: float = 5.0) -> tuple[Array, Array]:
     """Returns the position (3,) that explains all best, and its covariance (3, 3).
 
@@ -80,7 +85,7 @@ def placed(seen: Sequence[Place | Bearing], largest: float = 5.0) -> tuple[Array
             break
     if any(float(one.direction @ (point - one.origin)) <= 0 for one in seen if isinstance(one, Bearing)):
         raise Unknown("bearings that cross behind a sensor")
-    return point, np.linalg.inv(information)
+    return point, inverted(information)
 
 
 def _start(seen: Sequence[Place | Bearing]) -> Array:
@@ -150,7 +155,7 @@ def pose_misfits(seen: Sequence[RigidPose]) -> Array:
         known = (np.diag(one.information) > 0) & (np.diag(mean.information) > 0)
         if known.any():
             chosen = np.ix_(known, known)
-            spread = np.linalg.inv(mean.information[chosen])
+            spread = inverted(mean.information[chosen])
             found[k] = _normalised(off[known], one.information[chosen], spread)
     return found
 

@@ -26,10 +26,12 @@ from dataflow.messages import (
 )
 from dataflow.messages.geometry import invert
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
-from operators.fusion.beginning import Prior, first_node, rests
+from operators.fusion.beginning import Prior, coasting_node, first_node, rests
+from operators.fusion.control import Command
 from operators.fusion.error_state import POSITION, Noise
 from operators.fusion.gate import GateConfig
-from operators.fusion.late_filter import FilterConfig, LateFilter, Measurement, Sample
+from operators.fusion.late_filter import FilterConfig, LateFilter
+from operators.fusion.nodes import Measurement, Sample
 from operators.fusion.output import diagnostics, odometry_of
 from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, measurements, unheard, use_of
 from operators.geometry.extrinsics import transform_between
@@ -43,9 +45,9 @@ class EkfFusion(Operator):
     """Fuses inertial, satellite, odometry, pose, velocity, heading, radar and range measurements by an error-state EKF.
 
     The state is position, velocity, orientation and the biases of the inertial sensor. Inertial samples move it;
-    without them (`motion: constant_velocity`) velocity and angular velocity stay but for noise. Everything else
-    corrects it, at the time when it was measured: what comes late, up to `window`, is put in its place and the rest is
-    done again.
+    without them (`motion: constant_velocity`) velocity and angular velocity stay but for noise, or follow a control
+    input, a twist that is used as `control`. Everything else corrects it, at the time when it was measured: what comes
+    late, up to `window`, is put in its place and the rest is done again.
 
     Settings of a stream stand under the end of its name (`robot/fix`); the status names those of no stream. A
     chi-square gate refuses what does not fit; measurements that fit only because the filter knows little wait for a
@@ -296,7 +298,7 @@ class EkfFusion(Operator):
 
     def _measure(self, name: str, message: Message, around: Surroundings) -> None:
         if self._filter is None and self.motion == "constant_velocity":
-            self._filter = self._coasting(message.stamp)
+            self._filter = LateFilter(self._config(), coasting_node(message.stamp, self._prior(), self.gravity))
         settings = self._settings(name)
         if use_of(name, message, settings) in _WITHOUT_PATIENCE:  # whatever says so: the setting or the message's type
             self._gates[name] = GateConfig(share=settings.share, agreeing=_NEVER_AGREE)
@@ -306,22 +308,26 @@ class EkfFusion(Operator):
         if self._filter is None:
             self._ignored[f"{name}: before the beginning"] += 1
             return
+        if settings.use == "control":
+            self._command(name, message, settings, around)
+            return
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
                 self._filter.measure(Measurement(time, sensor, model, noise))
         except Unusable as reason:
             self._ignored[f"{name}: {reason}"] += 1
 
-    def _coasting(self, stamp: int) -> LateFilter:
-        """A filter without inertial sensor: level, with the heading known or not, at any velocity."""
-        up = np.array([0.0, 0.0, self.gravity])
-        quiet = Noise(1e-3, 1e-3, 0.0, 0.0)
-        samples = [Sample(stamp - 1, np.zeros(3), up, quiet), Sample(stamp, np.zeros(3), up, quiet)]
-        prior = self._prior()
-        if prior.heading is None:
-            prior = replace(prior, heading=0.0, heading_sigma=math.pi)
-        prior = replace(prior, gyro_bias=1.0, accel_bias=1e-3, moving_velocity=10.0, moving_accel=1.0)
-        return LateFilter(self._config(), first_node(samples, prior, self.gravity, at_rest=False))
+    def _command(self, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> None:
+        assert self._filter is not None
+        assert isinstance(message, Twist)
+        if self.motion == "inertial":
+            self._ignored[f"{name}: a control input beside inertial samples"] += 1
+        elif not (np.isfinite(message.linear).all() and np.isfinite(message.angular).all()):
+            self._ignored[f"{name}: not finite"] += 1
+        else:
+            turn = around.place(message.frame)[:3, :3]
+            time = message.stamp - round(settings.offset * 1e9)
+            self._filter.command(Command(time, turn @ message.linear, turn @ message.angular, settings.lag))
 
     def _odometry(self, stamp: int) -> Odometry | None:
         assert self._filter is not None

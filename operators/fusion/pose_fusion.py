@@ -14,7 +14,7 @@ from dataflow.messages import Diagnostics, Imu, Message, Odometry, Pose, Transfo
 from dataflow.messages.geometry import invert, matrix_to_quaternion, quaternion_to_matrix, transform_matrix
 from dataflow.operator import Context, Duration, In, Operator, Out, Param, Sampled
 from operators.fusion.agreement import Agreement
-from operators.fusion.combination import RigidPose, pose_consistency, pose_misfits, posed
+from operators.fusion.combination import RigidPose, inverted, pose_consistency, pose_misfits, posed
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import skew
 
@@ -73,7 +73,7 @@ class PoseFusion(Operator):
                     child_frame=self.base_frame,
                     position=mean.position,
                     orientation=matrix_to_quaternion(mean.rotation),
-                    covariance=np.linalg.inv(mean.information) * growth,
+                    covariance=inverted(mean.information) * growth,
                 )
             else:
                 self._ignored["position or orientation unknown"] += 1
@@ -120,5 +120,5 @@ class PoseFusion(Operator):
             self._ignored[f"{name}: covariance not positive"] += 1
             return None
         information = np.zeros((6, 6))
-        information[known, known] = np.linalg.inv(covariance)
+        information[known, known] = inverted(covariance)
         return RigidPose(position, rotation, information)

@@ -62,7 +62,7 @@ class PositionFusion(Operator):
             if stamp - message.stamp <= self.window:
                 for identity, one in self._of(name, message, extrinsics):
                     seen.setdefault(identity, {})[name] = one
-        found = [(identity, *result) for identity in sorted(seen) if (result := self._place(seen[identity]))]
+        found = [(identity, *place) for identity in sorted(seen) if (place := self._place(seen[identity])) is not None]
         result: dict[str, Any] = {
             "places": LandmarkSightings(
                 stamp=stamp,

@@ -39,7 +39,17 @@ from operators.geometry.geodesy import east_north_up
 
 Array = NDArray[np.float64]
 Use = Literal[
-    "auto", "inertial", "position", "pose", "orientation", "velocity", "wheels", "heading", "doppler", "range"
+    "auto",
+    "inertial",
+    "control",
+    "position",
+    "pose",
+    "orientation",
+    "velocity",
+    "wheels",
+    "heading",
+    "doppler",
+    "range",
 ]
 Found = tuple[int, str, Model, Array]
 _I3 = np.eye(3)
@@ -60,6 +70,7 @@ class SensorSettings(BaseModel):
     )
     share: float = Field(0.999, gt=0, lt=1, description="share of true measurements that the gate lets through")
     agreeing: int = Field(3, ge=2, description="refused measurements that must agree until the filter yields to them")
+    lag: float = Field(0.2, gt=0, description="seconds in which velocities follow a control input")
     still: float = Field(0.002, ge=0, description="wheels slower than this (m/s at the rim) stand still")
     azimuth: float = Field(
         math.pi / 2, description="of magnetic north, radians from x towards y; a half π less declination if y is north"
@@ -84,6 +95,7 @@ _FITTING: dict[str, tuple[type[Message], ...]] = {
     "velocity": (Odometry, Twist),
     "wheels": (Odometry, Twist),
     "heading": (MagneticField,),
+    "control": (Twist,),
     "doppler": (RadarScan,),
     "range": (LandmarkSightings,),
 }

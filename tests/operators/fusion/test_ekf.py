@@ -295,6 +295,43 @@ def test_without_inertial_sensor_poses_are_smoothed() -> None:
     assert operator.summary()["robot/pose, refused"] == 0
 
 
+def test_without_inertial_sensor_a_control_input_carries_the_estimate_through_an_outage() -> None:
+    """A body on a circle at 1 m/s and 0.5 rad/s, whose positions end after 3 s."""
+    stamps = [100_000_000 * k for k in range(1, 61)]
+    circle = [transform(stamp * 1e-9) for stamp in stamps]
+    poses = [
+        Pose.from_matrix(T, stamp=s, frame="world", child_frame="base_link", covariance=np.eye(6) * 1e-4)
+        for s, T in zip(stamps, circle, strict=True)
+    ]
+    told = [Twist(stamp=s + 1, frame="base_link", linear=[1, 0, 0], angular=[0, 0, 0.5]) for s in stamps]
+    ends = []
+    for commands in (told, told[:30]):
+        operator = EkfFusion(
+            motion="constant_velocity",
+            free_acceleration=0.05,
+            free_turning=0.05,
+            sensors={"robot/pose": {"use": "pose"}, "robot/told": {"use": "control", "lag": 0.2}},
+        )
+        played = play(operator, {"measurements": {"robot/pose": poses[:30], "robot/told": commands}})
+        state = operator.snapshot()
+        other = EkfFusion(motion="constant_velocity", sensors=operator.sensors)
+        other.setup()
+        other.restore(state)
+        assert other.summary() == operator.summary()
+        assert operator._filter is not None
+        ends.append(float(np.linalg.norm(operator._filter.estimate(stamps[-1])[0].position - circle[-1][:3, 3])))
+        assert played["odometry"]
+    assert ends[0] < 0.1
+    assert operator._filter.estimate(stamps[-1])[0].covariance[0, 0] > 0.1**2
+
+
+def transform(t: float) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", 0.5 * t).as_matrix()
+    T[:2, 3] = 2 * np.sin(0.5 * t), 2 - 2 * np.cos(0.5 * t)
+    return T
+
+
 def test_what_is_ignored_is_counted_with_its_reason() -> None:
     robot = Robot(3.0)
     fixes = robot.fixes()
