@@ -53,6 +53,8 @@ class OperatorRunner(Runner):
         self.paranoid, self.snapshots = paranoid, snapshots
         self._next_snapshot: int | None = None
         self._warm: int | None = None
+        self.idle = NEVER
+        """The output frontier after the last step, where that left nothing to decide; else NEVER."""
         self.calls = Calls(node, self.operator, seed)
         self.records = FiringLog(node.name, emitter)
         self.aligner = Aligner(align_spec(node, self.spec, static))
@@ -127,6 +129,7 @@ class OperatorRunner(Runner):
             self.ports.promise(frontier)
             self.done = max(self.done, frontier)
             if self.aligner.paused:
+                self.idle = NEVER
                 self.wake()
             return self.aligner.paused
         work = self.work
@@ -140,10 +143,10 @@ class OperatorRunner(Runner):
             work.end()
             self.working_since = None
         if firing.kind == "finish":
-            self.ended, self.done = True, FOREVER
+            self.ended, self.done, self.idle = True, FOREVER, FOREVER
             self.ports.end(self.aligner.final_stamp(), "end of input")
             return True
-        frontier = self.aligner.idle_frontier()
+        frontier = self.idle = self.aligner.idle_frontier()
         if frontier == NEVER:
             frontier = firing.stamp
             self.wake()
