@@ -21,7 +21,8 @@ from dataflow.firing.restarts import Restarts
 from dataflow.firing.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
-from dataflow.sync import NEVER, Aligner, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+from dataflow.sync.single import make_aligner
 
 OWN_CLOCK = 1_000_000_000
 """A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
@@ -119,7 +120,7 @@ class LiveRunner(OperatorRunner):
         return [*mine, *theirs], more + Counter(others)
 
     def has_drops(self) -> bool:
-        return self._log.pending or super().has_drops()
+        return self._log.pending or self.aligner.has_drops()
 
     # What streams say
 
@@ -307,7 +308,7 @@ class LiveRunner(OperatorRunner):
         for held, count in old.buffered().items():
             if count and self.spec.inputs[held].kind != "sampled":
                 self._drops_before[held, "reset"] += count
-        self.aligner = Aligner(old.spec)
+        self.aligner = make_aligner(old.spec)
         self._told = True
         for static in self._statics.values():
             self.aligner.push(static.stream, static)

@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
-from dataflow.process.spinning import Spinning
 from dataflow.transport import Incoming
 
 Item = tuple[Any, ...]
@@ -26,11 +25,10 @@ Item = tuple[Any, ...]
 class Inbox:
     """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own.
 
-    Whoever makes it has the turn. `spinning`: where short waits are spent looking.
+    Whoever makes it has the turn.
     """
 
     def __init__(self, wake: int | None = None, incoming: Sequence[Incoming] = ()) -> None:
-        self.spinning: Spinning | None = None
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if wake is None else wake
         self._incoming = tuple(incoming)
         self._items: deque[Item] = deque()
@@ -56,9 +54,7 @@ class Inbox:
         return True
 
     def give_turn(self, *, wake: bool) -> None:
-        """Gives the turn back. `wake`: there is something to do for the thread that waits, or soon will be."""
-        if not wake and self.spinning is not None:
-            wake = self.spinning.worth() > 0
+        """Gives the turn back. `wake`: there is something to do for the thread that waits."""
         self._turn.release()
         if wake:
             os.eventfd_write(self.wake, 1)
@@ -70,8 +66,6 @@ class Inbox:
         return self.get_nowait()
 
     def _wait(self, timeout: float) -> None:
-        if self.spinning is not None and self.spinning.look(self._any, timeout):
-            return
         self._asleep = True
         if not self._items and not sum(not ring.sleep() for ring in self._incoming):
             self._turn.release()
@@ -85,9 +79,6 @@ class Inbox:
         for ring in self._incoming:
             ring.awake()
 
-    def _any(self) -> bool:
-        return bool(self._items) or any(ring.arrived() for ring in self._incoming)
-
     def get_nowait(self) -> Item:
         """Returns the next item; raises `queue.Empty` when there is none."""
         if not self._items and self.empty():
@@ -99,8 +90,6 @@ class Inbox:
         items = self._items
         for ring in self._incoming:
             if ring.arrived():
-                if self.spinning is not None:
-                    self.spinning.arrived()
                 for key, payload in ring.take():
                     items.append(("envelope", key, payload))
         return not items

@@ -34,7 +34,6 @@ from dataflow.process.pace import Pace
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
-from dataflow.process.spinning import Spinning
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
 from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
@@ -63,8 +62,6 @@ class OperatorProcess:
     ) -> None:
         """`box`: the descriptor of the memory in which the latest firing records outlive this process."""
         self.config, self.channel, self.inbox = config, channel, inbox
-        self.spinning = Spinning() if config.live else None
-        inbox.spinning = self.spinning
         self.graph = Graph.from_json(config.graph)
         self.static = statics_of(self.graph)
         self.pace = Pace(config.rate)
@@ -232,8 +229,6 @@ class OperatorProcess:
             if not self._running:
                 return False
             act(step)
-            if inbox.spinning is not None:
-                inbox.spinning.did("step")
         finally:
             inbox.give_turn(wake=self.runners.ready.any)
         return True
@@ -304,8 +299,6 @@ class OperatorProcess:
         kind = item[0]
         if kind == "envelope":
             self.inlet.take(item[1], item[2])
-            if self.spinning is not None:
-                self.spinning.did(item[1])
         elif kind == "control":
             self.orders.obey(item[1], item[2])
         elif kind == "source":

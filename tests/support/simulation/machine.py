@@ -455,10 +455,6 @@ class System:
         count, thing.count = thing.count, 0
         return int(count)
 
-    def sched_yield(self) -> None:
-        """Others have the core, for longer than a look takes."""
-        self.world.wait(1e-3)
-
     def _exit(self, code: int) -> None:
         task = self.world.task
         assert task is not None

@@ -155,7 +155,6 @@ class Simulation:
             (f"{process}.inbox", "os"): system,
             (f"{process}.inbox", "select"): machine.Select(system),
             (f"{process}.inbox", "threading"): threads,
-            (f"{process}.spinning", "os"): system,
             (f"{process}.polling", "select"): machine.Select(system),
             (f"{process}.operator_process", "Bus"): network.Bus,
             (f"{process}.operator_process", "TapServer"): network.Nobody,
