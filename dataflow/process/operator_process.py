@@ -14,12 +14,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from dataflow.chaos.faults import OperatorFaults
 from dataflow.feeds.window import Window
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.source import SourceRunner
 from dataflow.firing.threads import limit_threads
-from dataflow.graph.model import Graph, Node
+from dataflow.graph.model import Graph
 from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
@@ -27,13 +26,14 @@ from dataflow.process.handed import BACKLOG
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet, StreamDamaged
 from dataflow.process.live_sources import LiveSources, Step
+from dataflow.process.making import make_operators
 from dataflow.process.network import network_config
 from dataflow.process.orders import Orders
 from dataflow.process.outlet import Network, Outlet, incarnations_of
 from dataflow.process.pace import Pace
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
-from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
+from dataflow.process.runners import Runners, give, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
 from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
@@ -101,7 +101,9 @@ class OperatorProcess:
             ),
         )
         self.progress = Progress(channel, self.runners, self.feeding, self.live, paced=config.live)
-        self.requests = Requests(config, self.runners, self.live, self.progress, self.outlet.recent)
+        self.requests = Requests(
+            config, self.runners, self.live, self.progress, self.outlet.recent, self.pace.event_time
+        )
         self.orders = Orders(self)
         self._watch: Watchdog | None = None
         self._running = False
@@ -147,32 +149,7 @@ class OperatorProcess:
 
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
-        for name in self.config.nodes:
-            try:
-                self._make(self.graph.nodes[name])
-            except OperatorFailure:
-                raise
-            except Exception as error:
-                raise OperatorFailure(name, "construction", error) from error
-        log = make_log(self.graph, self.config, self.outlet)
-        if log is not None:
-            self.feeding.feeds.append(log)
-
-    def _make(self, node: Node) -> None:
-        config, outlet = self.config, self.outlet
-        if not node.source:
-            clock, tell = self.pace.event_time, self._on_outlived_failure
-            faults = self.runners.faults[node.name] = OperatorFaults()
-            self.runners.add(
-                make_runner(node, self.graph, config, outlet, faults=faults, event_clock=clock, on_failure=tell)
-            )
-            return
-        source = make_source(node, self.graph, config, outlet)
-        self.runners.sources.append(source)
-        if config.live:
-            self.live.add(source)
-        else:
-            self.feeding.feeds.append(source)
+        make_operators(self)
 
     def set_up(self) -> None:
         """Calls `setup()` of every operator, with as many library threads as the graph allows."""
@@ -188,11 +165,6 @@ class OperatorProcess:
         self.runners.ready.wake_all()
         self.live.start()
         self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)
-
-    def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
-        self.channel.send(
-            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
-        )
 
     def run(self) -> None:
         """Runs the main loop; returns when the supervisor has let the process go."""

@@ -14,6 +14,8 @@ RUN: Final = "dataflow:run"
 ENDS: Final = "dataflow:ends"
 OUTCOME: Final = "dataflow:outcome"
 COMPLETED: Final = "dataflow:completed"
+BAG: Final = "dataflow:bag"
+"""Of a replay of another system's bag: its file, clock, topics and repairs."""
 RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})
 FIELDS: Final = "fields"
 """Key of a stream's channel metadata: the declaration of a type that is not of `dataflow.messages`, as JSON."""
@@ -29,6 +31,7 @@ class Kind(StrEnum):
     FIRINGS = "firings"
     EVENTS = "events"
     FRAMES = "frames"
+    LOGS = "logs"
 
 
 EVENT_SCHEMA: Final = json.dumps(
@@ -63,6 +66,10 @@ def events_topic(namespace: str) -> str:
 
 def frames_topic(namespace: str) -> str:
     return _internal(namespace, "frames")
+
+
+def logs_topic(namespace: str) -> str:
+    return _internal(namespace, "logs")
 
 
 def _internal(namespace: str, rest: str) -> str:
