@@ -194,9 +194,9 @@ def processes(rounds: int, trees: dict[str, Path], messages: int) -> str:
             for name, tree in trees.items():
                 found[case.name][name].append(measure(case, tree, messages)["per_second"] / case.operators)
     lines = [f"| messages/s | {' | '.join(trees)} |", "| --- |" + " --- |" * len(trees)]
-    for case, by_tree in found.items():
+    for which, by_tree in found.items():
         texts = [f"{statistics.median(each):,.0f} ({min(each):,.0f} - {max(each):,.0f})" for each in by_tree.values()]
-        lines.append(f"| {case} | {' | '.join(texts)} |")
+        lines.append(f"| {which} | {' | '.join(texts)} |")
     return "\n".join(lines)
 
 

@@ -94,7 +94,8 @@ ACTIONS = st.one_of(
 
 @given(st.lists(ACTIONS, max_size=40))
 def test_the_same_are_asked_in_the_same_order_as_by_a_look_at_everybody(actions: list[tuple[str, int, Any]]) -> None:
-    clock, log, listed = Clock(), [], Listed()
+    clock, listed = Clock(), Listed()
+    log: list[int] = []
     ready = Ready(clock)
     runners = [Scripted(number, log, clock) for number in range(5)]
     for runner in runners:

@@ -45,7 +45,8 @@ def test_what_was_lost_is_said_once_and_the_rest_is_taken(count: int, data: st.D
 @given(st.integers(1, 6).map(stream_of), st.data())
 def test_what_contradicts_a_stream_changes_nothing(own: list[Envelope], data: st.DataObject) -> None:
     """Places that are past, and the end of time."""
-    order, taken = StreamOrder(), []
+    order = StreamOrder()
+    taken: list[Envelope] = []
     for envelope in own:
         taken += take_all(order, [envelope])[0]
         behind = envelope.seq - (0 if envelope.kind is Kind.MESSAGE else 1)
@@ -96,9 +97,10 @@ def test_a_message_that_breaks_a_promise_is_damage() -> None:
     assert order.take(message(2, 1600)).taken
 
 
-def taken_by(envelopes: list[Envelope], *, shortcut: bool) -> list[object]:
+def taken_by(envelopes: list[Envelope], *, shortcut: bool) -> list[Verdict]:
     """What becomes of envelopes in turn, with or without the short way for those that simply go on."""
-    order, found = StreamOrder(), []
+    order = StreamOrder()
+    found: list[Verdict] = []
     for envelope in envelopes:
         if shortcut and order.goes_on(envelope):
             found.append(Verdict(envelope))
