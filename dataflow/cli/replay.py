@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -105,19 +106,22 @@ def replay(
       dataflow replay thin.mcap --complete full.mcap
     """
     began = time.monotonic()
-    from dataflow.graph import load_graph
-    from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
-    from dataflow.supervision.replay import plan_replay
-    from dataflow.supervision.run import replay as replay_recording
+    from dataflow.supervision.early import early_nursery
 
-    with friendly_errors():
+    with friendly_errors(), ExitStack() as stack:
         existing(recording, "a recording")
         if record is not None and record.exists() and record.samefile(recording):
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
+        early = None if complete is not None else stack.enter_context(early_nursery())
+        from dataflow.graph import load_graph
+        from dataflow.recording import Recording
+        from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
+        from dataflow.supervision.replay import plan_replay
+        from dataflow.supervision.run import replay as replay_recording
+
         with Recording(recording) as opened:
             if graph is None:
                 recorded = graph_as_recorded(opened)
@@ -148,7 +152,9 @@ def replay(
         if whole is not None:
             shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
         execute(
-            lambda watch: replay_recording(recording, graph=loaded, start=start, end=end, watch=watch, **options),
+            lambda watch: replay_recording(
+                recording, graph=loaded, start=start, end=end, watch=watch, early=early, **options
+            ),
             loaded,
             outputs,
             shown,

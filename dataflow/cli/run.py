@@ -75,23 +75,26 @@ def run(
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
     began = time.monotonic()
-    from dataflow.chaos.plan import load_plan
-    from dataflow.graph import load_graph
-    from dataflow.supervision.run import run as run_graph
+    from dataflow.supervision.early import early_nursery
 
-    with friendly_errors():
-        if chaos_seed is not None and chaos is None:
-            raise fail("--chaos-seed varies a fault plan: name it with --chaos")
-        find_modules_in(path)
+    if chaos_seed is not None and chaos is None:
+        raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+    existing(graph, "a graph file")
+    find_modules_in(path)
+    with early_nursery() as early, friendly_errors():
+        from dataflow.chaos.plan import load_plan
+        from dataflow.graph import load_graph
+        from dataflow.supervision.run import run as run_graph
+
         live = live or chaos is not None
-        loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
+        loaded = load_graph(graph, settings=settings or (), live=live)
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live
         if chaos is not None:
             options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
         execute(
-            lambda watch: run_graph(loaded, watch=watch, **options),
+            lambda watch: run_graph(loaded, watch=watch, early=early, **options),
             loaded,
             outputs,
             None,
