@@ -132,6 +132,16 @@ def opencv_tracking(threads: int) -> bytes:
     return raw(moved, rotation, translation, inliers)
 
 
+def opencv_stereo(threads: int) -> bytes:
+    """What stereo depth does: semi-global matching in three directions."""
+    import cv2
+
+    cv2.setNumThreads(threads)
+    left, right = images()
+    matcher: Any = cv2.StereoSGBM.create(0, 128, 5, 200, 800, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY)
+    return raw(matcher.compute(left, right))
+
+
 def opencv_filters(threads: int) -> bytes:
     """What cloud building, the simulator and network inputs do: resampling and smoothing in floating point."""
     import cv2
@@ -202,11 +212,13 @@ def numpy_algebra(threads: int) -> bytes:
 MODES = (
     Mode("OpenCV", "opencv-python-headless", "corners, optical flow, PnP RANSAC", 1, True, opencv_tracking),
     Mode("OpenCV", "opencv-python-headless", "remap, resize, blur, Sobel", 1, True, opencv_filters),
+    Mode("OpenCV", "opencv-python-headless", "semi-global matching", 1, True, opencv_stereo),
     Mode("onnxruntime", "onnxruntime", "convolutional network", 1, True, onnxruntime_network),
     Mode("numpy", "numpy", "BLAS and LAPACK", 1, True, numpy_algebra),
     Mode("small_gicp", "small_gicp", "GICP", 1, True, small_gicp),
     Mode("torch", "torch", "convolution, gradient, sum", 1, True, torch_network),
     Mode("OpenCV", "opencv-python-headless", "corners, optical flow, PnP RANSAC", 4, False, opencv_tracking),
+    Mode("OpenCV", "opencv-python-headless", "semi-global matching", 4, False, opencv_stereo),
     Mode("onnxruntime", "onnxruntime", "convolutional network", 4, False, onnxruntime_network),
     Mode("numpy", "numpy", "BLAS and LAPACK", 4, False, numpy_algebra),
     Mode("torch", "torch", "convolution, gradient, sum", 4, False, torch_network),

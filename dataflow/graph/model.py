@@ -165,11 +165,17 @@ class Record:
     snapshots: int | None = None
 
 
+PANELS = ("world", "cameras", "scene", "map", "plots", "status", "log")
+"""Parts of the viewer's window that a graph may choose."""
+
+
 @dataclass(frozen=True, slots=True)
 class View:
-    """Streams that the viewer leaves out, by name."""
+    """Choices for the viewer: streams left out, panels (none: all), a layout saved from it (empty: derived)."""
 
     hide: tuple[str, ...] = ()
+    panels: tuple[str, ...] = ()
+    layout: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,7 +289,7 @@ class Graph:
             aliases=dict(data["aliases"]),
             types={declaration.schema: declaration for declaration in types},
             record=Record(**{**data["record"], "streams": tuple(data["record"]["streams"])}),
-            view=View(tuple(data["view"]["hide"])),
+            view=_view_from_json(data["view"]),
             network=Network(
                 **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},
             ),
@@ -360,6 +366,11 @@ class Graph:
     def relative(self, stream: str) -> str:
         """`stream` without the namespace, for people."""
         return stream.removeprefix(f"{self.namespace}/")
+
+
+def _view_from_json(data: Mapping[str, Any]) -> View:
+    """What older recordings do not have is as it was: every panel, no saved layout."""
+    return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""))
 
 
 def _node_from_json(values: Mapping[str, Any]) -> Node:

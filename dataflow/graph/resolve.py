@@ -8,6 +8,7 @@ from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern, Wired
 from dataflow.graph.fields import Fields
 from dataflow.graph.keys import canonical, has_wildcard, key_fault
 from dataflow.graph.model import (
+    PANELS,
     Bundle,
     Graph,
     Node,
@@ -244,8 +245,17 @@ class Resolver:
         return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots)
 
     def view(self, tree: Tree | None) -> View:
-        table = self.fields.table(tree, "view", ("hide",))
-        return View(self.topics(table.get("hide"), "hide") if table else ())
+        table = self.fields.table(tree, "view", ("hide", "panels", "layout"))
+        if table is None:
+            return View()
+        panels = []
+        for leaf in self.fields.texts(table.get("panels"), "panels"):
+            if (panel := self.fields.choice(leaf, "panels", {name: name for name in PANELS})) is not None:
+                panels.append(panel)
+        layout = self.fields.text(table.get("layout"), "layout") or ""
+        if layout and not layout.endswith(".rbl"):
+            self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")  # type: ignore[arg-type]
+        return View(self.topics(table.get("hide"), "hide"), tuple(panels), layout)
 
     def topics(self, tree: Tree | None, what: str) -> tuple[str, ...]:
         """The streams that a list of key expressions matches; each must match one at least."""

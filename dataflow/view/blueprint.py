@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.api import VisualizerLike
 
-from dataflow.graph.model import Graph
+from dataflow.graph.model import PANELS, Graph
 from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
 from dataflow.view.canvas import Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
@@ -37,20 +37,28 @@ def blueprint(
 
 def blueprint_of(shown: Layout, *, outlook: Outlook | None = None, following: bool = False) -> rrb.Blueprint:
     """The views for a layout."""
-    world = _world(shown, outlook)
-    cameras = [_camera(camera, shown) for camera in shown.cameras]
-    side = [*_graphs(shown), *_maps(shown), *_tensors(shown)]
-    plots = _plots(shown)
-    log = _log(shown)
+    chosen = shown.panels or PANELS
+    world = _world(shown, outlook) if "world" in chosen else None
+    cameras = [_camera(camera, shown) for camera in shown.cameras] if "cameras" in chosen else []
+    scene = _graphs(shown) if "scene" in chosen else []
+    side = [*scene, *(_maps(shown) if "map" in chosen else []), *_tensors(shown)]
+    plots = _plots(shown) if "plots" in chosen else []
+    status = _status(shown) if "status" in chosen else None
+    log = _log(shown) if "log" in chosen else None
 
     main = [part for part in (world, _row(cameras, 3)) if part is not None]
-    column = [part for part in (_tabs(side), _tabs(plots), log) if part is not None]
-    if not main:
-        root: Part = rrb.Vertical(contents=[*plots, *side, log])
-    else:
+    parts = ((_tabs(side), 3), (_tabs(plots), 3), (status, 1), (log, 2))
+    column = [(part, share) for part, share in parts if part is not None]
+    beside = None
+    if column:
+        beside = rrb.Vertical(contents=[part for part, _ in column], row_shares=[share for _, share in column])
+    left = None
+    if main:
         left = main[0] if len(main) == 1 else rrb.Vertical(contents=main, row_shares=[3, 2])
-        heights = [3, 2, 1][3 - len(column) :] if len(column) > 1 else None
-        root = rrb.Horizontal(left, rrb.Vertical(contents=column, row_shares=heights), column_shares=[7, 3])
+    if left is not None and beside is not None:
+        root: Part = rrb.Horizontal(left, beside, column_shares=[7, 3])
+    else:
+        root = left or beside or _log(shown)
     return rrb.Blueprint(
         root,
         rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following" if following else None),
@@ -80,6 +88,9 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
     trails: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
         f"{entity_of(name)}/space/trail": rrb.VisibleTimeRanges([forever]) for name in shown.of_type(Pose, Odometry)
     }
+    hidden: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
+        f"{entity_of(name)}/space": rrb.EntityBehavior(visible=False) for name in shown.aside
+    }
     eye = None
     if outlook is not None and outlook.position is not None:
         eye = rrb.EyeControls3D(position=outlook.position, look_target=outlook.target, eye_up=outlook.up)
@@ -89,7 +100,7 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
         name="World",
         background=_BACKGROUND,
         eye_controls=eye,
-        overrides=trails,
+        overrides={**trails, **hidden},
     )
 
 
@@ -98,7 +109,7 @@ def _camera(camera: Camera, shown: Layout) -> rrb.Spatial2DView:
     overlays = [f"+ {entity_of(name)}/overlay" for name in camera.overlays]
     return rrb.Spatial2DView(
         origin=entity_of(camera.image),
-        contents=[f"+ {entity_of(camera.image)}", *overlays],
+        contents=[f"+ {entity_of(camera.image)}", f"+ {entity_of(camera.image)}/scale/**", *overlays],
         name=_short(camera.image, shown),
         background=_BACKGROUND,
     )
@@ -113,7 +124,7 @@ def _graphs(shown: Layout) -> list[Part]:
             force_many_body=rrb.archetypes.ForceManyBody(enabled=True, strength=-400.0),
             force_collision_radius=rrb.archetypes.ForceCollisionRadius(enabled=True),
         )
-        for name in _with_role(shown, "graph")
+        for name in sorted(_with_role(shown, "graph"), key=lambda name: name in shown.aside)
     ]
 
 
@@ -160,6 +171,15 @@ def _plots(shown: Layout) -> list[Part]:
         for kind, title in (("latency", "Latency"), ("rate", "Rates"), ("value", "Health")):
             parts.append(_plot(title, [f"+ {entity_of(name)}/plot/{kind}/**" for name in health]))
     return parts
+
+
+def _status(shown: Layout) -> Part | None:
+    """A lane for everything that reports its health: green, yellow, red, grey where it is silent."""
+    names = _with_role(shown, "status")
+    if not names:
+        return None
+    contents = [f"+ {entity_of(name)}/status/**" for name in names]
+    return rrb.StateTimelineView(origin="/", contents=contents, name="Status")
 
 
 def _plot(name: str, contents: Sequence[str]) -> rrb.TimeSeriesView:

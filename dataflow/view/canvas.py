@@ -20,7 +20,7 @@ from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
 NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
 
-Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor"]
+Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor", "status"]
 """Which views a type appears in. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
 
 
@@ -77,10 +77,10 @@ class Canvas:
         """One line in the text log."""
         self.log("log", rr.TextLog(text, level=level))
 
-    def notice(self, text: str) -> None:
+    def notice(self, text: str, level: str = "WARN") -> None:
         """Tells people once that this stream is not shown as it is."""
         if self.scene.once(self.stream, text):
-            self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level="WARN"))
+            self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level=level))
 
     def place(self, parent: str, child: str, T_parent_child: npt.NDArray[np.float64], *, tree: bool = False) -> None:
         """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.

@@ -25,6 +25,9 @@ ESTIMATES: tuple[RGB, ...] = ((255, 176, 0), (86, 180, 233), (230, 110, 190), (2
 """Trajectories that are no ground truth, in the order of their stream names (after Okabe and Ito)."""
 
 _GOLDEN = 0.618033988749895
+_LEGIBLE = 0.3
+"""Relative luminance (WCAG 2) of a colour that stands out from dark grey by 4.5 to 1 and more."""
+_LIGHTNESSES = (0.55, 0.6, 0.65, 0.7, 0.75, 0.8)
 _TURBO = ((48, 18, 59), (70, 107, 227), (40, 187, 235), (50, 242, 152), (164, 252, 60), (238, 207, 58), (251, 126, 33),
           (208, 48, 5), (122, 4, 3))  # fmt: skip
 
@@ -68,6 +71,9 @@ def of_values(values: npt.ArrayLike, low: float | None = None, high: float | Non
 
 
 def _vivid(hue: float) -> RGB:
-    """A colour that is legible on dark and on light; hues of equal brightness, green darkened a little."""
-    r, g, b = colorsys.hls_to_rgb(hue, 0.58, 0.78)
+    """A colour whose text can be read on the viewer's dark ground: blue and violet are lightened until it can."""
+    for lightness in _LIGHTNESSES:
+        r, g, b = colorsys.hls_to_rgb(hue, lightness, 0.78)
+        if 0.2126 * r**2.2 + 0.7152 * g**2.2 + 0.0722 * b**2.2 >= _LEGIBLE:
+            break
     return round(r * 255), round(g * 255), round(b * 255)

@@ -9,13 +9,17 @@ from types import MappingProxyType
 
 from dataflow.graph.model import Graph
 from dataflow.messages import (
+    Boxes3D,
     CameraInfo,
     CompressedDepth,
     CompressedImage,
     DepthImage,
     Detections2D,
     Image,
+    Mesh,
     Message,
+    Planes,
+    SceneGraph,
     SegmentationMap,
     Tracks,
 )
@@ -45,12 +49,16 @@ class Layout:
     - `cameras`: every image stream; colour before depth, then by name.
     - `planes`: stream → name of the image plane that its pixels lie in, for images, calibrations and overlays.
     - `static`: streams whose one message holds for all time.
+    - `aside`: truth that is drawn but switched off: scenes, surfaces, and boxes where others are estimated.
+    - `panels`: the parts of the window that the graph asks for; none: all.
     """
 
     streams: Mapping[str, type[Message]] = field(default_factory=lambda: MappingProxyType({}))
     cameras: tuple[Camera, ...] = ()
     planes: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     static: frozenset[str] = frozenset()
+    aside: frozenset[str] = frozenset()
+    panels: tuple[str, ...] = ()
 
     def of_type(self, *types: type[Message]) -> tuple[str, ...]:
         """The streams of some types, sorted."""
@@ -58,13 +66,15 @@ class Layout:
 
 
 def layout(streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()) -> Layout:
-    """The layout of `streams` (name → message type), less those that the graph hides.
+    """The layout of `streams` (name → message type), less those that are hidden and those that only decode another.
 
     With a graph, what is drawn over an image is found by walking the graph upstream; without one, by the words that
     names share. `static` adds to what the graph says.
     """
     hidden = set(graph.view.hide) if graph is not None else set()
     shown = {name: streams[name] for name in sorted(streams) if name not in hidden}
+    copies = _decoded(shown, graph) if graph is not None else {}
+    shown = {name: type_ for name, type_ in shown.items() if name not in copies}
     fixed = {name for name in static if name in shown}
     if graph is not None:
         fixed |= {name for name, stream in graph.streams.items() if stream.static and name in shown}
@@ -79,13 +89,15 @@ def layout(streams: Mapping[str, type[Message]], graph: Graph | None = None, sta
     for name, info in info_of.items():
         planes[name] = plane_name(info or name)
     for name, type_ in shown.items():
-        if issubclass(type_, OVERLAYS) and (image := _image_under(name, images, depths, graph)) is not None:
+        if issubclass(type_, OVERLAYS) and (image := _image_under(name, images, depths, graph, copies)) is not None:
             over[image].append(name)
             planes[name] = planes[image]
     cameras = tuple(
         Camera(name, info_of[name], depth=name in depths, overlays=tuple(over[name])) for name in images + depths
     )
-    return Layout(MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed))
+    panels = graph.view.panels if graph is not None else ()
+    aside = _aside(shown, graph)
+    return Layout(MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed), aside, panels)
 
 
 def plane_name(stream: str) -> str:
@@ -115,10 +127,38 @@ def _calibration(image: str, infos: list[str], images: list[str], graph: Graph |
     return max(near, key=lambda info: (_likeness(_port(info), _port(image)), -len(info)), default=None)
 
 
-def _image_under(overlay: str, images: list[str], depths: list[str], graph: Graph | None) -> str | None:
+def _decoded(shown: Mapping[str, type[Message]], graph: Graph) -> dict[str, str]:
+    """The images that operators decode from a compressed one that is shown too: stream → the compressed one."""
+    found = {}
+    for name, type_ in shown.items():
+        family = COLOR if issubclass(type_, COLOR) else DEPTH if issubclass(type_, DEPTH) else ()
+        if name not in graph.streams or not family or issubclass(type_, family[1]):
+            continue
+        taken = [stream for streams in graph.producer(name)[0].inputs.values() for stream in streams]
+        if len(taken) == 1 and issubclass(shown.get(taken[0], Message), family[1]):
+            found[name] = taken[0]
+    return found
+
+
+def _aside(shown: Mapping[str, type[Message]], graph: Graph | None) -> frozenset[str]:
+    """The streams of truth that would hide what is estimated: what a source gives, or what is named so."""
+
+    def given(stream: str) -> bool:
+        from_source = graph is not None and stream in graph.streams and graph.producer(stream)[0].source
+        return from_source or is_truth(stream)
+
+    scenes = [name for name, type_ in shown.items() if issubclass(type_, SceneGraph | Planes | Mesh)]
+    boxes = [name for name, type_ in shown.items() if issubclass(type_, Boxes3D)]
+    estimated = any(not given(name) for name in boxes)
+    return frozenset(name for name in scenes + (boxes if estimated else []) if given(name))
+
+
+def _image_under(
+    overlay: str, images: list[str], depths: list[str], graph: Graph | None, copies: Mapping[str, str]
+) -> str | None:
     """The image that an overlay was made from."""
     if graph is not None:
-        made_from = list(_upstream(overlay, graph))
+        made_from = [copies.get(stream, stream) for stream in _upstream(overlay, graph)]
         found = next((s for s in made_from if s in images), None) or next((s for s in made_from if s in depths), None)
         if found is not None:
             return found

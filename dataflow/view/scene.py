@@ -41,21 +41,28 @@ class ViewOptions:
     """Bounds on what is shown, and with it on memory.
 
     - `jpeg_quality`: raw colour images are sent as JPEG of this quality, None: as they are (20 times the memory).
-    - `compress_depth`: depth is sent as 16-bit PNG in steps of 1 mm (coarser only beyond 65 m) instead of float32.
+    - `depth_step`: depth is sent as 16-bit PNG in steps of so many metres (coarser only where the farthest would not
+      fit); None: as float32.
     - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log says so once.
+    - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
     - `trail`: trails get a vertex every so many metres at least.
     - `track_history`: event time (ns) for which the paths of tracks are drawn.
     """
 
     jpeg_quality: int | None = 85
-    compress_depth: bool = True
+    depth_step: float | None = 0.001
     max_points: int = 200_000
+    point_step: float = 0.0
     trail: float = 0.01
     track_history: int = 5_000_000_000
 
     def __post_init__(self) -> None:
         if self.jpeg_quality is not None and not 1 <= self.jpeg_quality <= 100:
             raise ValueError(f"jpeg_quality must be 1 to 100 or None, got {self.jpeg_quality}")
+        if self.depth_step is not None and not self.depth_step > 0:
+            raise ValueError(f"depth_step must be more than 0 m or None, got {self.depth_step}")
+        if not self.point_step >= 0:
+            raise ValueError(f"point_step must be 0 m or more, got {self.point_step}")
         if self.max_points < 1:
             raise ValueError(f"max_points must be at least 1, got {self.max_points}")
 

@@ -33,6 +33,9 @@ from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, SceneState, ViewOpti
 SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
 
+FILE_OPTIONS = ViewOptions(jpeg_quality=75, depth_step=0.02, max_points=2_500, point_step=2.0**-7)
+"""What a file is to hold unless more is asked for: what can be seen, not what can be measured."""
+
 _GRPC_PORT = 9876
 _WEB_PORT = 9090
 
@@ -134,7 +137,7 @@ class ViewerSink:
         application: str = "dataflow",
     ) -> None:
         self.target = target
-        self._options = options or ViewOptions()
+        self._options = options or (FILE_OPTIONS if isinstance(target, Save) else ViewOptions())
         self._bounds = bounds or Bounds()
         self._report = report or logging.getLogger(__name__).warning
         self._application = application
@@ -149,6 +152,7 @@ class ViewerSink:
         self._graph: Graph | None = None
         self._outlook: Outlook | None = None
         self._seen: set[str] = set()
+        self._laid_out = False
 
     def open(
         self, streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()
@@ -171,7 +175,8 @@ class ViewerSink:
             raise
         recording.send_recording_name(name)
         recording.log(SCENE, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        if not isinstance(self.target, Save):
+        self._saved_layout(recording, graph)
+        if not isinstance(self.target, Save) and not self._laid_out:
             recording.send_blueprint(blueprint_of(self._scene.layout, following=True))
         self._recording = recording
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
@@ -325,8 +330,21 @@ class ViewerSink:
             recording.log(SCENE, rr.ViewCoordinates.RDF, static=True)
         self._lay_out(recording)
 
+    def _saved_layout(self, recording: rr.RecordingStream, graph: Graph | None) -> None:
+        """Takes the layout that the graph names, as somebody saved it from the viewer, in place of a derived one."""
+        if graph is None or not graph.view.layout:
+            return
+        file = Path(graph.view.layout)
+        if file.is_file():
+            recording.log_file_from_path(file)
+            self._laid_out = True
+        else:
+            self._tell("", "layout", f"there is no layout {file} (`view: layout` in the graph); the views are derived")
+
     def _lay_out(self, recording: rr.RecordingStream) -> None:
         """Views for the streams that have had a message: a sensor that is off leaves no empty view."""
+        if self._laid_out:
+            return
         full = self._scene.layout
         shown = layout({name: type_ for name, type_ in full.streams.items() if name in self._seen}, self._graph)
         following = not isinstance(self.target, Save)

@@ -1,5 +1,6 @@
 """Operators that make and change depth images."""
 
 from operators.depth.depth_filter import DepthFilter
+from operators.depth.stereo_depth import StereoDepth
 
-__all__ = ["DepthFilter"]
+__all__ = ["DepthFilter", "StereoDepth"]

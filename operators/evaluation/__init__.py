@@ -1,8 +1,9 @@
 """Sinks that score streams against ground truth."""
 
+from operators.evaluation.depth_metrics import DepthMetrics
 from operators.evaluation.detection_metrics import DetectionMetrics
 from operators.evaluation.orientation_metrics import OrientationMetrics
 from operators.evaluation.segmentation_metrics import SegmentationMetrics
 from operators.evaluation.trajectory_metrics import TrajectoryMetrics
 
-__all__ = ["DetectionMetrics", "OrientationMetrics", "SegmentationMetrics", "TrajectoryMetrics"]
+__all__ = ["DepthMetrics", "DetectionMetrics", "OrientationMetrics", "SegmentationMetrics", "TrajectoryMetrics"]

@@ -7,11 +7,10 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-import numpy as np
-
 from dataflow.messages import CameraInfo, Diagnostics, Image, Odometry
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
+from operators.geometry.stereo import rectified_pair
 from operators.odometry.emission import outputs
 from operators.odometry.motion import Motion
 from operators.odometry.stereo_adjustment import Sightings, StereoRig
@@ -88,13 +87,7 @@ class StereoVisualOdometry(Operator):
 
 def rig_of(left: CameraInfo, right: CameraInfo) -> StereoRig:
     """Returns the rig that two calibrations describe. Raises ValueError where they are no rectified pair."""
-    if right.P is None or right.P[0, 3] >= 0:
-        raise ValueError("right_info.P must be given, with P[0, 3] = -fx * baseline below 0")
-    K = left.K if left.P is None else left.P[:, :3]
-    if not np.allclose(K, right.P[:, :3], rtol=1e-3):
-        raise ValueError("left_info and right_info must describe a rectified pair: one K for both")
-    start = 0.0 if left.P is None else float(left.P[0, 3])
-    return StereoRig(np.array(K, np.float64), (start - float(right.P[0, 3])) / float(K[0, 0]))
+    return StereoRig(*rectified_pair(left, right))
 
 
 def _to_plain(state: StereoState) -> dict[str, Any]:

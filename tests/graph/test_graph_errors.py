@@ -351,6 +351,16 @@ CASES = {
         "4:15: hide: 'camera/imge' is no stream of this graph",
         "did you mean 'camera/image'?",
     ),
+    "no_such_panel": (
+        HEAD + "view: {panels: [world, plot]}\n",
+        "4:24: panels must be one of world, cameras, scene, map, plots, status, log, not the text 'plot'",
+        "did you mean 'plots'?",
+    ),
+    "layout_of_no_kind": (
+        HEAD + "view: {layout: mine.rrd}\n",
+        "4:16: layout must be a file of the viewer's, NAME.rbl, not the text 'mine.rrd'",
+        "",
+    ),
     "bad_endpoint": (
         HEAD + "network: {listen: [192.168.1.2:7447]}\n",
         "4:20: listen: '192.168.1.2:7447' is no Zenoh endpoint",

@@ -2,8 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from dataflow.graph.model import Bundle, Graph, Live, Node, Record, Stream, View
-from dataflow.messages import CameraInfo, DepthImage, Detections2D, Image
+from dataflow.messages import (
+    Boxes3D,
+    CameraInfo,
+    CompressedDepth,
+    CompressedImage,
+    DepthImage,
+    Detections2D,
+    Image,
+    Message,
+    SceneGraph,
+)
 from dataflow.view.layout import layout
 
 TYPES = {
@@ -23,6 +35,17 @@ def node(name: str, inputs: dict[str, str], *outputs: str) -> Node:
     return Node(name, "nowhere:Nothing", {}, taken, made, Live("newest", 1, {}))
 
 
+def linked(types: dict[str, type[Message]], nodes: list[Node], view: View) -> Graph:
+    streams = [
+        Stream(name, n.name, port, (types[name].SCHEMA,), static=port == "info")
+        for n in nodes
+        for port, name in n.outputs.items()
+    ]
+    by_name = {n.name: n for n in nodes}
+    made = {s.name: s for s in streams}
+    return Graph("g", "r", by_name, made, Record(()), Bundle("g.yaml", {"g.yaml": ""}), view=view)
+
+
 def graph(hide: tuple[str, ...] = ()) -> Graph:
     nodes = [
         node("left", {}, "image", "info"),
@@ -31,14 +54,7 @@ def graph(hide: tuple[str, ...] = ()) -> Graph:
         node("left_detector", {"image": "r/gray/image"}, "boxes"),
         node("monodepth", {"image": "r/right/image"}, "depth"),
     ]
-    streams = [
-        Stream(name, n.name, port, (TYPES[name].SCHEMA,), static=port == "info")
-        for n in nodes
-        for port, name in n.outputs.items()
-    ]
-    by_name = {n.name: n for n in nodes}
-    made = {s.name: s for s in streams}
-    return Graph("g", "r", by_name, made, Record(()), Bundle("g.yaml", {"g.yaml": ""}), view=View(hide))
+    return linked(TYPES, nodes, View(hide))
 
 
 def test_overlays_and_derived_images_follow_the_graph_against_their_names() -> None:
@@ -55,3 +71,43 @@ def test_hidden_streams_are_not_shown() -> None:
     shown = layout(TYPES, graph(hide=("r/left/image", "r/left/info")))
     assert "r/left/image" not in shown.streams
     assert {camera.image for camera in shown.cameras} == {"r/right/image", "r/gray/image", "r/monodepth/depth"}
+
+
+def test_an_image_and_what_only_decodes_it_are_shown_once_with_overlays_on_the_one_that_stays() -> None:
+    types: dict[str, type[Message]] = {
+        "r/camera/jpeg": CompressedImage,
+        "r/camera/png": CompressedDepth,
+        "r/color/image": Image,
+        "r/depth/depth": DepthImage,
+        "r/small/image": Image,
+        "r/detector/boxes": Detections2D,
+    }
+    nodes = [
+        node("camera", {}, "jpeg", "png"),
+        node("color", {"compressed": "r/camera/jpeg"}, "image"),
+        node("depth", {"compressed": "r/camera/png"}, "depth"),
+        node("small", {"image": "r/color/image"}, "image"),
+        node("detector", {"image": "r/color/image"}, "boxes"),
+    ]
+    shown = layout(types, linked(types, nodes, View()))
+    cameras = {camera.image: camera for camera in shown.cameras}
+    assert set(cameras) == {"r/camera/jpeg", "r/camera/png", "r/small/image"}
+    assert cameras["r/camera/jpeg"].overlays == ("r/detector/boxes",)
+    without = {name: type_ for name, type_ in types.items() if name != "r/camera/jpeg"}
+    assert "r/color/image" in layout(without, linked(types, nodes, View())).streams  # nothing else shows it
+
+
+def test_truth_stands_aside_for_what_is_estimated() -> None:
+    types: dict[str, type[Message]] = {
+        "r/robot/scene": SceneGraph,
+        "r/robot/boxes": Boxes3D,
+        "r/lifter/boxes": Boxes3D,
+        "r/builder/scene": SceneGraph,
+    }
+    robot = replace(node("robot", {}, "scene", "boxes"), source=True)
+    nodes = [robot, node("lifter", {}, "boxes"), node("builder", {"boxes": "r/lifter/boxes"}, "scene")]
+    made = linked(types, nodes, View(panels=("world", "log")))
+    assert layout(types, made).aside == {"r/robot/scene", "r/robot/boxes"}
+    only_true = {name: type_ for name, type_ in types.items() if name.startswith("r/robot")}
+    assert layout(only_true, made).aside == {"r/robot/scene"}, "true boxes are all there is to see"
+    assert layout(types, made).panels == ("world", "log")

@@ -11,6 +11,7 @@ import pytest
 import rerun.blueprint as rrb
 from rrd_rows import at, blueprint_rows, rows
 
+from dataflow.graph.model import Bundle, Graph, Record, View
 from dataflow.messages import (
     CameraInfo,
     DepthImage,
@@ -167,6 +168,7 @@ def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
         ("TimeSeries", "Latency"),
         ("TimeSeries", "Rates"),
         ("TimeSeries", "Health"),
+        ("StateTimeline", "Status"),
         ("TextLog", "Log"),
     ]
     assert views(blueprint({"r/imu/data": Imu}))[-1] == ("TextLog", "Log")
@@ -180,7 +182,11 @@ def test_a_camera_view_shows_its_overlays_and_the_world_does_not() -> None:
         return [line for inner in part.contents for line in contents(name, inner)]
 
     root = blueprint(STREAMS).root_container
-    assert contents("camera/image", root) == ["+ /r/camera/image", "+ /r/detector/boxes/overlay"]
+    assert contents("camera/image", root) == [
+        "+ /r/camera/image",
+        "+ /r/camera/image/scale/**",
+        "+ /r/detector/boxes/overlay",
+    ]
     assert "+ /r/odometry/pose/space/**" in contents("World", root)
     assert not any("detector" in line for line in contents("World", root))
 
@@ -282,3 +288,23 @@ def test_what_cannot_be_reached_is_said_at_once(tmp_path: Path, monkeypatch: pyt
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(ViewerError, match="no display"):
         ViewerSink(Spawn()).open({"imu": Imu})
+
+
+def test_a_layout_that_was_saved_takes_the_place_of_the_derived_one(tmp_path: Path) -> None:
+    saved = tmp_path / "mine.rbl"
+    rrb.Blueprint(rrb.TextLogView(origin="/", name="Only this")).save("g", str(saved))
+
+    def opened(layout: str) -> tuple[list[str], list[str]]:
+        made = Graph("g", "r", {}, {}, Record(()), Bundle("g.yaml", {"g.yaml": ""}), view=View(layout=layout))
+        said: list[str] = []
+        path = tmp_path / "a.rrd"
+        with ViewerSink(Save(path), report=said.append) as sink:
+            sink.open({"c/truth": Pose}, made)
+            sink.log("c/truth", pose(STAMP))
+        return [row.values[0] for row in blueprint_rows(path) if row.component.endswith("display_name")], said
+
+    names, said = opened(str(saved))
+    assert (names, said) == (["Only this"], [])
+    names, said = opened(str(tmp_path / "lost.rbl"))
+    assert "World" in names
+    assert "lost.rbl" in said[0]

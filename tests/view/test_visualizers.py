@@ -37,7 +37,7 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages.declaration import Declaration, generic_type
-from dataflow.view import SceneState, ViewOptions, visualize, visualizers
+from dataflow.view import SceneState, ViewOptions, colors, visualize, visualizers
 from dataflow.view.layout import layout
 
 TYPES = [
@@ -105,9 +105,27 @@ def test_inverse_depth_is_decoded(tmp_path: Path) -> None:
 
     png = cv2.imencode(".png", np.array([[0, 110, 210]], np.uint16))[1].ravel()
     message = CompressedDepth(stamp=STAMP, frame="c", quantizer="inverse", scale=100.0, offset=10.0, data=png)
-    found = draw(tmp_path, ("camera/depth", message), options=ViewOptions(compress_depth=False))
+    found = draw(tmp_path, ("camera/depth", message), options=ViewOptions(depth_step=None))
     (buffer,) = at(found, "/camera/depth", "DepthImage:buffer")
     np.testing.assert_allclose(np.frombuffer(bytes(buffer.values[0]), np.float32), [0.0, 1.0, 0.5])
+
+
+def test_depth_keeps_its_colours_and_has_a_scale(tmp_path: Path) -> None:
+    near = DepthImage(stamp=STAMP, frame="c", data=np.full((32, 32), 1.7, np.float32))
+    far = DepthImage(stamp=STAMP + 1, frame="c", data=np.full((32, 32), 40.0, np.float32))
+    found = draw(tmp_path, ("camera/depth", near), ("camera/depth", far))
+    meters = [row.values[0] for row in at(found, "/camera/depth", "EncodedDepthImage:meter")]
+    ranges = [row.values[0] for row in at(found, "/camera/depth", "EncodedDepthImage:depth_range")]
+    np.testing.assert_allclose([end / meter for (_, end), meter in zip(ranges, meters, strict=True)], [2.0, 2.0])
+    (labels,) = at(found, "/camera/depth/scale/marks", "Points2D:labels")
+    assert labels.values == ["0 m", "0.5 m", "1 m", "1.5 m", "2 m"]
+
+
+def test_every_class_can_be_read_on_dark_ground() -> None:
+    for number in range(200):
+        linear = (np.array(colors.of_identity(number)) / 255) ** 2.2
+        luminance = float(linear @ (0.2126, 0.7152, 0.0722))
+        assert (luminance + 0.05) / (0.02 + 0.05) > 4.5
 
 
 def test_detections_lie_in_the_plane_of_their_camera(tmp_path: Path) -> None:
@@ -269,6 +287,7 @@ def test_diagnostics_are_told_when_they_change_and_plotted_by_kind(tmp_path: Pat
     found = draw(tmp_path, *[("d/d", health(t, level)) for t, level in enumerate((0, 0, 2, 2))])
     assert [row.values[0] for row in at(found, "/d/d/log", "TextLog:text")] == ["camera: OK fine", "camera: ERROR hot"]
     assert [row.values[0] for row in at(found, "/d/d/log", "TextLog:level")] == ["INFO", "ERROR"]
+    assert [row.values[0] for row in at(found, "/d/d/status/camera", "StateChange:state")] == ["OK", "ERROR"]
     assert at(found, "/d/d/plot/rate/camera/rate_hz", "Scalars:scalars")[0].values == [30.0]
     assert at(found, "/d/d/plot/latency/camera/latency", "Scalars:scalars")[0].values == [4.5]
 

@@ -7,10 +7,14 @@ import numpy as np
 import rerun as rr
 
 from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 
 _FRUSTUM = (150, 155, 165)
 _DEPTH_COLORS = rr.components.Colormap.Turbo
+_FAR = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0)
+"""Ends of the scale of depths, metres."""
+_SHADES = 32
 
 
 @visualizer(CameraInfo, "image")
@@ -65,17 +69,9 @@ def depth_image(canvas: Canvas, message: DepthImage) -> None:
 @visualizer(CompressedDepth, "image")
 def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
     """As a depth image; the file is passed on as it is where its values are proportional to depth."""
-    if message.quantizer == "linear" and message.offset == 0.0:
-        canvas.draw(
-            "",
-            canvas.plane,
-            rr.EncodedDepthImage(
-                blob=message.data.tobytes(),
-                media_type="image/png",
-                meter=1.0 / message.scale,
-                colormap=_DEPTH_COLORS,
-            ),
-        )
+    proportional = message.quantizer == "linear" and message.offset == 0.0
+    if proportional and (canvas.entity, "depth scale") in canvas.scene.remembered:
+        _encoded_depth(canvas, message.data.tobytes(), 1.0 / message.scale)
         return
     values = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)
     if values is None:
@@ -98,17 +94,70 @@ def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:
     clean = np.where(known, depth, np.float32(0))
     sample = clean[::8, ::8]
     canvas.scene.saw_range(sample[sample > 0])
-    if not canvas.scene.options.compress_depth:
-        canvas.draw("", canvas.plane, rr.DepthImage(clean, meter=1.0, colormap=_DEPTH_COLORS))
+    if (canvas.entity, "depth scale") not in canvas.scene.remembered and (sample > 0).any():
+        _scale(canvas, float(np.percentile(sample[sample > 0], 98)), clean.shape)
+    step = canvas.scene.options.depth_step
+    if step is None:
+        far = canvas.scene.remembered.get((canvas.entity, "depth scale"))
+        picture = rr.DepthImage(clean, meter=1.0, colormap=_DEPTH_COLORS, depth_range=None if far is None else (0, far))
+        canvas.draw("", canvas.plane, picture)
         return
     farthest = float(clean.max(initial=0.0))
-    units = 1000.0 if farthest <= 65.0 else 65000.0 / farthest  # per metre
+    units = min(1.0 / step, 65000.0 / farthest if farthest > 0 else np.inf)  # per metre
     steps = np.rint(clean * np.float32(units)).astype(np.uint16)
-    encoded, png = cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    encoded, png = cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 3])
     if not encoded:
         raise ValueError(f"a depth image of shape {depth.shape} cannot be written as PNG")
+    _encoded_depth(canvas, png.tobytes(), units)
+
+
+def _encoded_depth(canvas: Canvas, png: bytes, units: float) -> None:
+    """A depth PNG with `units` steps per metre, in colours that mean the same from the first image to the last."""
+    far = canvas.scene.remembered.get((canvas.entity, "depth scale"))
     canvas.draw(
         "",
         canvas.plane,
-        rr.EncodedDepthImage(blob=png.tobytes(), media_type="image/png", meter=units, colormap=_DEPTH_COLORS),
+        rr.EncodedDepthImage(
+            blob=png,
+            media_type="image/png",
+            meter=units,
+            colormap=_DEPTH_COLORS,
+            depth_range=None if far is None else (0.0, far * units),
+        ),
+    )
+
+
+def _scale(canvas: Canvas, far: float, shape: tuple[int, ...]) -> None:
+    """Settles for good which depth has the last colour, and draws the bar of colours at the left edge of the image."""
+    end = next((nice for nice in _FAR if nice >= far), float(np.ceil(far)))
+    canvas.scene.remembered[canvas.entity, "depth scale"] = end
+    height, width = shape
+    top, bottom, side = 0.08 * height, 0.92 * height, max(width / 40, 3.0)
+    cuts = np.linspace(bottom, top, _SHADES + 1)
+    column = np.full(_SHADES, 1.5 * side)
+    canvas.log(
+        "scale/bar",
+        rr.CoordinateFrame(canvas.plane),
+        rr.LineStrips2D(
+            np.stack([np.column_stack([column, cuts[:-1]]), np.column_stack([column, cuts[1:]])], axis=1),
+            colors=colors.of_values(np.arange(_SHADES), 0.0, _SHADES - 1.0),
+            radii=side / 2,
+            draw_order=5.0,
+        ),
+        static=True,
+    )
+    marks = np.linspace(0.0, end, 5)
+    rows = bottom - marks / end * (bottom - top)
+    canvas.log(
+        "scale/marks",
+        rr.CoordinateFrame(canvas.plane),
+        rr.Points2D(
+            np.column_stack([np.full(5, 2.0 * side), rows]),
+            colors=(235, 235, 235),
+            radii=rr.Radius.ui_points(1.5),
+            labels=[f"{mark:g} m" for mark in marks],
+            show_labels=True,
+            draw_order=6.0,
+        ),
+        static=True,
     )

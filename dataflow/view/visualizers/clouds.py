@@ -26,7 +26,9 @@ def point_cloud(canvas: Canvas, message: PointCloud) -> None:
         paint = colors.of_values(message.intensities[kept])
     else:
         paint = colors.of_values(points[:, 2])
-    canvas.draw("space", message.frame, rr.Points3D(points, colors=paint, radii=rr.Radius.ui_points(1.5)))
+    step = np.float32(canvas.scene.options.point_step)
+    drawn = np.round(points / step) * step if step else points
+    canvas.draw("space", message.frame, rr.Points3D(drawn, colors=paint, radii=rr.Radius.ui_points(1.5)))
     canvas.scene.saw_points(message.frame, points[::16])
 
 
@@ -77,5 +79,5 @@ def thin(canvas: Canvas, indices: npt.NDArray[np.int64]) -> npt.NDArray[np.int64
     most = canvas.scene.options.max_points
     if len(indices) <= most:
         return indices
-    canvas.notice(f"shown thinned to at most {most:,} points of a message (option max_points)")
+    canvas.notice(f"shown thinned to at most {most:,} points of a message (option max_points)", "INFO")
     return indices[:: -(-len(indices) // most)]

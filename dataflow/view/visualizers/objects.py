@@ -14,7 +14,11 @@ from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.visualizers.clouds import finite_rows
 
-MANY_LABELS = 40  # more labels than this are shown only on hovering
+MANY_LABELS = 24  # more labels than this are shown only on hovering
+_BACKDROP = frozenset(
+    ("background", "building", "ceiling", "floor", "ground", "road", "sidewalk", "sky", "terrain", "vegetation", "wall")
+)
+_BACKDROP_ALPHA = 60  # of 255: the image stays readable
 _RAY = 10.0  # metres: how far a bearing without a range is drawn
 _PATH_VERTICES = 200
 _STILL = 0.05  # m/s
@@ -31,7 +35,7 @@ def detections_2d(canvas: Canvas, message: Detections2D) -> None:
 
 @visualizer(SegmentationMap, "overlay")
 def segmentation_map(canvas: Canvas, message: SegmentationMap) -> None:
-    """Classes as a half-transparent layer in class colours; instances, where known, in a layer of their own."""
+    """Classes as a transparent layer in class colours, walls and floors fainter; instances, where known, apart."""
     if message.classes.size == 0:
         canvas.clear("overlay")
         return
@@ -39,12 +43,13 @@ def segmentation_map(canvas: Canvas, message: SegmentationMap) -> None:
     table = canvas.scene.remembered.setdefault((canvas.entity, "classes"), {})
     for index in known:
         name = message.class_names[index] if message.class_names else str(index)
-        table[index] = rr.AnnotationInfo(id=index, label=name, color=(*colors.of_class(name), 255))
+        alpha = _BACKDROP_ALPHA if name.lower() in _BACKDROP else 255
+        table[index] = rr.AnnotationInfo(id=index, label=name, color=(*colors.of_class(name), alpha))
     if message.void is not None:
         table[message.void] = rr.AnnotationInfo(id=message.void, label="void", color=(0, 0, 0, 0))
     if canvas.scene.changed(canvas.entity, "annotations", tuple((i, table[i].label) for i in sorted(table))):
         canvas.log("overlay", rr.AnnotationContext([table[i] for i in sorted(table)]), static=True)
-    canvas.draw("overlay", canvas.plane, rr.SegmentationImage(message.classes, opacity=0.45, draw_order=1.0))
+    canvas.draw("overlay", canvas.plane, rr.SegmentationImage(message.classes, opacity=0.4, draw_order=1.0))
     if message.instances is not None:
         canvas.draw("instances", canvas.plane, rr.SegmentationImage(message.instances, opacity=0.6))
 

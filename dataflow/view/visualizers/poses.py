@@ -15,6 +15,7 @@ from dataflow.view.visualizers.clouds import finite_rows, thin
 
 _AXIS = 0.15  # metres
 _ARROW = 0.12  # metres: a particle
+_NAMES = 0.3  # metres: from a pose to its name, and from there to the next
 _GAP = 5.0  # metres: a farther step than this is a jump, and no line is drawn along it
 
 
@@ -115,6 +116,7 @@ def _moving(
     if not np.isfinite(T_frame_child).all():
         canvas.clear("space/axes")
         canvas.clear("space/covariance")
+        canvas.clear("space/name")
         canvas.scene.trails.pop(canvas.entity, None)
         return
     if child and child != frame:
@@ -124,6 +126,24 @@ def _moving(
     if covariance is not None:
         _ellipsoid(canvas, frame, position, covariance[:3, :3])
     _trail(canvas, frame, position)
+    _name(canvas, frame, position)
+
+
+def _name(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> None:
+    """The stream's name in the colour of its trail, above the pose; names of several streams one above the other."""
+    rivals = canvas.scene.layout.of_type(Pose, Odometry)
+    height = _NAMES * (1 + rivals.index(canvas.stream)) if canvas.stream in rivals else _NAMES
+    canvas.draw(
+        "space/name",
+        frame,
+        rr.Points3D(
+            [position + np.array([0.0, 0.0, height])],
+            colors=canvas.scene.trail_color(canvas.stream, rivals),
+            radii=rr.Radius.ui_points(1.0),
+            labels=["/".join(canvas.stream.split("/")[-2:])],
+            show_labels=True,
+        ),
+    )
 
 
 def _trail(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> None:

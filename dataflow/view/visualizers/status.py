@@ -12,6 +12,12 @@ from dataflow.messages import Diagnostics, Imu, JointState, Level, MagneticField
 from dataflow.view.canvas import Canvas, visualizer
 
 _LEVELS = {Level.OK: "INFO", Level.WARN: "WARN", Level.ERROR: "ERROR", Level.STALE: "WARN"}
+_LANE = rr.StateConfiguration(
+    values=[level.name for level in Level],
+    labels=["ok", "warning", "error", "stale"],
+    colors=[(60, 170, 90), (230, 180, 40), (215, 60, 60), (130, 135, 145)],
+)
+_DIGITS = re.compile(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?")
 _LATENCY = re.compile(r"latency|lag|delay|duration|age|_ms$|_s$|time")
 _RATE = re.compile(r"rate|hz|fps|frequency|throughput")
 
@@ -46,13 +52,20 @@ def joint_state(canvas: Canvas, message: JointState) -> None:
             canvas.plot(what, values, message.names)
 
 
-@visualizer(Diagnostics, "log", "plot")
+@visualizer(Diagnostics, "status", "log", "plot")
 def diagnostics(canvas: Canvas, message: Diagnostics) -> None:
-    """A line of text when a status changes; numeric values as curves, latencies and rates in plots of their own."""
+    """A lane from green to red for each status, a line of text when it changes by more than its numbers, and curves.
+
+    Latencies and rates among the numeric values have plots of their own.
+    """
     for i, name in enumerate(message.names):
         level = Level(int(message.levels[i]))
-        state = (level, message.messages[i])
-        if canvas.scene.changed(canvas.entity, f"status {name}", state):
+        lane = f"status/{rr.escape_entity_path_part(name)}"
+        if canvas.scene.changed(canvas.entity, lane, level):
+            if canvas.scene.once(canvas.stream, lane):
+                canvas.log(lane, _LANE, static=True)
+            canvas.log(lane, rr.StateChange(state=level.name))
+        if canvas.scene.changed(canvas.entity, f"text {name}", (level, _DIGITS.sub("", message.messages[i]))):
             canvas.text(f"{name}: {level.name} {message.messages[i]}".rstrip(), _LEVELS[level])
         for key, value in message.pairs(i).items():
             number = _number(value)

@@ -1,0 +1,74 @@
+"""Scores depth images against ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from dataflow.messages import DepthImage
+from dataflow.operator import Batch, Duration, In, Operator, Param
+from operators.evaluation.depth_error import DepthErrors, depth_errors
+from operators.evaluation.pairing import Pairing
+
+
+class DepthMetrics(Operator):
+    """Collects depth images and the true ones, pixel for pixel, and computes errors when the depths end.
+
+    Images are paired each with the truth nearest in time within `tolerance`; images without a partner are counted and
+    not scored. Figures are means over the images that have a depth to judge, with the worst image's RMSE beside them;
+    `measured` is the share of the pixels with a known true depth that have one. Both must be of one view: the frames'
+    names may differ, as those of two cameras at one place do.
+    """
+
+    depth: In[DepthImage] = In(doc="the depths to score")
+    truth: Batch[DepthImage] = Batch(doc="the true depths at the same pixels")
+
+    tolerance: Duration = Param("1ms", doc="farthest in time that the truth of an image may be")
+    lateness: Duration = Param("1s", doc="truth may arrive so much later than the image it belongs to; kept in memory")
+    max_range: float = Param(100.0, gt=0, doc="pixels whose true depth is farther are not judged", unit="m")
+
+    def setup(self) -> None:
+        self._pairing: Pairing[DepthImage, DepthImage] = Pairing(self.tolerance)
+        self._errors: list[DepthErrors] = []
+
+    def process(self, depth: DepthImage, truth: tuple[DepthImage, ...]) -> None:
+        """Raises ValueError where result and truth have different sizes."""
+        for true in truth:
+            self._pairing.add_truth(true.stamp, true)
+        self._pairing.add_found(depth.stamp, depth)
+        self._judge(self._pairing.settle(depth.stamp - self.lateness))
+
+    def on_reset(self, input: str) -> None:
+        """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
+        self.setup()
+
+    def finish(self) -> None:
+        """Judges the images that waited for their truth."""
+        self._judge(self._pairing.finish())
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        figures: dict[str, float | int | str] = {
+            "frames": self._pairing.pairs,
+            "unmatched_depths": self._pairing.unmatched_found,
+            "unmatched_truths": self._pairing.unmatched_truths,
+            "frames_without_depth": sum(not e.measured for e in self._errors),
+        }
+        judged = sum(e.judged for e in self._errors)
+        if judged:
+            figures["measured"] = sum(e.measured for e in self._errors) / judged
+        scored = [e for e in self._errors if e.measured]
+        if not scored:
+            return figures | {"rmse_m": "not computed: no pixel of the paired images has a depth and a true one"}
+        return figures | {
+            "rmse_m": float(np.mean([e.rmse for e in scored])),
+            "worst_rmse_m": max(e.rmse for e in scored),
+            "mean_relative_error": float(np.mean([e.relative for e in scored])),
+            "median_relative_error": float(np.mean([e.middle for e in scored])),
+            "within_25_percent": float(np.mean([e.near for e in scored])),
+        }
+
+    def _judge(self, pairs: list[tuple[DepthImage, DepthImage]]) -> None:
+        limit = np.float32(self.max_range)
+        for found, true in pairs:
+            self._errors.append(depth_errors(found.data, np.where(true.data <= limit, true.data, 0)))
