@@ -4,12 +4,12 @@
     python benchmarks/start.py --against OTHER_TREE     # another checkout in turns with this one: ratios
     python benchmarks/start.py --only attach,first
 
-Each figure is taken from the start of the command, Python's own start included, with compiled modules (a first run makes
-them). `first message`: until the sink of a graph of seven light operators, a process each, gets one. `echo`, `hz`,
-`view` attach to such a graph while it runs: until the first line, the first table (on a terminal), and until the viewer
-file follows it. Replays and verifications are of recordings/demo.mcap through graphs/simulated_robot.yaml: `start and
-close` is what the command takes beyond its sources' and operators' run; efficiency is the CPU time of the operators'
-calls divided by that run's time, and by the cores that it may use.
+Each figure is taken from the start of the command, Python's own start included, with compiled modules (a first run
+makes them). `first message`: until the sink of a graph of seven light operators, a process each, gets one. `echo`,
+`hz`, `view` attach to such a graph while it runs: until the first line, the first table (on a terminal), and until
+the viewer file follows it. Replays and verifications are of recordings/demo.mcap through graphs/simulated_robot.yaml:
+`start and close` is what the command takes beyond its sources' and operators' run; efficiency is the CPU time of the
+operators' calls divided by that run's time, and by the cores that it may use.
 """
 
 from __future__ import annotations

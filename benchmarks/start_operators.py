@@ -1,4 +1,4 @@
-"""Operators for the benchmark of starting: a source at the pace of a camera, and a sink that notes its first message."""
+"""Operators for the benchmark of starting: a source as quick as an IMU, and a sink that notes its first message."""
 
 from __future__ import annotations
 

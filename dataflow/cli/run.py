@@ -82,7 +82,6 @@ def run(
     existing(graph, "a graph file")
     find_modules_in(path)
     with early_nursery() as early, friendly_errors():
-        from dataflow.chaos.plan import load_plan
         from dataflow.graph import load_graph
         from dataflow.supervision.run import run as run_graph
 
@@ -92,6 +91,8 @@ def run(
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live
         if chaos is not None:
+            from dataflow.chaos.plan import load_plan
+
             options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
         execute(
             lambda watch: run_graph(loaded, watch=watch, early=early, **options),

@@ -17,7 +17,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.graph.lookup import NotFound, find_operator, is_concrete
+from dataflow.graph.lookup import NotFound, find_operator, is_concrete, offered
 from dataflow.graph.problems import did_you_mean
 from dataflow.operator import InputPort, Operator, OutputPort, is_live, is_source
 from dataflow.sync.stamps import format_duration, parse_duration
@@ -66,7 +66,7 @@ def discover(packages: Iterable[str] | None = None) -> Catalogue:
     found: dict[type[Operator], str] = {}
     for root in roots:
         for module in _modules(root, failures):
-            for name, value in sorted(vars(module).items()):
+            for name, value in offered(module):
                 if not _is_own(value, name, root):
                     continue
                 path = f"{module.__name__}:{name}"
