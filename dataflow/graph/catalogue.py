@@ -67,7 +67,7 @@ def discover(packages: Iterable[str] | None = None) -> Catalogue:
     for root in roots:
         for module in _modules(root, failures):
             for name, value in offered(module):
-                if not _is_own(value, name, root):
+                if not _is_own(value, root):
                     continue
                 path = f"{module.__name__}:{name}"
                 known = found.get(value)
@@ -81,12 +81,9 @@ def _advertised() -> list[str]:
     return sorted({entry.module for entry in entry_points(group=ENTRY_POINTS)})
 
 
-def _is_own(value: object, name: str, root: str) -> bool:
+def _is_own(value: type[Operator], root: str) -> bool:
     return (
-        isinstance(value, type)
-        and issubclass(value, Operator)
-        and is_concrete(value)
-        and not name.startswith("_")
+        is_concrete(value)
         and not value.__name__.startswith("_")
         and (value.__module__ == root or value.__module__.startswith(f"{root}."))
     )

@@ -82,18 +82,16 @@ def import_module(name: str) -> ModuleType | NotFound:
 
 def operator_names(module: ModuleType) -> list[str]:
     """Names of the usable operators that a module offers, its imports included."""
-    return sorted(
-        name
-        for name, value in offered(module)
-        if isinstance(value, type) and issubclass(value, Operator) and is_concrete(value) and not name.startswith("_")
-    )
+    return [name for name, value in offered(module) if is_concrete(value)]
 
 
-def offered(module: ModuleType) -> Iterator[tuple[str, object]]:
-    """Yields what a module offers by name, also what it imports only when it is asked; not what fails to import."""
+def offered(module: ModuleType) -> Iterator[tuple[str, type[Operator]]]:
+    """Yields the operators that a module offers by name, also what it imports only when it is asked."""
     for name in dir(module):
-        with contextlib.suppress(Exception, SystemExit):
-            yield name, getattr(module, name)
+        with contextlib.suppress(Exception, SystemExit):  # one that fails to import is named when its module is
+            value = getattr(module, name)
+            if isinstance(value, type) and issubclass(value, Operator) and not name.startswith("_"):
+                yield name, value
 
 
 def is_concrete(cls: type[Operator]) -> bool:
