@@ -8,6 +8,7 @@ from typing import Any
 
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.feeds.log import LogFeed
+from dataflow.feeds.numbering import gapless
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.live import LiveRunner
 from dataflow.firing.ports import Emitter
@@ -118,6 +119,7 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
         finals=replay["finals"],
         start=replay["start"],
         end=replay["end"],
+        numbered=gapless,
     )
 
 
