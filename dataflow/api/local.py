@@ -281,10 +281,11 @@ def _losses(drops: Mapping[tuple[str, str], int]) -> tuple[tuple[str, str, int],
 
 def _config(graph: Graph, log: LogPlan | None, paranoid: bool) -> ProcessConfig:
     """Returns what a process of its own would be told."""
-    replay = None
+    replay: dict[str, Any] | None = None
     if log is not None:
         span = {"start": log.start, "end": log.end}
-        replay = {"path": str(log.path), "streams": list(log.streams), "finals": dict(log.finals), **span}
+        made = {"path": str(log.path), "streams": list(log.streams), "finals": dict(log.finals)}
+        replay = {**made, **span, "bag": log.bag}
     return ProcessConfig(
         label="here",
         graph={},
@@ -295,7 +296,9 @@ def _config(graph: Graph, log: LogPlan | None, paranoid: bool) -> ProcessConfig:
         replay=replay,
         paranoid=paranoid,
         snapshots=graph.record.snapshots,
-        warm=None if log is None or log.start is None else {"path": str(log.path), "stamp": log.start},
+        warm=None
+        if log is None or log.start is None or log.bag is not None
+        else {"path": str(log.path), "stamp": log.start},
     )
 
 

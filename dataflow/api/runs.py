@@ -17,9 +17,12 @@ from dataflow.api.recordings import RecordedStreams, open
 from dataflow.firing import seeding
 from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph import load_graph
+from dataflow.interop.clocks import Choice
+from dataflow.interop.opening import is_foreign
+from dataflow.interop.playing import play
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
-from dataflow.recording.layout import RUN
+from dataflow.recording.layout import BAG, RUN
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport
@@ -124,20 +127,33 @@ def replay(
     overwrite: bool = False,
     settings: Mapping[str, Any] | None = None,
     paranoid: bool = False,
+    maps: Mapping[str, str] | None = None,
+    clock: Choice = "auto",
     watch: Watch | None = None,
 ) -> RunResult:
     """Replays a recording in this process, through the graph that made it or another one with the same sources.
 
     Recorded streams replace the sources; everything else runs again. `start`, `end`: seconds from the first message;
-    operators begin in the state that they had at `start`. Raises `ReplayError`, `GraphError`, `RunFailed`.
+    operators begin in the state that they had at `start`. A ROS bag (file or folder) or any MCAP plays into `graph`
+    too: `maps` says which topic stands in for which stream (`{"/camera/image_raw": "camera/image"}`), where types leave
+    a choice; `clock` whether headers or log times stamp it. Raises `ReplayError`, `GraphError`, `RunFailed`, and
+    `MappingError` that lists the topics.
     """
     path = Path(recording)
-    with Recording(path) as opened:
-        built = recorded_graph(opened) if graph is None else resolved(graph, settings)
-        log = plan_replay(opened, built, start=start, end=end)
+    facts: dict[str, dict[str, str]] = {}
+    if graph is not None and is_foreign(path):
+        built = resolved(graph, settings)
+        words = [f"{topic}={stream}" for topic, stream in (maps or {}).items()]
+        with play(path, built, words, clock) as bag:
+            log = plan_replay(bag, built, start=start, end=end)
+            facts = {BAG: bag.facts()}
+    else:
+        with Recording(path) as opened:
+            built = recorded_graph(opened) if graph is None else resolved(graph, settings)
+            log = plan_replay(opened, built, start=start, end=end)
     file = None if record is None else Path(record)
     report = LocalRun(built, log=log, paranoid=paranoid).execute(
-        record=file, metadata=_metadata(built, "replay"), overwrite=overwrite, watch=watch
+        record=file, metadata=facts | _metadata(built, "replay"), overwrite=overwrite, watch=watch
     )
     return RunResult(report, file)
 

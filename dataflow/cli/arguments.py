@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from dataflow.cli.output import fail, seconds
 
 if TYPE_CHECKING:
-    from dataflow.recording import Recording
+    from dataflow.feeds.playable import PlayableStreams
 
 FLAG = " "
 """The metavar of an option without a value: nothing is shown."""
@@ -31,6 +31,25 @@ Settings = Annotated[
     typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
 ]
 GraphFile = Annotated[Path, typer.Argument(metavar="GRAPH", help="A graph file (.yaml).")]
+AnyRecording = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder.")
+]
+Map = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--map",
+        metavar="TOPIC=STREAM",
+        help="Of a bag: the topic that stands in for a stream of the graph's sources. May be repeated.",
+    ),
+]
+Clock = Annotated[
+    Literal["auto", "header", "log"],
+    typer.Option(
+        "--clock",
+        metavar="auto|header|log",
+        help="Of a bag: stamp messages with the time in their headers, or with the time of their recording.",
+    ),
+]
 RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
 Start = Annotated[
     float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the recording's first message.")
@@ -79,6 +98,11 @@ def existing(path: Path, what: str) -> Path:
         raise fail(f"no file {path}: there is no folder {folder}")
     near = nearest(path.name, sorted(p.name for p in folder.iterdir() if p.is_file()))
     raise fail(f"no file {path}" + (f"; did you mean {folder / near}?" if near else f"; expected {what}"))
+
+
+def existing_recording(path: Path) -> Path:
+    """`path` of a recording or a bag, which may be a folder; or an error that names what could be meant."""
+    return path if path.is_dir() else existing(path, "a recording")
 
 
 def find_modules_in(folders: Sequence[Path] | None) -> None:
@@ -134,7 +158,7 @@ def chosen_streams(words: Sequence[str] | None, names: Iterable[str], namespace:
     return [name for name in known if name in found]
 
 
-def span(recording: Recording, streams: Iterable[str]) -> tuple[int, int] | None:
+def span(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] | None:
     """The first and the last stamp (ns) of those streams that are not static; None when they hold no message."""
     infos = [recording.streams[s] for s in streams if not recording.streams[s].static]
     firsts = [info.first for info in infos if info.first is not None]

@@ -143,6 +143,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     from dataflow.chaos.plan import ChaosError
     from dataflow.client.attach import NotRunning
     from dataflow.graph import GraphError, OperatorImportError
+    from dataflow.interop.mapping import MappingError
     from dataflow.messages import MessageError
     from dataflow.operator import ParameterError
     from dataflow.recording import RecordingError
@@ -159,6 +160,7 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
         NotRunning,
         RegistryError,
         ChaosError,
+        MappingError,
     )
     viewer = sys.modules.get("dataflow.view.process")  # importing it takes long; an error of it has imported it
     match error:

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, RecordingFile, existing
+from dataflow.cli.arguments import FLAG, AnyRecording, Json, existing, existing_recording
 from dataflow.cli.output import (
     DIFFERENT,
     count,
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 def info(
-    recording: RecordingFile,
+    recording: AnyRecording,
     digests: Annotated[
         bool, typer.Option("--digests", metavar=FLAG, help="Read everything and print each stream's digest.")
     ] = False,
@@ -42,19 +42,29 @@ def info(
 ) -> None:
     """Describe a recording: streams, types, counts, rates, what made it.
 
-    Any MCAP file will do, a torn one too.
+    Any MCAP file will do, a torn one too, and ROS 1 and ROS 2 bags (.bag, .db3, .mcap, folders): of those it tells
+    what each topic can be replayed as.
 
     Examples:
 
       dataflow info run.mcap
       dataflow info run.mcap --metadata
       dataflow info run.mcap --digests --json
+      dataflow info drive.bag
     """
+    from dataflow.cli.bags import describe_bag
+    from dataflow.interop.opening import is_foreign
     from dataflow.recording import Recording
     from dataflow.recording.info import describe
     from dataflow.recording.layout import RECORDING
 
-    with friendly_errors(), Recording(existing(recording, "a recording")) as opened:
+    with friendly_errors():
+        if is_foreign(existing_recording(recording)):
+            if digests or metadata:
+                raise fail("--digests and --metadata tell of recordings; of a bag there are neither")
+            describe_bag(recording, json=json)
+            return
+    with friendly_errors(), Recording(recording) as opened:
         described = describe(opened)
         computed = dict(opened.digests()) if digests else None
     if json:

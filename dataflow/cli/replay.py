@@ -11,13 +11,16 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.arguments import (
+    AnyRecording,
+    Clock,
     End,
+    Map,
     ModuleFolders,
     Network,
-    RecordingFile,
     Settings,
     Start,
     existing,
+    existing_recording,
     find_modules_in,
     output_file,
     span,
@@ -47,11 +50,13 @@ if TYPE_CHECKING:
 
 
 def replay(
-    recording: RecordingFile,
+    recording: AnyRecording,
     graph: Annotated[
         Path | None,
         typer.Option("--graph", metavar="GRAPH", help="Another graph than the one that made the recording."),
     ] = None,
+    maps: Map = None,
+    clock: Clock = "auto",
     settings: Settings = None,
     path: ModuleFolders = None,
     start: Start = None,
@@ -85,6 +90,11 @@ def replay(
     it with `dataflow diff`. With --start, operators begin in the state they had then, where the recording is of the
     same operators: their last recorded snapshot, and what they did since, repeated.
 
+    A ROS 1 or ROS 2 bag (file or folder) or any MCAP stands in for the sources of a graph, which --graph names: --map
+    says which topic feeds which stream. Without it, topics are matched by message type, and where that leaves a choice,
+    the error proposes what to say. Messages are stamped with the time in their headers, or where that cannot be trusted
+    with the time of their recording; which, and why, is printed.
+
     With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
     nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded
     digest. Where one comes out otherwise, nothing is written and the exit code is 1; also 1 where firings could not be
@@ -104,12 +114,13 @@ def replay(
       dataflow replay run.mcap --graph other.yaml --set cloud.stride=8
       dataflow replay run.mcap --record again.mcap --view again.rrd --open
       dataflow replay thin.mcap --complete full.mcap
+      dataflow replay drive.bag --graph g.yaml --map /rgb=camera/image
     """
     began = time.monotonic()
     from dataflow.supervision.early import early_nursery
 
     with friendly_errors(), ExitStack() as stack:
-        existing(recording, "a recording")
+        existing_recording(recording)
         if record is not None and record.exists() and record.samefile(recording):
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
         if graph is None and settings:
@@ -117,11 +128,28 @@ def replay(
         find_modules_in(path)
         early = None if complete is not None else stack.enter_context(early_nursery())
         from dataflow.graph import load_graph
+        from dataflow.interop.opening import is_foreign, open_bag
         from dataflow.recording import Recording
         from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
         from dataflow.supervision.replay import plan_replay
         from dataflow.supervision.run import replay as replay_recording
 
+        if maps or is_foreign(recording):
+            from dataflow.cli.bags import replay_bag
+
+            if graph is None:
+                open_bag(recording).close()
+                raise fail(f"{recording} does not hold the graph that made it: name one with --graph")
+            if complete is not None:
+                raise fail("--complete needs the firing records of a run, which bags do not hold")
+            loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+            outputs = checked_outputs(record, view, open_view, overwrite)
+            options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
+            options["early"] = early
+            replay_bag(
+                recording, loaded, maps or (), clock, start, end, outputs, options, began=began, json=json, quiet=quiet
+            )
+            return
         with Recording(recording) as opened:
             if graph is None:
                 recorded = graph_as_recorded(opened)

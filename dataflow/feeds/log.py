@@ -6,12 +6,13 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dataflow.feeds.playable import PlayableStreams
 from dataflow.feeds.promises import promises
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter
 from dataflow.firing.work import Work
 from dataflow.messages.digest import StreamDigest
-from dataflow.recording import Recorded, Recording
+from dataflow.recording import Recorded
 from dataflow.records.firing import Emission
 from dataflow.sync import FOREVER, NEVER, Entry
 
@@ -50,7 +51,7 @@ class LogFeed:
 
     def __init__(
         self,
-        recording: Recording,
+        recording: PlayableStreams,
         streams: Mapping[str, str],
         emitter: Emitter,
         *,
@@ -189,7 +190,7 @@ class LogFeed:
             records.add("finish", self.last, time.time_ns(), outputs=(None,) * len(self._ports[node]))
 
     def close(self) -> None:
-        self.recording.__exit__(None, None, None)
+        self.recording.close()
 
     def counts(self) -> Iterable[tuple[str, int, str]]:
         """(stream, messages, digest) of all streams."""

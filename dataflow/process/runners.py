@@ -17,8 +17,8 @@ from dataflow.firing.ready import Ready
 from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Graph, Node
+from dataflow.interop.streams import recorded_streams
 from dataflow.process.config import ProcessConfig, Resumed
-from dataflow.recording import Recording
 from dataflow.records.black_box import BlackBox, Reached
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Envelope, Kind
@@ -112,7 +112,7 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
         return None
     nodes = {graph.streams[s].node for s in replay["streams"]}
     return LogFeed(
-        Recording(replay["path"]),
+        recorded_streams(Path(replay["path"]), replay["bag"]),
         {s: graph.streams[s].node for s in replay["streams"]},
         emitter,
         ports={n: tuple(graph.nodes[n].outputs.values()) for n in nodes},

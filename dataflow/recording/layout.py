@@ -14,6 +14,8 @@ RUN: Final = "dataflow:run"
 ENDS: Final = "dataflow:ends"
 OUTCOME: Final = "dataflow:outcome"
 COMPLETED: Final = "dataflow:completed"
+BAG: Final = "dataflow:bag"
+"""Of a replay of another system's bag: its file, clock, topics and repairs."""
 RESERVED_METADATA: Final = frozenset({RECORDING, DIGESTS})
 FIELDS: Final = "fields"
 """Key of a stream's channel metadata: the declaration of a type that is not of `dataflow.messages`, as JSON."""

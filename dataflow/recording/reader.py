@@ -218,6 +218,10 @@ class Recording:
             found[stream.info.name] = digest.hexdigest()
         return found
 
+    def opening(self) -> Mapping[str, Any] | None:
+        """None: the path alone suffices to open the same streams in another process."""
+        return None
+
     def close(self) -> None:
         """Closes the file. Idempotent."""
         self._file.close()

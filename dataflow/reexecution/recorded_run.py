@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+from dataflow.feeds.playable import PlayableStreams
 from dataflow.firing.seeding import version_of
 from dataflow.graph import load_bundle
 from dataflow.graph.model import Graph, Network
@@ -20,7 +21,7 @@ class ReplayError(ValueError):
     """A recording that cannot drive a graph: says which stream is missing and what would help."""
 
 
-def recorded_graph(recording: Recording) -> Graph:
+def recorded_graph(recording: PlayableStreams) -> Graph:
     """Returns the graph that made a recording, without its network: a recording opens no port and calls nobody.
 
     Its operators are imported. Raises `ReplayError` when the recording does not hold a graph, `GraphError`.
@@ -33,7 +34,7 @@ def isolated(graph: Graph) -> Graph:
     return replace(graph, network=Network(shared_memory=graph.network.shared_memory))
 
 
-def graph_as_recorded(recording: Recording) -> Graph:
+def graph_as_recorded(recording: PlayableStreams) -> Graph:
     """Returns the graph that made a recording, as it is; its operators are imported. Raises as `recorded_graph`."""
     bundle = recording.metadata.get(GRAPH, {}).get("bundle")
     if bundle is None:
@@ -81,7 +82,7 @@ def graph_metadata(graph: Graph) -> dict[str, dict[str, str]]:
     }
 
 
-def check_type(recording: Recording, graph: Graph, stream: str) -> None:
+def check_type(recording: PlayableStreams, graph: Graph, stream: str) -> None:
     """Raises `ReplayError` unless a recorded stream holds what the graph's stream of that name carries."""
     info = recording.streams[stream]
     wanted = graph.streams[stream].types
@@ -102,7 +103,7 @@ def check_type(recording: Recording, graph: Graph, stream: str) -> None:
         )
 
 
-def final_stamps(recording: Recording, streams: Iterable[str]) -> dict[str, int]:
+def final_stamps(recording: PlayableStreams, streams: Iterable[str]) -> dict[str, int]:
     """The stamps that streams ended with in the recorded run, where the recording says so.
 
     Raises `RecordingError` where it cannot be read.

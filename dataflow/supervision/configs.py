@@ -85,11 +85,12 @@ def _log(plan: RunPlan) -> dict[str, Any]:
         "finals": dict(log.finals),
         "start": log.start,
         "end": log.end,
+        "bag": log.bag,
     }
 
 
 def _warm_start(plan: RunPlan) -> dict[str, Any] | None:
     log = plan.log
-    if log is None or log.start is None:
+    if log is None or log.start is None or log.bag is not None:
         return None
     return {"path": str(log.path), "stamp": log.start}

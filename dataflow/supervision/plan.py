@@ -20,13 +20,17 @@ VIEWER_FILE = "@view"
 
 @dataclass(frozen=True, slots=True)
 class LogPlan:
-    """Recorded streams that stand in for sources: stream names, the stamps they ended with, and the span (ns)."""
+    """Recorded streams that stand in for sources: stream names, the stamps they ended with, and the span (ns).
+
+    `bag`: how the bag of another system is opened as such streams; None for a recording.
+    """
 
     path: Path
     streams: tuple[str, ...]
     finals: Mapping[str, int] = field(default_factory=dict)
     start: int | None = None
     end: int | None = None
+    bag: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True, slots=True)

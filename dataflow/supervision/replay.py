@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection
 from pathlib import Path
 
+from dataflow.feeds.playable import PlayableStreams
 from dataflow.graph.model import Graph
-from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
 from dataflow.supervision.plan import LogPlan
 
 
 def plan_replay(
-    recording: Recording,
+    recording: PlayableStreams,
     graph: Graph,
     *,
     replaced: Collection[str] | None = None,
@@ -53,4 +53,5 @@ def plan_replay(
         finals=final_stamps(recording, streams),
         start=None if start is None else first + round(start * 1e9),
         end=None if end is None else first + round(end * 1e9),
+        bag=recording.opening(),
     )

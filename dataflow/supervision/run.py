@@ -5,11 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from dataflow.feeds.playable import PlayableStreams
 from dataflow.firing import seeding
 from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
@@ -32,7 +33,7 @@ def run(graph: Graph, *, watch: Watch | None = None, early: EarlyNursery | None 
 
 
 def replay(
-    path: Path,
+    played: Path | PlayableStreams,
     *,
     graph: Graph | None = None,
     start: float | None = None,
@@ -43,13 +44,14 @@ def replay(
 ) -> RunReport:
     """Replays a recording through the graph that made it, or another one with the same sources.
 
+    `played`: a recording by its path, or recorded streams that are open already, such as those of a bag; they stay so.
     `start` and `end` are seconds from the recording's first message. Further options are the fields of `RunPlan`.
     Raises `ReplayError`, `RunFailed`.
     """
-    with Recording(path) as recording:
-        played = graph or recorded_graph(recording)
-        log = plan_replay(recording, played, start=start, end=end)
-    return execute(RunPlan(played, log=log, **options), mode="replay", watch=watch, early=early)
+    with Recording(played) if isinstance(played, Path) else nullcontext(played) as recording:
+        loaded = graph or recorded_graph(recording)
+        log = plan_replay(recording, loaded, start=start, end=end)
+    return execute(RunPlan(loaded, log=log, **options), mode="replay", watch=watch, early=early)
 
 
 def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None, early: EarlyNursery | None = None) -> RunReport:
@@ -79,7 +81,7 @@ def _metadata(plan: RunPlan, mode: str) -> Mapping[str, Mapping[str, str]]:
         **{f"process of {node}": label for node, label in placed.items()},
     }
     facts = machine_facts(environment(plan.graph.threads))
-    return {**graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}
+    return {**plan.metadata, **graph_metadata(plan.graph), "dataflow:run": run_facts, **facts}
 
 
 @contextmanager

@@ -9,6 +9,15 @@ if TYPE_CHECKING:
     from operators.sources.euroc_imu import EurocImu
     from operators.sources.kitti_odometry import KittiOdometry
     from operators.sources.kitti_raw import KittiRaw
+    from operators.sources.recorded import (
+        RecordedCamera,
+        RecordedImu,
+        RecordedLidar,
+        RecordedPose,
+        RecordedRgbdCamera,
+        RecordedStereoCamera,
+        RecordedTransforms,
+    )
     from operators.sources.rgbd_folder import RgbdFolder
     from operators.sources.simulated_robot import SimulatedRobot
     from operators.sources.synthetic_rgbd import SyntheticRgbd
@@ -21,6 +30,15 @@ else:  # most need a library of their own, which a graph without them need not l
             "euroc_imu": ("EurocImu",),
             "kitti_odometry": ("KittiOdometry",),
             "kitti_raw": ("KittiRaw",),
+            "recorded": (
+                "RecordedCamera",
+                "RecordedImu",
+                "RecordedLidar",
+                "RecordedPose",
+                "RecordedRgbdCamera",
+                "RecordedStereoCamera",
+                "RecordedTransforms",
+            ),
             "rgbd_folder": ("RgbdFolder",),
             "simulated_robot": ("SimulatedRobot",),
             "synthetic_rgbd": ("SyntheticRgbd",),
@@ -33,6 +51,13 @@ __all__ = [
     "EurocImu",
     "KittiOdometry",
     "KittiRaw",
+    "RecordedCamera",
+    "RecordedImu",
+    "RecordedLidar",
+    "RecordedPose",
+    "RecordedRgbdCamera",
+    "RecordedStereoCamera",
+    "RecordedTransforms",
     "RgbdFolder",
     "SimulatedRobot",
     "SyntheticRgbd",

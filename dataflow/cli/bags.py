@@ -1,0 +1,147 @@
+"""Bags of other systems on the command line: replayed through a graph, described."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn
+from rich.text import Text
+
+from dataflow.cli.arguments import span, window
+from dataflow.cli.execution import Outputs, execute
+from dataflow.cli.output import count, err, out, plural, print_json, say, seconds, size, table
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from dataflow.graph import Graph
+    from dataflow.interop.playing import Matching
+    from dataflow.interop.streams import BagStreams
+
+WORDS = {
+    "reordered": "put in order",
+    "repeated": "recorded twice, once left out",
+    "moved": "of an equal stamp, put 1 ns later",
+    "merged": "joined with others of their stamp",
+    "before_epoch": "before 1970, left out",
+}
+
+
+def replay_bag(
+    path: Path,
+    graph: Graph,
+    maps: Sequence[str],
+    clock: Literal["auto", "header", "log"],
+    start: float | None,
+    end: float | None,
+    outputs: Outputs,
+    options: dict[str, Any],
+    *,
+    began: float,
+    json: bool,
+    quiet: bool,
+) -> None:
+    """Replays a bag through a graph, and says what of it is played, by which clock, and what was repaired."""
+    from dataflow.interop.playing import match
+    from dataflow.interop.streams import BagStreams
+    from dataflow.recording.layout import BAG
+    from dataflow.supervision.replay import plan_replay
+    from dataflow.supervision.run import replay
+
+    matching = match(path, graph, maps)
+    with _counting(quiet) as watch, BagStreams(path, matching.played(), clock, watch=watch) as opened:
+        if not quiet:
+            say_what_is_played(matching, opened)
+        whole = span(opened, plan_replay(opened, graph).streams)
+        begin, finish = window(whole, start, end, path)
+        shown = None if whole is None else (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
+        metadata = {BAG: opened.facts()}
+        execute(
+            lambda watch: replay(opened, graph=graph, start=start, end=end, watch=watch, metadata=metadata, **options),
+            graph,
+            outputs,
+            shown,
+            began=began,
+            json=json,
+            quiet=quiet,
+        )
+
+
+def say_what_is_played(matching: Matching, opened: BagStreams) -> None:
+    """A line for each stream, one for the clock, one for each repair, on standard error."""
+    for note in opened.notes:
+        say(f"[yellow]{escape(note)}[/]")
+    names = {wanted.stream: wanted.name for wanted in matching.wanted}
+    for stream, played in opened.played.items():
+        info = opened.streams[stream]
+        what = opened.static_notes.get(stream, "static" if played.static else plural(info.count, "message"))
+        say(f"[dim]{escape(played.topic)} → {escape(names[stream])}: {played.type}, {what}[/]")
+        if left := opened.left_out(played.topic):
+            say(
+                f"[yellow]{escape(played.topic)}: fields without a place in {played.type}: {escape(', '.join(left))}[/]"
+            )
+    what = "header stamps" if opened.clock.kind == "header" else "log times"
+    say(f"[dim]stamped with {what}: {escape(opened.clock.why)}[/]")
+    for topic, mended in opened.repairs.items():
+        for name, number in mended.facts().items():
+            say(f"[dim]{escape(topic)}: {plural(number, 'message')} {WORDS[name]}[/]")
+
+
+@contextmanager
+def _counting(quiet: bool) -> Iterator[Callable[[int], None] | None]:
+    """Shows how many messages the first pass over a bag has seen."""
+    if quiet or not err.is_terminal:
+        yield None
+        return
+    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
+        task = progress.add_task("reading times")
+        yield lambda seen: progress.update(task, description=f"reading times · {count(seen)} messages")
+
+
+def describe_bag(path: Path, *, json: bool) -> None:
+    """Prints the topics of a bag: types, counts, rates, and what each can be played as."""
+    from dataflow.interop.opening import open_bag
+    from dataflow.interop.playing import readings_of
+    from dataflow.interop.summary import summaries, total
+    from dataflow.sync.stamps import format_stamp
+
+    bag = open_bag(path)
+    try:
+        rows = summaries(bag, readings_of(bag))
+        kind, notes = bag.kind, bag.notes
+    finally:
+        bag.close()
+    whole = total(rows)
+    if json:
+        facts = {"path": str(path), "format": kind, "notes": list(notes), "bytes": _bytes(path)}
+        print_json(facts | {"topics": [row.as_json() for row in rows]} | whole.as_json())
+        return
+    grid = table("", "")
+    grid.box, grid.show_header = None, False
+    for name, value in (
+        ("file", str(path)),
+        ("format", kind),
+        ("size", size(_bytes(path))),
+        *(("note", note) for note in notes),
+        *((("from", format_stamp(whole.first)), ("to", format_stamp(whole.last))) if whole.messages else ()),
+        ("duration", seconds(whole.duration * 1e-9)),
+        ("messages", count(whole.messages)),
+    ):
+        grid.add_row(Text(name, style="dim"), Text(value))
+    out.print(grid)
+    numbers = ("messages", "Hz")
+    made = table("topic", "type", *numbers, "read as", "", right=numbers)
+    for row in rows:
+        rate = "" if row.rate is None else f"{row.rate:.2f}"
+        notes_of = ", ".join(row.notes)
+        made.add_row(*map(Text, (row.topic, row.type, count(row.count), rate, " or ".join(row.read_as), notes_of)))
+    out.print(made)
+
+
+def _bytes(path: Path) -> int:
+    files = [path] if path.is_file() else [p for p in path.iterdir() if p.is_file()]
+    return sum(p.stat().st_size for p in files)

@@ -1,0 +1,74 @@
+"""A bag: topics of serialised messages in the order in which they were recorded, whatever the file format."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+from dataflow.recording.codecs import SchemaText
+from dataflow.recording.errors import RecordingError
+
+
+class BagError(RecordingError):
+    """A bag that cannot be opened or read: names the file, what is wrong, and what would be right."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic of a bag.
+
+    - `encoding`: of its messages: `cdr`, `ros1`, `protobuf` or `json`.
+    - `schema`: its message type as the file defines it; ROS types are named as in ROS 2 (`sensor_msgs/msg/Imu`).
+    - `count`, `first`, `last`: messages, and the log times of the first and last one (ns).
+    - `latched`: its messages were kept for late subscribers (ROS 1 latching, ROS 2 transient-local durability).
+    - `channel`: what else the file says of it (MCAP channel metadata, QoS profiles).
+    """
+
+    name: str
+    encoding: str
+    schema: SchemaText
+    count: int
+    first: int | None
+    last: int | None
+    bytes: int | None
+    latched: bool
+    channel: Mapping[str, str]
+
+
+class Stored(NamedTuple):
+    """One message of a bag, serialised. `log_time`: when it was recorded (ns); `number`: its place in its topic."""
+
+    topic: str
+    number: int
+    log_time: int
+    data: bytes | memoryview
+
+
+class Bag(Protocol):
+    """A bag opened for reading. Not thread-safe."""
+
+    path: Path
+    kind: str
+    """Format for people, such as `ROS 2 bag (sqlite3)`."""
+    notes: tuple[str, ...]
+    """What of the file is damaged or unusual, for people."""
+
+    @property
+    def topics(self) -> Mapping[str, Topic]:
+        """The topics by name, in alphabetical order."""
+
+    def messages(self, topics: Collection[str]) -> Iterator[Stored]:
+        """Every message of some topics, in the order of log times; equal ones as they stand in the file."""
+
+    def close(self) -> None:
+        """Closes the files. Idempotent."""
+
+
+def is_latched(topic: str, profiles: str = "") -> bool:
+    """Tells whether a topic keeps its messages for late subscribers, by its name or the text of its QoS profiles."""
+    if topic.rpartition("/")[2] == "tf_static":
+        return True
+    compact = profiles.lower().replace(" ", "").replace('"', "")
+    return "durability:transient_local" in compact or "durability:1\n" in compact + "\n"

@@ -1,0 +1,170 @@
+"""Chooses the clock by which the messages of a bag are stamped, and repairs stamps that repeat or go back. Pure.
+
+A message of a bag has the time at which the recorder took it (log time) and, where its type begins with a header, the
+time that its sensor gave it. The latter is when it was measured and the one to work with, unless it cannot be trusted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+Choice = Literal["auto", "header", "log"]
+I64 = npt.NDArray[np.int64]
+
+BACK = 5_000_000_000
+"""A header that goes back by more (ns) tells of a clock that was set, or of a log that was played again."""
+APART = 1_000_000_000
+"""Topics whose headers differ from log time by amounts farther apart (ns) have clocks of their own."""
+NEAR = 1_000_000_000
+"""Headers that differ from log time by less (ns, in the middle) are of the recorder's own clock."""
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """The times of one topic's entries in the order of the log, ns; `header` None where its type carries none.
+
+    `shares`: several messages of one time are usual, since they are of several publishers (transforms).
+    """
+
+    topic: str
+    log: I64
+    header: I64 | None
+    latched: bool = False
+    shares: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The clock that was chosen: `header` or `log`, why, and what is added to log times of messages without a header.
+
+    A latched topic whose headers are not of this clock counts as one without: what it says is valid from when it was
+    heard, whenever it was made.
+    """
+
+    kind: Literal["header", "log"]
+    why: str
+    shift: int = 0
+
+    def stamps(self, times: Times) -> I64:
+        """The stamps of a topic's entries, not repaired yet."""
+        if self.kind == "log":
+            return times.log
+        logged = times.log + self.shift
+        if times.header is None:
+            return logged
+        if times.latched and bool((np.abs(times.header - logged) > APART).any()):
+            return logged
+        return times.header
+
+
+def choose_clock(topics: Sequence[Times], wanted: Choice = "auto") -> Clock:
+    """Returns the one clock for all topics that are used together.
+
+    Header stamps, unless one is missing (zero or negative), goes back by more than 5 s, most of them repeat, or the
+    topics' headers are of different clocks: then log times, for all.
+    """
+    if wanted == "log":
+        return Clock("log", "asked for")
+    with_header = [t for t in topics if t.header is not None and len(t.header)]
+    offsets = {t.topic: _offset(t) for t in with_header if not t.latched}
+    typical = int(np.median(list(offsets.values()))) if offsets else 0
+    shift = 0 if abs(typical) <= NEAR else -typical
+    if wanted == "header":
+        return Clock("header", "asked for", shift)
+    if not with_header:
+        return Clock("log", "no message carries a time of its own")
+    for times in with_header:
+        assert times.header is not None
+        if times.latched:
+            continue
+        count = len(times.header)
+        if unset := int((times.header <= 0).sum()):
+            return Clock("log", f"{unset:,} of {count:,} headers of {times.topic} carry no time")
+        if not times.shares and count > 2 * (distinct := len(np.unique(times.header))):
+            return Clock("log", f"{count:,} headers of {times.topic} carry only {distinct:,} different times")
+        back = int(-np.diff(times.header).min(initial=0))
+        if back > BACK:
+            return Clock("log", f"the headers of {times.topic} go back by {back * 1e-9:.1f} s")
+    if offsets and max(offsets.values()) - min(offsets.values()) > APART:
+        late, early = max(offsets, key=lambda t: offsets[t]), min(offsets, key=lambda t: offsets[t])
+        apart = (offsets[late] - offsets[early]) * 1e-9
+        return Clock("log", f"the headers of {late} and {early} are of different clocks, {apart:.3f} s apart")
+    why = "when it was measured"
+    if shift:
+        why += f"; it runs {abs(typical) * 1e-9:.3f} s {'behind' if typical > 0 else 'ahead of'} the recorder's clock"
+    return Clock("header", why, shift)
+
+
+def _offset(times: Times) -> int:
+    """By how much the log is behind the headers of a topic, in the middle."""
+    assert times.header is not None
+    return int(np.median(times.log - times.header))
+
+
+@dataclass(frozen=True, slots=True)
+class Repair:
+    """Entries of one topic in stamp order.
+
+    - `order`: (M,) the entries that are kept; `stamps`: (M,) their stamps, strictly increasing, or with `merge` equal
+      for those that become one message.
+    - `reordered`: entries that came after one with a later stamp; `repeated`: identical ones left out;
+      `moved`: entries that share their stamp with a different one and were put just after it; `merged`: entries that
+      became part of another message; `before_epoch`: entries left out since their stamp is negative.
+    """
+
+    order: I64
+    stamps: I64
+    reordered: int = 0
+    repeated: int = 0
+    moved: int = 0
+    merged: int = 0
+    before_epoch: int = 0
+
+    def facts(self) -> dict[str, int]:
+        """The numbers of what was repaired, those that are not 0."""
+        names = ("reordered", "repeated", "moved", "merged", "before_epoch")
+        return {name: getattr(self, name) for name in names if getattr(self, name)}
+
+
+def repair(stamps: I64, digests: npt.NDArray[Any], *, merge: bool = False) -> Repair:
+    """Puts entries, given in log order, in the order of their stamps, which then strictly increase.
+
+    Entries of one stamp with the same digest are one message, recorded twice. Different ones are merged where `merge`
+    says that their type can be; else each but the first comes 1 ns after the one before it.
+    """
+    peaks = np.maximum.accumulate(stamps) if len(stamps) else stamps
+    reordered = int((stamps < peaks).sum())
+    order = np.argsort(stamps, kind="stable")
+    negative = int((stamps < 0).sum())
+    order = order[negative:]
+    kept: list[int] = []
+    given: list[int] = []
+    repeated = moved = merged = 0
+    here: set[Any] = set()
+    before = -1
+    last = -1
+    for entry in order.tolist():
+        stamp = int(stamps[entry])
+        digest = digests[entry]
+        if stamp != before:
+            here, before = set(), stamp
+        if digest in here:
+            repeated += 1
+            continue
+        here.add(digest)
+        if merge and len(here) > 1:
+            merged += 1
+        elif not merge and stamp <= last:
+            moved += 1
+            stamp = last + 1
+        last = max(last, stamp)
+        kept.append(entry)
+        given.append(stamp)
+    return Repair(
+        np.array(kept, np.int64), np.array(given, np.int64), reordered, repeated, moved, merged, before_epoch=negative
+    )

@@ -1,0 +1,98 @@
+"""Bags for a graph: which of its sources' streams the topics of a bag stand in for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from dataflow.graph.model import Graph
+from dataflow.interop.bag import Bag
+from dataflow.interop.clocks import Choice
+from dataflow.interop.conversions import offers
+from dataflow.interop.mapping import MappingError, Offered, Proposal, Wanted, parse_map, propose
+from dataflow.interop.opening import open_bag
+from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.topics import Reading
+
+
+@dataclass(frozen=True, slots=True)
+class Matching:
+    """The streams of a graph's sources, the topics of a bag, and what is proposed."""
+
+    path: Path
+    wanted: tuple[Wanted, ...]
+    readings: tuple[Reading, ...]
+    proposal: Proposal
+
+    def played(self) -> dict[str, Played]:
+        """Stream → what stands in for it. Raises `MappingError` where the proposal is not settled."""
+        if not self.proposal.settled:
+            raise MappingError(self.explanation())
+        return {m.wanted.stream: Played(m.topic, m.type, m.wanted.static) for m in self.proposal.matches}
+
+    def options(self) -> list[str]:
+        """The proposal as words of `--map`."""
+        return [f"{m.topic}={m.wanted.name}" for m in self.proposal.matches]
+
+    def explanation(self) -> str:
+        """Says why the proposal is not settled, and what would settle it."""
+        lines = [f"{self.path}: which topics feed the graph must be said with --map"]
+        for wanted in self.proposal.missing:
+            lines.append(f"  no topic holds what {wanted.name} takes: {' or '.join(wanted.types)}")
+        lines.append("topics:")
+        width = max((len(r.topic.name) for r in self.readings), default=0)
+        for r in self.readings:
+            what = " or ".join(_types(r)) if r.playable else r.reason
+            lines.append(f"  {r.topic.name:{width}}  {r.topic.count:>8,}  {what}")
+        if self.proposal.matches:
+            lines.append("proposed, from types and names:")
+            lines.append("  " + " ".join(f"--map {word}" for word in self.options()))
+        return "\n".join(lines)
+
+
+def wanted_streams(graph: Graph) -> tuple[Wanted, ...]:
+    """The streams of a graph's sources, and whether an operator cannot do without."""
+    found = []
+    for node in graph.sources():
+        for stream in node.outputs.values():
+            declared = graph.streams[stream]
+            needed = any(consumer.input_port(port).required for consumer, port in graph.consumers(stream))
+            found.append(Wanted(stream, graph.relative(stream), declared.types, declared.static, needed))
+    return tuple(found)
+
+
+def match(path: Path, graph: Graph, words: Sequence[str]) -> Matching:
+    """Returns what of a bag can feed a graph. `words`: TOPIC=STREAM. Raises `BagError` and `MappingError`."""
+    bag = open_bag(path)
+    try:
+        readings = readings_of(bag)
+    finally:
+        bag.close()
+    wanted = wanted_streams(graph)
+    given = parse_map(words, wanted, list(bag.topics))
+    for reading in readings:
+        if reading.topic.name in given.values() and not reading.playable:
+            raise MappingError(f"{path}: topic {reading.topic.name} cannot be played: {reading.reason}")
+    offered = [Offered(r.topic.name, _types(r), r.topic.count) for r in readings if r.playable]
+    return Matching(path, wanted, readings, propose(wanted, offered, given))
+
+
+def readings_of(bag: Bag, names: Collection[str] | None = None) -> tuple[Reading, ...]:
+    """Returns how the topics of a bag can be read."""
+    return tuple(Reading(bag, topic) for name, topic in bag.topics.items() if names is None or name in names)
+
+
+def play(
+    path: Path,
+    graph: Graph,
+    words: Sequence[str] = (),
+    clock: Choice = "auto",
+    watch: Callable[[int], None] | None = None,
+) -> BagStreams:
+    """Opens a bag as the streams of a graph's sources. Raises `BagError` and `MappingError`."""
+    return BagStreams(path, match(path, graph, words).played(), clock, watch=watch)
+
+
+def _types(reading: Reading) -> tuple[str, ...]:
+    return () if reading.read_as is None else tuple(t.SCHEMA for t in offers(reading.read_as))

@@ -1,0 +1,110 @@
+"""Poses, motions, paths and transforms of ROS as messages."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dataflow.interop.ros.values import covariance, orientation, time_ns, vector
+from dataflow.messages import Odometry, ParticleSet, Path, Pose, Transforms, Twist
+
+
+def odometry(message: Any, stamp: int) -> Odometry:
+    """nav_msgs/Odometry."""
+    pose, twist = message.pose, message.twist
+    return Odometry(
+        stamp=stamp,
+        frame=_bare(message.header.frame_id),
+        child_frame=_bare(message.child_frame_id),
+        position=vector(pose.pose.position),
+        orientation=orientation(pose.pose.orientation),
+        pose_covariance=covariance(pose.covariance, 6),
+        linear=vector(twist.twist.linear),
+        angular=vector(twist.twist.angular),
+        twist_covariance=covariance(twist.covariance, 6),
+    )
+
+
+def pose(message: Any, stamp: int) -> Pose:
+    """geometry_msgs/Pose, PoseStamped, PoseWithCovariance and PoseWithCovarianceStamped."""
+    placed, known = message, None
+    while hasattr(placed, "pose"):
+        placed = placed.pose
+        known = getattr(placed, "covariance", known)
+    return Pose(
+        stamp=stamp,
+        frame=_frame(message),
+        position=vector(placed.position),
+        orientation=orientation(placed.orientation),
+        covariance=None if known is None else covariance(known, 6),
+    )
+
+
+def twist(message: Any, stamp: int) -> Twist:
+    """geometry_msgs/Twist, TwistStamped and TwistWithCovarianceStamped."""
+    moved, known = message, None
+    while hasattr(moved, "twist"):
+        moved = moved.twist
+        known = getattr(moved, "covariance", known)
+    return Twist(
+        stamp=stamp,
+        frame=_frame(message),
+        linear=vector(moved.linear),
+        angular=vector(moved.angular),
+        covariance=None if known is None else covariance(known, 6),
+    )
+
+
+def path(message: Any, stamp: int) -> Path:
+    """nav_msgs/Path; timed where the stamps of its poses strictly increase."""
+    stamps = np.array([time_ns(p.header.stamp) for p in message.poses], np.int64)
+    timed = len(stamps) > 0 and stamps[0] > 0 and bool((np.diff(stamps) > 0).all())
+    return Path(
+        stamp=stamp,
+        frame=_frame(message),
+        positions=np.array([vector(p.pose.position) for p in message.poses]).reshape(-1, 3),
+        orientations=np.array([orientation(p.pose.orientation) for p in message.poses]).reshape(-1, 4),
+        stamps=stamps if timed else None,
+    )
+
+
+def pose_array(message: Any, stamp: int) -> ParticleSet:
+    """geometry_msgs/PoseArray: poses of equal weight."""
+    rows = [np.concatenate([vector(p.position), orientation(p.orientation)]) for p in message.poses]
+    return ParticleSet(
+        stamp=stamp,
+        frame=_frame(message),
+        poses=np.array(rows).reshape(-1, 7),
+        weights=np.full(len(rows), 1.0 / len(rows)) if rows else np.empty(0),
+    )
+
+
+def transform(message: Any, stamp: int) -> Transforms:
+    """geometry_msgs/TransformStamped: a set of one."""
+    return transforms([message], stamp)
+
+
+def transforms(rows: Sequence[Any], stamp: int) -> Transforms:
+    """Some geometry_msgs/TransformStamped as one set; of those that place one frame the last counts.
+
+    Frames that begin with a slash, as in early ROS, are named without it. A transform of a frame to itself is left out.
+    """
+    placed = [row for row in rows if _bare(row.child_frame_id) != _bare(row.header.frame_id)]
+    kept = list({_bare(row.child_frame_id): row for row in placed}.items())
+    return Transforms(
+        stamp=stamp,
+        frames=tuple(_bare(row.header.frame_id) for _, row in kept),
+        child_frames=tuple(child for child, _ in kept),
+        translations=np.array([vector(row.transform.translation) for _, row in kept]).reshape(-1, 3),
+        rotations=np.array([orientation(row.transform.rotation) for _, row in kept]).reshape(-1, 4),
+    )
+
+
+def _frame(message: Any) -> str:
+    return _bare(message.header.frame_id) if hasattr(message, "header") else ""
+
+
+def _bare(frame: str) -> str:
+    return frame.removeprefix("/")

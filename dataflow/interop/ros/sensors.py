@@ -1,0 +1,160 @@
+"""Inertial sensors, scans, satellite receivers, joints, maps and single values of ROS as messages."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from dataflow.interop.ros.values import covariance, first, optional, orientation, vector
+from dataflow.messages import (
+    Alarm,
+    Diagnostics,
+    Imu,
+    JointState,
+    LaserScan,
+    MagneticField,
+    NavSatFix,
+    Number,
+    OccupancyGrid,
+    Switch,
+    Text,
+)
+from dataflow.messages.poses import COVARIANCE_TYPES
+
+_FIX = {-1: "no_fix", 0: "fix", 1: "sbas", 2: "gbas"}
+_LEVELS = {1: "debug", 2: "info", 4: "warning", 8: "error", 16: "fatal"}
+"""Of rosgraph_msgs/Log; rcl_interfaces/Log has ten times as much."""
+_ABSENT = -1.0
+
+
+def imu(message: Any, stamp: int) -> Imu:
+    """sensor_msgs/Imu; without an orientation where its covariance begins with -1 (REP 145) or it is all zeros."""
+    turned = message.orientation
+    known = message.orientation_covariance[0] != _ABSENT and any((turned.x, turned.y, turned.z, turned.w))
+    return Imu(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        angular_velocity=vector(message.angular_velocity),
+        linear_acceleration=vector(message.linear_acceleration),
+        orientation=orientation(turned) if known else None,
+        angular_velocity_covariance=_known(message.angular_velocity_covariance),
+        linear_acceleration_covariance=_known(message.linear_acceleration_covariance),
+        orientation_covariance=_known(message.orientation_covariance) if known else None,
+    )
+
+
+def _known(values: Any) -> Any:
+    return None if values[0] == _ABSENT else covariance(values, 3)
+
+
+def magnetic_field(message: Any, stamp: int) -> MagneticField:
+    """sensor_msgs/MagneticField."""
+    return MagneticField(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        field=vector(message.magnetic_field),
+        covariance=_known(message.magnetic_field_covariance),
+    )
+
+
+def laser_scan(message: Any, stamp: int) -> LaserScan:
+    """sensor_msgs/LaserScan; the last beam's angle follows from the increment."""
+    count = len(message.ranges)
+    intensities = optional(message.intensities, "<f4")
+    step = float(message.time_increment)
+    return LaserScan(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        angle_min=float(message.angle_min),
+        angle_max=float(message.angle_min) + float(message.angle_increment) * max(count - 1, 0),
+        range_min=float(message.range_min),
+        range_max=float(message.range_max),
+        ranges=np.asarray(message.ranges, np.float32),
+        intensities=intensities if intensities is not None and len(intensities) == count else None,
+        time_offsets=(np.arange(count) * step).astype(np.float32) if step else None,
+    )
+
+
+def nav_sat_fix(message: Any, stamp: int) -> NavSatFix:
+    """sensor_msgs/NavSatFix."""
+    kind = int(message.position_covariance_type)
+    return NavSatFix(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        status=_FIX.get(int(message.status.status), "no_fix"),
+        latitude=float(message.latitude),
+        longitude=float(message.longitude),
+        altitude=float(message.altitude),
+        covariance_type=COVARIANCE_TYPES[kind] if 0 <= kind < len(COVARIANCE_TYPES) else "unknown",
+        covariance=np.asarray(message.position_covariance, np.float64).reshape(3, 3) if kind else None,
+    )
+
+
+def joint_state(message: Any, stamp: int) -> JointState:
+    """sensor_msgs/JointState."""
+    return JointState(
+        stamp=stamp,
+        names=tuple(message.name),
+        positions=optional(message.position, "<f8"),
+        velocities=optional(message.velocity, "<f8"),
+        efforts=optional(message.effort, "<f8"),
+    )
+
+
+def occupancy_grid(message: Any, stamp: int) -> OccupancyGrid:
+    """nav_msgs/OccupancyGrid."""
+    info = message.info
+    return OccupancyGrid(
+        stamp=stamp,
+        frame=message.header.frame_id,
+        resolution=float(info.resolution),
+        cells=np.asarray(message.data, np.int8).reshape(info.height, info.width),
+        position=vector(info.origin.position),
+        orientation=orientation(info.origin.orientation),
+    )
+
+
+def diagnostics(message: Any, stamp: int) -> Diagnostics:
+    """diagnostic_msgs/DiagnosticArray."""
+    pairs = [(i, pair) for i, status in enumerate(message.status) for pair in status.values]
+    return Diagnostics(
+        stamp=stamp,
+        names=tuple(status.name for status in message.status),
+        messages=tuple(status.message for status in message.status),
+        hardware_ids=tuple(status.hardware_id for status in message.status),
+        keys=tuple(pair.key for _, pair in pairs),
+        values=tuple(pair.value for _, pair in pairs),
+        levels=np.array([int(status.level) for status in message.status], np.uint8),
+        owners=np.array([i for i, _ in pairs], np.int32) if pairs else None,
+    )
+
+
+def log(message: Any, stamp: int) -> Alarm:
+    """rosgraph_msgs/Log and rcl_interfaces/Log."""
+    level = int(message.level)
+    return Alarm(
+        stamp=stamp,
+        level=_LEVELS.get(level)
+        or {10: "debug", 20: "info", 30: "warning", 40: "error", 50: "fatal"}.get(level, "info"),
+        name=message.name,
+        text=message.msg,
+    )
+
+
+def number(message: Any, stamp: int) -> Number:
+    """std_msgs numbers, sensor_msgs/Temperature, FluidPressure, Illuminance, RelativeHumidity and Range."""
+    value = first(message, "data", "temperature", "fluid_pressure", "illuminance", "relative_humidity", "range")
+    units = {"temperature": "°C", "fluid_pressure": "Pa", "illuminance": "lx", "range": "m"}
+    unit = next((unit for name, unit in units.items() if hasattr(message, name)), "")
+    return Number(stamp=stamp, value=float(value), unit=unit)
+
+
+def text(message: Any, stamp: int) -> Text:
+    """std_msgs/String."""
+    return Text(stamp=stamp, text=message.data)
+
+
+def switch(message: Any, stamp: int) -> Switch:
+    """std_msgs/Bool."""
+    return Switch(stamp=stamp, on=bool(message.data))

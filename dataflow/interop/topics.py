@@ -1,0 +1,191 @@
+"""Readers of topics: which message type a topic becomes, which times its messages carry, and how one is read."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from dataflow.interop.bag import Bag, Topic
+from dataflow.interop.ros import CONVERSIONS, TRANSFORM_SETS, Convert
+from dataflow.interop.ros.clouds import left_out
+from dataflow.interop.ros.objects import array_stamp
+from dataflow.interop.ros.poses import transforms
+from dataflow.interop.ros.values import time_ns
+from dataflow.interop.typestores import RosType, ros_type
+from dataflow.messages import Message, MessageError, Transforms
+from dataflow.recording.errors import RecordingError
+from dataflow.recording.foreign import foreign_decoder
+
+Data = bytes | memoryview
+
+_CDR_TIME = (struct.Struct("<iI"), struct.Struct(">iI"))
+_ROS1_TIME = struct.Struct("<II")
+_STAMPED_FIRST = {"rcl_interfaces/msg/Log"}
+"""Types that begin with a bare time."""
+
+
+class TopicReader(Protocol):
+    """Reads the messages of one topic. A message may be several here, its parts, which are numbered from 0."""
+
+    def stamps(self, data: Data) -> tuple[int, ...]:
+        """The times that a message carries (ns), one for each part; empty where its type carries none."""
+
+    def read(self, data: Data, part: int, stamp: int) -> Message:
+        """A part of a message, stamped with `stamp`. Raises `RecordingError` and `MessageError`."""
+
+
+class RosReader:
+    """Reads messages of a ROS type whose times stand at the beginning, in a header, or nowhere."""
+
+    def __init__(self, kind: RosType, ros1: bool) -> None:
+        self._kind, self._ros1 = kind, ros1
+        self._convert = CONVERSIONS[kind.name][1]
+        self._stamped = kind.has_header or kind.name in _STAMPED_FIRST
+
+    def stamps(self, data: Data) -> tuple[int, ...]:
+        """The time of its header, without reading more of the message."""
+        if not self._stamped:
+            return ()
+        try:
+            if self._ros1:
+                seconds, nanoseconds = _ROS1_TIME.unpack_from(data, 4)
+            else:
+                seconds, nanoseconds = _CDR_TIME[0 if data[1] & 1 else 1].unpack_from(data, 4)
+        except (struct.error, IndexError):
+            raise RecordingError(f"a {self._kind.name} of {len(data)} bytes is too short") from None
+        return (seconds * 10**9 + nanoseconds,)
+
+    def read(self, data: Data, part: int, stamp: int) -> Message:
+        """The message."""
+        return _converted(self._convert, self._kind, data, stamp)
+
+
+class TransformSetReader:
+    """Reads tf messages, whose transforms may have several stamps: each stamp is a part."""
+
+    def __init__(self, kind: RosType) -> None:
+        self._kind = kind
+
+    def stamps(self, data: Data) -> tuple[int, ...]:
+        """The times of its transforms, each once."""
+        return _stamps_of(self._kind.parse(data).transforms)
+
+    def read(self, data: Data, part: int, stamp: int) -> Message:
+        """The transforms of the part's time."""
+        rows = self._kind.parse(data).transforms
+        times = _stamps_of(rows)
+        return transforms([row for row in rows if time_ns(row.header.stamp) == times[part]] if times else [], stamp)
+
+
+def _stamps_of(rows: Any) -> tuple[int, ...]:
+    return tuple(sorted({time_ns(row.header.stamp) for row in rows}))
+
+
+class MarkerArrayReader:
+    """Reads marker arrays, which are stamped like their first marker."""
+
+    def __init__(self, kind: RosType) -> None:
+        self._kind = kind
+        self._convert = CONVERSIONS[kind.name][1]
+
+    def stamps(self, data: Data) -> tuple[int, ...]:
+        """The time of its first marker."""
+        found = array_stamp(self._kind.parse(data))
+        return () if found is None else (found,)
+
+    def read(self, data: Data, part: int, stamp: int) -> Message:
+        """The message."""
+        return _converted(self._convert, self._kind, data, stamp)
+
+
+def _converted(convert: Convert, kind: RosType, data: Data, stamp: int) -> Message:
+    try:
+        return convert(kind.parse(data), stamp)
+    except (ValueError, TypeError, AttributeError, IndexError) as error:
+        if isinstance(error, MessageError):
+            raise
+        raise RecordingError(f"a {kind.name} whose fields contradict each other: {error}") from error
+
+
+class ForeignReader:
+    """Reads what has a decoder among those of recordings: the Foxglove schemas, as protobuf or JSON."""
+
+    def __init__(self, decode: Callable[[bytes, int], Message]) -> None:
+        self._decode = decode
+
+    def stamps(self, data: Data) -> tuple[int, ...]:
+        """The time that it carries."""
+        carried = self._decode(bytes(data), -1).stamp
+        return () if carried == -1 else (carried,)
+
+    def read(self, data: Data, part: int, stamp: int) -> Message:
+        """The message."""
+        return self._decode(bytes(data), stamp).replace(stamp=stamp)
+
+
+def reader_of(topic: Topic) -> TopicReader:
+    """The reader of a topic; raises `RecordingError` that says why there is none."""
+    if topic.encoding in ("cdr", "ros1"):
+        return _ros_reader(topic)
+    decode = foreign_decoder(topic.encoding, topic.schema)
+    if decode is None:
+        kind = topic.schema.name or "no schema"
+        raise RecordingError(f"{topic.encoding or 'unnamed'} messages of {kind} have no counterpart here")
+    return ForeignReader(decode)
+
+
+def _ros_reader(topic: Topic) -> TopicReader:
+    name = ros_type(topic.schema.name)
+    if name not in CONVERSIONS:
+        raise RecordingError(f"{name} has no counterpart here")
+    kind = RosType(name, topic.encoding, topic.schema)
+    if name in TRANSFORM_SETS:
+        return TransformSetReader(kind)
+    if name == "visualization_msgs/msg/MarkerArray":
+        return MarkerArrayReader(kind)
+    return RosReader(kind, topic.encoding == "ros1")
+
+
+class Reading:
+    """A topic as it can be played: how its messages are read, and the type that the first one becomes.
+
+    `reason`: why it cannot be played; `read_as`: None then, and for a topic without messages of a kind that tells.
+    """
+
+    def __init__(self, bag: Bag, topic: Topic) -> None:
+        self.topic = topic
+        self.reader: TopicReader | None = None
+        self.read_as: type[Message] | None = None
+        self.reason = ""
+        self.left_out: tuple[str, ...] = ()
+        try:
+            self.reader = reader_of(topic)
+            first = next(iter(bag.messages([topic.name])), None) if topic.count else None
+            if first is None:
+                self.read_as = CONVERSIONS.get(ros_type(topic.schema.name), (None, None))[0]
+                self.reason = "it holds no messages"
+            else:
+                self.read_as = type(self._message(first.data, first.log_time))
+                self.left_out = self._left_out(first.data)
+        except (RecordingError, MessageError) as error:
+            self.reader, self.reason = None, str(error)
+
+    @property
+    def playable(self) -> bool:
+        """Tells whether its messages can stand in for a stream."""
+        return not self.reason
+
+    @property
+    def merges(self) -> bool:
+        """Tells whether messages of one stamp become one."""
+        return self.read_as is Transforms
+
+    def _message(self, data: Data, log_time: int) -> Message:
+        assert self.reader is not None
+        return self.reader.read(data, 0, max(log_time, 0))
+
+    def _left_out(self, data: Data) -> tuple[str, ...]:
+        if ros_type(self.topic.schema.name) != "sensor_msgs/msg/PointCloud2":
+            return ()
+        return left_out(RosType(self.topic.schema.name, self.topic.encoding, self.topic.schema).parse(data))

@@ -1,0 +1,82 @@
+"""ROS message definitions as they stand in a bag, made into parsers and serialisers by the `rosbags` library."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from dataflow.recording.codecs import SchemaText
+from dataflow.recording.errors import RecordingError
+
+HEADER = "std_msgs/msg/Header"
+_IDL_SEPARATOR = "=" * 80 + "\n"
+_NAME = re.compile(r"^(\w+)/(?:msg/)?(\w+)$")
+
+
+def ros_type(name: str) -> str:
+    """Returns a ROS type by its name of ROS 2: `sensor_msgs/Imu` is `sensor_msgs/msg/Imu`."""
+    found = _NAME.match(name)
+    return name if found is None else f"{found[1]}/msg/{found[2]}"
+
+
+class RosType:
+    """One ROS message type, as a bag defines it. Raises `RecordingError` where its definition cannot be read."""
+
+    def __init__(self, name: str, encoding: str, schema: SchemaText) -> None:
+        self.name = ros_type(name)
+        self._store = _store(self.name, encoding, schema)
+        if self.name not in self._store.fielddefs:
+            raise RecordingError(f"the definition of {self.name} is not in the bag, and the type is not known here")
+        self._parse: Callable[[Any, str], Any] = (
+            self._store.deserialize_ros1 if encoding == "ros1" else self._store.deserialize_cdr
+        )
+
+    @property
+    def has_header(self) -> bool:
+        """Tells whether its first field is a std_msgs/Header."""
+        fields = self._store.fielddefs[self.name][1]
+        return bool(fields) and fields[0][1][1] == HEADER
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Names of its fields."""
+        return tuple(name for name, _ in self._store.fielddefs[self.name][1])
+
+    def parse(self, data: bytes | memoryview) -> Any:
+        """Returns the message as an object; raises `RecordingError`."""
+        try:
+            return self._parse(data, self.name)
+        except Exception as error:  # the library's parsers raise whatever broken bytes make them raise
+            raise RecordingError(f"not a {self.name}: {type(error).__name__}: {error}") from error
+
+
+@cache
+def _store(name: str, encoding: str, schema: SchemaText) -> Typestore:
+    text = schema.data.decode("utf-8", "replace")
+    if not text.strip() and schema.encoding in ("", "ros2msg", "ros1msg"):
+        if encoding == "ros1" or schema.encoding == "ros1msg":
+            return get_typestore(Stores.ROS1_NOETIC)
+        return get_typestore(Stores.LATEST)
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(_types(name, schema.encoding, text))
+    except TypesysError as error:
+        first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise RecordingError(f"the definition of {name} in the bag cannot be read ({first})") from error
+    return store
+
+
+def _types(name: str, encoding: str, text: str) -> Any:
+    if encoding != "ros2idl":
+        return get_types_from_msg(text, name)
+    if not text.startswith(f"{_IDL_SEPARATOR}IDL: "):
+        return get_types_from_idl(text)
+    found: dict[str, Any] = {}
+    for part in text.split(_IDL_SEPARATOR)[1:]:
+        found |= get_types_from_idl(part.partition("\n")[2])
+    return found

@@ -1,0 +1,111 @@
+"""Bags replayed through graphs: live processes, recorded, verified, from real bags too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_bags import SECOND, header, ros, write_ros2, xyz, xyzw
+
+import dataflow
+from dataflow.graph import load_graph
+from dataflow.interop.mapping import MappingError
+from dataflow.interop.playing import match, play
+from dataflow.recording import Recording
+
+TRAJECTORIES = """
+graph: trajectories
+namespace: robot1
+operators:
+  slam: {use: "operators.sources:RecordedPose"}
+  truth: {use: "operators.sources:RecordedPose"}
+  metrics:
+    use: operators.evaluation:TrajectoryMetrics
+    inputs: {estimate: slam/odometry, ground_truth: truth/pose}
+"""
+DETECTION = """
+graph: detection
+operators:
+  camera: {use: "operators.sources:RecordedCamera"}
+  detector:
+    use: operators.detection:OnnxDetector
+    inputs: {image: camera/image}
+    params: {model: MODEL, decoder: fastestdet, score_threshold: 0.3}
+"""
+
+
+@pytest.fixture
+def graph(tmp_path: Path) -> Path:
+    path = tmp_path / "graph.yaml"
+    path.write_text(TRAJECTORIES)
+    return path
+
+
+@pytest.fixture
+def bag(tmp_path: Path) -> Path:
+    rows = []
+    for i in range(50):
+        stamp = 1_700_000_000 * SECOND + i * SECOND // 10
+        for topic in ("/estimate", "/truth"):
+            pose = ros(
+                "geometry_msgs/Pose", position=xyz(0.1 * i, np.sin(i / 5), 0, "Point"), orientation=xyzw(0, 0, 0, 1)
+            )
+            rows.append((topic, stamp + 1000, ros("geometry_msgs/PoseStamped", header=header(stamp, "map"), pose=pose)))
+    return write_ros2(tmp_path / "bag", rows)
+
+
+MAPS = ["/estimate=slam/odometry", "/truth=truth/pose"]
+
+
+def test_mapping_that_is_not_clear_is_an_error_with_the_topics_and_the_proposal(graph: Path, bag: Path) -> None:
+    with pytest.raises(MappingError) as caught:
+        match(bag, load_graph(graph), []).played()
+
+    told = str(caught.value)
+    assert "/estimate        50  Pose or Odometry" in told
+    assert "--map /truth=truth/pose" in told
+
+
+def test_bag_replayed_in_this_process_is_recorded_and_verified(graph: Path, bag: Path, tmp_path: Path) -> None:
+    from dataflow.cli.bags import replay_bag
+    from dataflow.cli.execution import Outputs
+
+    loaded, file = load_graph(graph), tmp_path / "out.mcap"
+    outputs = Outputs(file, None, None, False, False)
+    options = {"placement": "one_process", "record": file}
+    replay_bag(bag, loaded, MAPS, "auto", None, None, outputs, options, began=0.0, json=False, quiet=True)
+
+    with Recording(file) as made:
+        assert made.metadata["dataflow:bag"]["clock"] == "header: when it was measured"
+        assert made.streams["robot1/truth/pose"].count == 50
+        assert {m.message.frame for m in made.messages()} == {"map"}
+    assert dataflow.verify(file).identical
+
+
+def test_span_of_a_bag_is_counted_from_its_first_message(graph: Path, bag: Path) -> None:
+    from dataflow.supervision.replay import plan_replay
+
+    with play(bag, load_graph(graph), MAPS) as streams:
+        plan = plan_replay(streams, load_graph(graph), start=1.0, end=2.0)
+        part = list(streams.messages(["robot1/truth/pose"], plan.start, plan.end))
+
+    assert len(part) == 11
+
+
+def test_recorded_sources_cannot_be_run(graph: Path) -> None:
+    with pytest.raises(Exception, match="replay one into the graph"):
+        dataflow.run(str(graph))
+
+
+@pytest.mark.data
+def test_camera_bag_of_others_feeds_a_detector_and_verifies(data_dir: Path, tmp_path: Path) -> None:
+    file = tmp_path / "graph.yaml"
+    file.write_text(DETECTION.replace("MODEL", str(data_dir / "models" / "FastestDet.onnx")))
+    out = tmp_path / "out.mcap"
+
+    dataflow.replay(data_dir / "bags" / "foxglove_camera_jsonschema.mcap", graph=str(file), record=out)
+
+    with Recording(out) as made:
+        assert made.streams["detection/detector/detections"].count == 10
+    assert dataflow.verify(out).identical
