@@ -17,7 +17,6 @@ from dataflow.firing.ready import Ready
 from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Graph, Node
-from dataflow.interop.streams import recorded_streams
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.records.black_box import BlackBox, Reached
 from dataflow.sync import NEVER, Entry
@@ -110,6 +109,8 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
     replay = config.replay
     if replay is None:
         return None
+    from dataflow.interop.streams import recorded_streams  # bags need libraries that no other run does
+
     nodes = {graph.streams[s].node for s in replay["streams"]}
     return LogFeed(
         recorded_streams(Path(replay["path"]), replay["bag"]),
