@@ -1,4 +1,4 @@
-"""What is done with every image of one camera: undistorted, turned, cropped, scaled, its brightness made even."""
+"""Prepares every image of one camera: lens distortion, rotation, crop, scale, brightness."""
 
 from __future__ import annotations
 
