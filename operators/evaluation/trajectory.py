@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from operators.association import mutually_nearest
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Alignment = Literal["se3", "sim3", "none"]
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -199,6 +201,8 @@ def _relative_error(matches: Matches, pairs: Pairs) -> tuple[NDArray[np.float64]
 
 def _motions(trajectory: Trajectory, pairs: Pairs) -> tuple[Rotation, NDArray[np.float64]]:
     """Rotation and translation from the first to the second pose of each pair, in the first's own frame."""
+    from scipy.spatial.transform import Rotation
+
     first, second = pairs
     positions = np.array(trajectory.positions)
     rotations = Rotation.from_quat(np.array(trajectory.orientations))
