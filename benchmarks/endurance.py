@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
+import os
 import signal
 import statistics
 import subprocess
@@ -69,10 +70,11 @@ def observe(duration: float, recording: Path, report: Path) -> dict[str, list[tu
     command = [*DATAFLOW, "run", str(GRAPH), "--live", "--process-each", "--quiet", "--json"]
     command += ["--record", str(recording), "--set", f"duration={duration:g}s"]
     command += [word for setting in SETTINGS for word in ("--set", setting)]
+    environment = {**os.environ, "XDG_RUNTIME_DIR": str(recording.parent)}  # other graphs may run on this machine
     samples: dict[str, list[tuple[float, int]]] = defaultdict(list)
     stopped: subprocess.Popen[bytes] | None = None
     plan = {ATTACH_AT: "attach", STOP_AT: "stop", KILL_AT: "kill"}
-    with report.open("w") as output, subprocess.Popen(command, stdout=output, cwd=ROOT) as started:
+    with report.open("w") as output, subprocess.Popen(command, stdout=output, cwd=ROOT, env=environment) as started:
         run, begin = psutil.Process(started.pid), time.monotonic()
         try:
             while started.poll() is None:
@@ -80,7 +82,8 @@ def observe(duration: float, recording: Path, report: Path) -> dict[str, list[tu
                 for at in [at for at in plan if now >= at]:
                     what = plan.pop(at)
                     if what == "attach":
-                        stopped = subprocess.Popen([*DATAFLOW, "echo", "color/image"], stdout=subprocess.DEVNULL)
+                        words = [*DATAFLOW, "echo", "color/image"]
+                        stopped = subprocess.Popen(words, stdout=subprocess.DEVNULL, env=environment)
                     elif what == "stop" and stopped is not None:
                         stopped.send_signal(signal.SIGSTOP)
                     elif what == "kill":

@@ -4,6 +4,7 @@
     python benchmarks/firings.py --against OTHER_TREE     # another checkout in turns with this one: ratios
     python benchmarks/firings.py --memory                 # 1,000,000 messages, a minute or more
     python benchmarks/firings.py --processes              # the chain with a process for each operator
+    python benchmarks/firings.py --apart                  # the CPU time of a firing where each operator has a process
 
 Chains (a source, relays, a sink) and fans (a source, sinks) of small messages run in one process as fast as they go,
 each in a Python of its own. Time is taken inside that process every 20 messages, so start-up is not in it; CPU time is
@@ -11,6 +12,9 @@ the whole process's. The figures are those of the tenth of the time that was lea
 too): other work on the machine does not decide. With several rounds the table gives medians, and of ratios the smallest
 and the largest beside them. The floor is the same chain as plain calls of Python functions: makes the array
 and the message's dictionary, digests it, packs a record of 40 bytes; no checks, no order, no frontiers.
+
+With `--apart`, each operator and the source has a process of its own. The figure is what two runs of different lengths
+differ by in CPU time, all processes together, divided by the firings that they differ by: starting costs both the same.
 """
 
 from __future__ import annotations
@@ -18,6 +22,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import resource
 import statistics
 import struct
 import subprocess
@@ -102,6 +107,37 @@ def measure(case: Case, tree: Path, count: int, marks: list[int] | None = None) 
         "peak": found["peak"],
         **{f"memory after {n}": mib for n, mib in json.loads(found["memory"]).items()},
     }
+
+
+def spent_apart(case: Case, count: int) -> float:
+    """CPU seconds of all processes of a run with a process for each operator, supervisor and start included."""
+    with tempfile.TemporaryDirectory() as folder:
+        graph = Path(folder) / "graph.yaml"
+        graph.write_text(json.dumps(graph_of(case, count, [])))
+        command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--process-each", "--json", "--quiet"]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE.parent), str(HERE)])}
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run(command, capture_output=True, timeout=600, check=True, env=environment)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def apart(rounds: int, firings: int) -> str:
+    """The CPU time of a firing in chains and fans of processes, as Markdown."""
+    lines = ["| graph | CPU, µs a firing | x that of 2 operators |", "| --- | --- | --- |"]
+    for kind, fan in (("chain", False), ("fan", True)):
+        base = 0.0
+        for operators in (2, 4, 8, 16):
+            case = Case(f"{kind} of {operators}", operators, fan=fan)
+            short, long = firings // (4 * operators), firings // operators
+            costs = [
+                (spent_apart(case, long) - spent_apart(case, short)) / ((long - short) * operators)
+                for _ in range(rounds)
+            ]
+            cost = statistics.median(costs)
+            base = base or cost
+            lines.append(f"| {case.name}, a process each | {cost * 1e6:.0f} | {cost / base:.2f} |")
+    return "\n".join(lines)
 
 
 def floor(seconds: float = 1.0) -> dict[str, float]:
@@ -209,8 +245,12 @@ def main() -> None:
     parser.add_argument("--live", action="store_true", help="live runs")
     parser.add_argument("--memory", action="store_true", help="memory after many messages, instead")
     parser.add_argument("--processes", action="store_true", help="a process for each operator, instead")
+    parser.add_argument("--apart", action="store_true", help="a process for each operator, instead")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
+    if arguments.apart:
+        print(apart(arguments.rounds, arguments.firings))
+        return
     if arguments.memory:
         print(memory(HERE.parent))
         return

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
-from dataflow.chaos.plan import SECOND
+from dataflow.chaos.kinds import SECOND
 from dataflow.messages.base import Message
 from dataflow.sync import Firing
 

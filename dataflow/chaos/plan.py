@@ -15,17 +15,13 @@ from typing import Annotated, Any, Literal, get_args
 
 import pydantic
 
+from dataflow.chaos.kinds import SECOND, TO_OPERATORS, TO_SOURCES
 from dataflow.graph.document import parse
 from dataflow.graph.model import Graph, Node
 from dataflow.graph.problems import Place, Problems, did_you_mean
 from dataflow.graph.tree import at, plain
 from dataflow.operator import ParameterError, is_live, validate_parameters
 from dataflow.sync.stamps import parse_duration
-
-SECOND = 1_000_000_000
-TO_OPERATORS = ("raise", "hang", "slow", "leak")
-TO_SOURCES = ("stop", "flood", "jump", "past")
-TO_PROCESSES = ("kill", "freeze")
 
 
 class ChaosError(ValueError):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -117,20 +118,23 @@ def replay(
       dataflow replay drive.bag --graph g.yaml --map /rgb=camera/image
     """
     began = time.monotonic()
-    from dataflow.graph import load_graph
-    from dataflow.interop.opening import is_foreign, open_bag
-    from dataflow.recording import Recording
-    from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
-    from dataflow.supervision.replay import plan_replay
-    from dataflow.supervision.run import replay as replay_recording
+    from dataflow.supervision.early import early_nursery
 
-    with friendly_errors():
+    with friendly_errors(), ExitStack() as stack:
         existing_recording(recording)
         if record is not None and record.exists() and record.samefile(recording):
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
+        early = None if complete is not None else stack.enter_context(early_nursery())
+        from dataflow.graph import load_graph
+        from dataflow.interop.opening import is_foreign, open_bag
+        from dataflow.recording import Recording
+        from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
+        from dataflow.supervision.replay import plan_replay
+        from dataflow.supervision.run import replay as replay_recording
+
         if maps or is_foreign(recording):
             from dataflow.cli.bags import replay_bag
 
@@ -142,6 +146,7 @@ def replay(
             loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
             outputs = checked_outputs(record, view, open_view, overwrite)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
+            options["early"] = early
             replay_bag(
                 recording, loaded, maps or (), clock, start, end, outputs, options, began=began, json=json, quiet=quiet
             )
@@ -176,7 +181,9 @@ def replay(
         if whole is not None:
             shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
         execute(
-            lambda watch: replay_recording(recording, graph=loaded, start=start, end=end, watch=watch, **options),
+            lambda watch: replay_recording(
+                recording, graph=loaded, start=start, end=end, watch=watch, early=early, **options
+            ),
             loaded,
             outputs,
             shown,

@@ -81,28 +81,32 @@ def run(
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
     began = time.monotonic()
-    from dataflow.chaos.plan import load_plan
-    from dataflow.graph import load_graph
-    from dataflow.process.speech import LEVEL_VARIABLE
-    from dataflow.supervision.run import run as run_graph
+    from dataflow.supervision.early import early_nursery
 
-    with friendly_errors():
-        if chaos_seed is not None and chaos is None:
-            raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+    if chaos_seed is not None and chaos is None:
+        raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+    if log_level not in (None, *LOG_LEVELS):
+        raise fail(f"--log-level {log_level}: expected one of {', '.join(LOG_LEVELS)}")
+    file = graph_file(graph)
+    find_modules_in(path)
+    with early_nursery() as early, friendly_errors():
+        from dataflow.graph import load_graph
+        from dataflow.process.speech import LEVEL_VARIABLE
+        from dataflow.supervision.run import run as run_graph
+
         if log_level is not None:
-            if log_level not in LOG_LEVELS:
-                raise fail(f"--log-level {log_level}: expected one of {', '.join(LOG_LEVELS)}")
             os.environ[LEVEL_VARIABLE] = log_level
-        find_modules_in(path)
         live = live or chaos is not None
-        loaded = load_graph(graph_file(graph), settings=settings or (), live=live)
+        loaded = load_graph(file, settings=settings or (), live=live)
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live
         if chaos is not None:
+            from dataflow.chaos.plan import load_plan
+
             options["faults"] = load_plan(existing(chaos, "a fault plan"), loaded, seed=chaos_seed)
         execute(
-            lambda watch: run_graph(loaded, watch=watch, **options),
+            lambda watch: run_graph(loaded, watch=watch, early=early, **options),
             loaded,
             outputs,
             None,

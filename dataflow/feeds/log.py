@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from dataflow.feeds.playable import PlayableStreams
@@ -59,7 +59,9 @@ class LogFeed:
         finals: Mapping[str, int],
         start: int | None = None,
         end: int | None = None,
+        numbered: Callable[[Iterable[Recorded]], Iterable[Recorded]] = iter,
     ) -> None:
+        """`numbered` gives the messages their numbers; they keep those that were recorded unless it says otherwise."""
         self.recording, self.emitter = recording, emitter
         self._ports = ports
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
@@ -71,7 +73,7 @@ class LogFeed:
         }
         self._first_end = self._least_final()
         self._nodes = dict(streams)
-        self._messages = iter(recording.messages(streams=list(streams), start=start, end=end))
+        self._messages = iter(numbered(recording.messages(streams=list(streams), start=start, end=end)))
         self._step: list[Recorded] = []
         self._following: Recorded | None = None
         self.last = NEVER

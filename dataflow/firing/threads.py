@@ -21,6 +21,10 @@ _VARIABLES = (
 )
 
 
+THREADS = (*_VARIABLES, "DATAFLOW_THREADS")
+"""Environment variables by which libraries are told their number of threads; most read them when they load."""
+
+
 def environment(threads: int) -> dict[str, str]:
     """Returns the environment of operators: thread counts, the import path of this process, hashing without a salt."""
     return {

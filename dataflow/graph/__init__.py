@@ -1,8 +1,22 @@
 """The graph language: YAML that names operators and wires them; loaded, resolved and checked before anything starts."""
 
-from dataflow.graph.load import load_bundle, load_graph, load_text
-from dataflow.graph.model import Edge, Graph, Live, Network, Node, OperatorImportError, Placement, Stream
-from dataflow.graph.problems import GraphError, Place, Problem
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from dataflow.graph.load import load_bundle, load_graph, load_text
+    from dataflow.graph.model import Edge, Graph, Live, Network, Node, OperatorImportError, Placement, Stream
+    from dataflow.graph.problems import GraphError, Place, Problem
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "load": ("load_bundle", "load_graph", "load_text"),
+            "model": ("Edge", "Graph", "Live", "Network", "Node", "OperatorImportError", "Placement", "Stream"),
+            "problems": ("GraphError", "Place", "Problem"),
+        },
+    )
 
 __all__ = [
     "Edge",

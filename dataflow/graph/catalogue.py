@@ -17,7 +17,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.graph.lookup import NotFound, find_operator, is_concrete
+from dataflow.graph.lookup import NotFound, find_operator, is_concrete, offered
 from dataflow.graph.problems import did_you_mean
 from dataflow.operator import InputPort, Operator, OutputPort, is_live, is_source
 from dataflow.sync.stamps import format_duration, parse_duration
@@ -66,8 +66,8 @@ def discover(packages: Iterable[str] | None = None) -> Catalogue:
     found: dict[type[Operator], str] = {}
     for root in roots:
         for module in _modules(root, failures):
-            for name, value in sorted(vars(module).items()):
-                if not _is_own(value, name, root):
+            for name, value in offered(module):
+                if not _is_own(value, root):
                     continue
                 path = f"{module.__name__}:{name}"
                 known = found.get(value)
@@ -81,12 +81,9 @@ def _advertised() -> list[str]:
     return sorted({entry.module for entry in entry_points(group=ENTRY_POINTS)})
 
 
-def _is_own(value: object, name: str, root: str) -> bool:
+def _is_own(value: type[Operator], root: str) -> bool:
     return (
-        isinstance(value, type)
-        and issubclass(value, Operator)
-        and is_concrete(value)
-        and not name.startswith("_")
+        is_concrete(value)
         and not value.__name__.startswith("_")
         and (value.__module__ == root or value.__module__.startswith(f"{root}."))
     )

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import pkgutil
 import sys
 import traceback
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -33,7 +35,10 @@ def find_operator(use: str) -> type[Operator] | NotFound:
     module = import_module(module_name)
     if isinstance(module, NotFound):
         return module
-    found = getattr(module, name, None)
+    try:
+        found = getattr(module, name, None)
+    except (Exception, SystemExit) as error:  # a package may import what it offers only now
+        return NotFound(f"{use!r} fails to import: {type(error).__name__}: {error}", _where(error, module_name))
     if found is None:
         return NotFound(
             f"module {module_name!r} has no operator {name!r}",
@@ -77,11 +82,16 @@ def import_module(name: str) -> ModuleType | NotFound:
 
 def operator_names(module: ModuleType) -> list[str]:
     """Names of the usable operators that a module offers, its imports included."""
-    return sorted(
-        name
-        for name, value in vars(module).items()
-        if isinstance(value, type) and issubclass(value, Operator) and is_concrete(value) and not name.startswith("_")
-    )
+    return [name for name, value in offered(module) if is_concrete(value)]
+
+
+def offered(module: ModuleType) -> Iterator[tuple[str, type[Operator]]]:
+    """Yields the operators that a module offers by name, also what it imports only when it is asked."""
+    for name in dir(module):
+        with contextlib.suppress(Exception, SystemExit):  # one that fails to import is named when its module is
+            value = getattr(module, name)
+            if isinstance(value, type) and issubclass(value, Operator) and not name.startswith("_"):
+                yield name, value
 
 
 def is_concrete(cls: type[Operator]) -> bool:

@@ -12,11 +12,13 @@ import sys
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from dataflow.messages.base import Message, MessageError, import_type, message_type
 from dataflow.messages.declaration import Declaration
-from dataflow.operator import InputPort, Operator, OperatorSpec
+
+if TYPE_CHECKING:  # what follows a running graph imports no operator
+    from dataflow.operator import InputPort, Operator, OperatorSpec
 
 QueuePolicy = Literal["newest", "oldest", "block"]
 StalePolicy = Literal["use", "drop"]
@@ -41,6 +43,8 @@ class OperatorImportError(ImportError):
 
 def import_operator(use: str) -> type[Operator]:
     """The class behind `"operators.cloud:CloudBuilder"`; raises `OperatorImportError`."""
+    from dataflow.operator import Operator
+
     module_name, _, name = use.partition(":")
     try:
         module = sys.modules.get(module_name) or importlib.import_module(module_name)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from dataflow.chaos.faults import SourceFaults
-from dataflow.chaos.plan import TO_SOURCES
+from dataflow.chaos.kinds import TO_SOURCES
 from dataflow.feeds.window import Handover, Window
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.restarts import Restarts

@@ -8,6 +8,7 @@ from typing import Any
 
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.feeds.log import LogFeed
+from dataflow.feeds.numbering import gapless
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.live import LiveRunner
 from dataflow.firing.ports import Emitter
@@ -16,7 +17,6 @@ from dataflow.firing.ready import Ready
 from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Graph, Node
-from dataflow.interop.streams import recorded_streams
 from dataflow.process.config import ProcessConfig, Resumed
 from dataflow.records.black_box import BlackBox, Reached
 from dataflow.sync import NEVER, Entry
@@ -109,6 +109,8 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
     replay = config.replay
     if replay is None:
         return None
+    from dataflow.interop.streams import recorded_streams  # bags need libraries that no other run does
+
     nodes = {graph.streams[s].node for s in replay["streams"]}
     return LogFeed(
         recorded_streams(Path(replay["path"]), replay["bag"]),
@@ -118,6 +120,7 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
         finals=replay["finals"],
         start=replay["start"],
         end=replay["end"],
+        numbered=gapless,
     )
 
 

@@ -61,6 +61,8 @@ class Core:
         if self.run.phase is not Phase.OVER:
             try:
                 self._handle(event)
+                if _decides(event):
+                    self._go_on()
             except RunFailed as failure:
                 self._fail(failure)
         return self.run.take_commands()
@@ -99,23 +101,28 @@ class Core:
     # Time
 
     def _tick(self) -> None:
-        run = self.run
         self._logs.hand_on()
-        for process in run.processes.values():
+        for process in self.run.processes.values():
             self._see_to_death(process)
+        if self._closing is None and self.run.phase is Phase.STARTING:
+            self._restarts.tick()
+        elif self._closing is None:
+            for part in self._parts:
+                part.tick()
+        self._go_on()
+
+    def _go_on(self) -> None:
+        """Begins what nothing more stands in the way of: the probes, the run, its end."""
+        run = self.run
         if self._closing is not None:
             self._closing.tick()
             if self._closing.over:
                 self._over(self._closing)
         elif run.phase is Phase.STARTING:
-            self._restarts.tick()
             if self._barrier.tick():
                 self._release()
-        else:
-            for part in self._parts:
-                part.tick()
-            if all(p.life is Life.ENDED for p in run.processes.values()):
-                self._close(None)
+        elif all(p.life is Life.ENDED for p in run.processes.values()):
+            self._close(None)
 
     def _see_to_death(self, process: Supervised) -> None:
         """A process that closed its channel, or failed and was told to leave, has so much time to end."""
@@ -234,3 +241,11 @@ class Core:
         run.enter(Phase.OVER)
         report = None if closing.failure is not None else report_of(run, self._ended_at, interrupted=self._interrupted)
         run.command(Over(report, closing.failure))
+
+
+def _decides(event: Event) -> bool:
+    """Tells whether a run may go on at once because of this event: a process has reached what others wait for."""
+    match event:
+        case Said(_, "ready" | "seen" | "ended" | "closed", _) | Died():
+            return True
+    return False

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,7 +17,7 @@ import msgpack
 
 from dataflow.process.channel import QueuedChannel
 from dataflow.process.polling import readable
-from dataflow.supervision.nursery_process import MORE, MOST_DESCRIPTORS, SPAWN
+from dataflow.supervision.nursery_process import ENVIRONMENT, MORE, MOST_DESCRIPTORS, SPAWN
 
 LEAVE_WITHIN = 15.0
 WORDS_AT_ONCE = 65536
@@ -116,7 +116,8 @@ class Leftovers:
 class Nursery:
     """Starts processes. The first one takes half a second, while the nursery imports the runtime."""
 
-    def __init__(self, environment: dict[str, str]) -> None:
+    def __init__(self, environment: Mapping[str, str]) -> None:
+        self.environment = environment
         ours, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
@@ -135,6 +136,22 @@ class Nursery:
 
     def fileno(self) -> int:
         return self._socket.fileno()
+
+    def give(self, environment: Mapping[str, str]) -> None:
+        """Gives the processes to come another environment. What libraries read when they load has been read already.
+
+        Raises `NurseryFailed`.
+        """
+        self.environment = environment
+        try:
+            with os.fdopen(os.memfd_create("environment"), "wb") as file:
+                file.write(
+                    msgpack.packb({os.fsencode(name): os.fsencode(value) for name, value in environment.items()})
+                )
+                file.flush()
+                socket.send_fds(self._socket, [ENVIRONMENT], [file.fileno()])
+        except OSError as error:
+            raise NurseryFailed(f"cannot reach the process that starts the others: {error}") from error
 
     def spawn(self, handed: Sequence[int] = ()) -> Child:
         """Asks for a process, which waits for its configuration on its channel and inherits the descriptors `handed`.
@@ -190,6 +207,8 @@ class Nursery:
 
     def close(self) -> None:
         """Ends the nursery, and with it any process that is left."""
+        if not self._children and not self._unborn:
+            self._process.kill()  # it may be importing still
         self._socket.close()
         try:
             self._process.wait(timeout=LEAVE_WITHIN)

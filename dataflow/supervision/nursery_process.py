@@ -32,8 +32,9 @@ LEAVE_WITHIN = 12.0
 DIE_WITHIN = 1.0
 MOST_DESCRIPTORS = 253
 """As many as one message on a Unix socket carries."""
-MORE, SPAWN = b"+", b"s"
-"""A request: descriptors, of which more follow, and the last ones for a process that is to be started."""
+MORE, SPAWN, ENVIRONMENT = b"+", b"s", b"e"
+"""A request: descriptors, of which more follow; the last ones for a process that is to be started; a file with the
+environment of the processes to come."""
 PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main", "speech"))
 
 _PR_SET_CHILD_SUBREAPER = 36
@@ -85,6 +86,9 @@ def serve(connection: socket.socket) -> None:
             descriptors += given
             if request == MORE:
                 continue
+            if request == ENVIRONMENT:
+                _take_environment(descriptors.pop())
+                continue
             descriptor, words, *handed = descriptors
             pid = _fork_process(descriptor, words, handed, [connection.fileno(), *children])
             for each in descriptors:
@@ -94,6 +98,17 @@ def serve(connection: socket.socket) -> None:
             children[pidfd] = pid
             _tell(connection, "spawned", pid, None, [pidfd])
     _outlive(children)
+
+
+def _take_environment(descriptor: int) -> None:
+    """Takes over the environment in a file, as if this process had been started with it: PYTHONPATH, too."""
+    with open(descriptor, "rb") as file:
+        file.seek(0)
+        environment = msgpack.unpackb(file.read(), raw=True)
+    os.environb.clear()
+    os.environb.update(environment)
+    first = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    sys.path[:] = [*first, *(path for path in sys.path if path not in first)]
 
 
 def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: int) -> None:

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from dataflow.chaos.plan import Fault
 from dataflow.graph.model import Graph, Placement, current_placement
 from dataflow.names import firings_key
+
+if TYPE_CHECKING:  # runs without faults read no fault plan
+    from dataflow.chaos.plan import Fault
 
 LOG_PROCESS = "@log"
 RECORDER = "@recorder"

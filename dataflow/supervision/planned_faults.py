@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
-from dataflow.chaos.plan import Fault
 from dataflow.supervision.life import Life
 from dataflow.supervision.part import Part
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.supervised import Supervised
+
+if TYPE_CHECKING:
+    from dataflow.chaos.plan import Fault
 
 
 class PlannedFaults(Part):

@@ -17,6 +17,7 @@ from dataflow.graph.model import Graph
 from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
+from dataflow.supervision.early import EarlyNursery
 from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
@@ -26,9 +27,9 @@ from dataflow.supervision.supervisor import Supervisor
 Watch = Callable[[Status], None]
 
 
-def run(graph: Graph, *, watch: Watch | None = None, **options: Any) -> RunReport:
+def run(graph: Graph, *, watch: Watch | None = None, early: EarlyNursery | None = None, **options: Any) -> RunReport:
     """Runs a graph's own sources. Options are the fields of `RunPlan`. Raises `RunFailed`."""
-    return execute(RunPlan(graph, **options), mode="run", watch=watch)
+    return execute(RunPlan(graph, **options), mode="run", watch=watch, early=early)
 
 
 def replay(
@@ -38,6 +39,7 @@ def replay(
     start: float | None = None,
     end: float | None = None,
     watch: Watch | None = None,
+    early: EarlyNursery | None = None,
     **options: Any,
 ) -> RunReport:
     """Replays a recording through the graph that made it, or another one with the same sources.
@@ -49,17 +51,20 @@ def replay(
     with Recording(played) if isinstance(played, Path) else nullcontext(played) as recording:
         loaded = graph or recorded_graph(recording)
         log = plan_replay(recording, loaded, start=start, end=end)
-    return execute(RunPlan(loaded, log=log, **options), mode="replay", watch=watch)
+    return execute(RunPlan(loaded, log=log, **options), mode="replay", watch=watch, early=early)
 
 
-def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None) -> RunReport:
-    """Runs a plan under a supervisor; Ctrl-C asks it for an orderly end, a second one ends it at once."""
+def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None, early: EarlyNursery | None = None) -> RunReport:
+    """Runs a plan under a supervisor; Ctrl-C asks it for an orderly end, a second one ends it at once.
+
+    `early`: a nursery that was started already.
+    """
     for file in (plan.record, plan.view_file):
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
     if plan.record is not None:
         plan = replace(plan, metadata=_metadata(plan, mode))
-    supervisor = Supervisor(plan)
+    supervisor = Supervisor(plan, early=early)
     with interrupts(supervisor.stop), _watching(supervisor, watch):
         return supervisor.run()
 

@@ -21,6 +21,7 @@ from dataflow.records.black_box import make_black_box, read_black_box
 from dataflow.supervision import commands, events
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
+from dataflow.supervision.early import EarlyNursery
 from dataflow.supervision.nursery import Child, End, Nursery, NurseryFailed
 from dataflow.supervision.plan import RunPlan, process_plans
 from dataflow.supervision.report import RunFailed, RunReport, Status
@@ -45,8 +46,15 @@ def _print(label: str, line: str) -> None:
 class Supervisor:
     """Runs one plan. `stop()` may be called from a signal handler; `status` may be read at any time."""
 
-    def __init__(self, plan: RunPlan, *, on_output: Callable[[str, str], None] | None = None) -> None:
+    def __init__(
+        self,
+        plan: RunPlan,
+        *,
+        on_output: Callable[[str, str], None] | None = None,
+        early: EarlyNursery | None = None,
+    ) -> None:
         self.plan = plan
+        self._early = early
         self._processes = process_plans(plan)
         self._reserved = reserve_endpoints(len(self._processes))
         self._endpoints = dict(zip(self._processes, self._reserved.endpoints, strict=True))
@@ -104,8 +112,11 @@ class Supervisor:
             raise RunFailed(f"cannot link the processes: {error}; raise the limit of open files (ulimit -n)") from error
 
     def _start_nursery(self) -> Nursery:
+        threads = self.plan.graph.threads
+        if self._early is not None and (nursery := self._early.take(threads)) is not None:
+            return nursery
         try:
-            return Nursery(environment(self.plan.graph.threads))
+            return Nursery(environment(threads))
         except OSError as error:
             raise RunFailed(f"cannot start a process: {error}") from error
 

@@ -51,7 +51,8 @@ class Ledger:
         """Tells a verification what its recording cannot account for."""
         account = self.accounts[verification.operator]
         verification.not_stored = account.not_stored
-        verification.cut = not self.ended and not account.finished
+        lacking = bool(account.not_stored or verification.beyond)  # records are stored before messages
+        verification.cut = not self.ended and (not account.finished or lacking)
         if verification.cut:
             verification.after_cut = account.unaccounted
         else:

@@ -33,7 +33,7 @@ class StandIn:
 
     @staticmethod
     def of(operator: str, account: Account, *, ended: bool) -> StandIn:
-        cut = not ended and not account.finished
+        cut = not ended and (not account.finished or account.not_stored > 0)
         return StandIn(
             operator, account.unaccounted, account.lost, not account.finished and not cut, account.not_stored, cut
         )
@@ -94,7 +94,7 @@ class VerifyReport:
     @property
     def cut(self) -> bool:
         """The recording ends before its run did: what it was verified up to is all that can be said of it."""
-        return any(v.cut for v in self.operators)
+        return any(v.cut for v in self.operators) or any(s.cut for s in self.stand_ins)
 
     @property
     def empty(self) -> bool:

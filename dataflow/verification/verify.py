@@ -61,7 +61,7 @@ def verify(
     jobs: int | None = None,
     stall_timeout: float = 120.0,
     watch: Watch | None = None,
-    workers: Workers = call_workers,
+    workers: Workers | None = None,
 ) -> VerifyReport:
     """Re-executes a recording by its firing records and compares.
 
@@ -73,7 +73,7 @@ def verify(
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
     `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
-    `stall_timeout`: seconds allowed without progress. `workers`: what makes the calls.
+    `stall_timeout`: seconds allowed without progress. `workers`: what makes the calls, instead of processes.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
     began = time.monotonic()
@@ -81,6 +81,7 @@ def verify(
         raise ReplayError(f"tolerance {tolerance}: expected a finite number, 0 or more")
     if jobs is not None and jobs < 1:
         raise ReplayError(f"{jobs} jobs: expected 1 or more")
+    workers = workers or call_workers
     task = _prepare(path, graph, first, only, start, jobs)
     options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
     with shared_records(task.log) as (descriptor, batches):

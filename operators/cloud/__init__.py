@@ -1,9 +1,27 @@
 """Operators that make and change point clouds."""
 
-from operators.cloud.cloud_builder import CloudBuilder
-from operators.cloud.cloud_colorizer import CloudColorizer
-from operators.cloud.cloud_filter import CloudFilter
-from operators.cloud.clusterer import Clusterer
-from operators.cloud.plane_segmenter import PlaneSegmenter
+from typing import TYPE_CHECKING
 
-__all__ = ["CloudBuilder", "CloudColorizer", "CloudFilter", "Clusterer", "PlaneSegmenter"]
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from operators.cloud.cloud_builder import CloudBuilder
+    from operators.cloud.cloud_colorizer import CloudColorizer
+    from operators.cloud.cloud_filter import CloudFilter
+    from operators.cloud.cloud_registration import CloudRegistration
+    from operators.cloud.clusterer import Clusterer
+    from operators.cloud.plane_segmenter import PlaneSegmenter
+else:  # most need scipy, which a graph without them need not load
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "cloud_builder": ("CloudBuilder",),
+            "cloud_colorizer": ("CloudColorizer",),
+            "cloud_filter": ("CloudFilter",),
+            "cloud_registration": ("CloudRegistration",),
+            "clusterer": ("Clusterer",),
+            "plane_segmenter": ("PlaneSegmenter",),
+        },
+    )
+
+__all__ = ["CloudBuilder", "CloudColorizer", "CloudFilter", "CloudRegistration", "Clusterer", "PlaneSegmenter"]

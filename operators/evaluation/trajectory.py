@@ -7,13 +7,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from operators.association import mutually_nearest
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 Alignment = Literal["se3", "sim3", "none"]
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
@@ -143,6 +145,32 @@ def relative_errors(matches: Matches, seconds: float, metres: float) -> dict[str
     return figures
 
 
+def segment_drift(matches: Matches, lengths: Sequence[float], step: int = 10) -> dict[str, float]:
+    """Drift as KITTI defines it (Geiger et al., CVPR 2012): mean error of segments of the true path by their length.
+
+    `drift_percent` and `drift_deg_per_m` over all segments of the given lengths (m) that begin at every `step`th pose;
+    `drift_segments` is their number. Empty where the path is shorter than all of them.
+    """
+    steps = np.linalg.norm(np.diff(np.array(matches.truth.positions).reshape(-1, 3), axis=0), axis=1)
+    travelled = np.concatenate(([0.0], np.cumsum(steps)))
+    first, second, spans = [], [], []
+    for i in range(0, len(matches.truth), step):
+        for length in lengths:
+            j = int(np.searchsorted(travelled, travelled[i] + length, side="right"))
+            if j < len(matches.truth):
+                first.append(i)
+                second.append(j)
+                spans.append(length)
+    if not first:
+        return {}
+    translations, rotations = _relative_error(matches, (np.array(first, np.intp), np.array(second, np.intp)))
+    return {
+        "drift_percent": float((translations / spans).mean() * 100),
+        "drift_deg_per_m": float((rotations / spans).mean()),
+        "drift_segments": len(first),
+    }
+
+
 def frames_apart(count: int, frames: int) -> Pairs:
     """All pairs of `count` poses that are so many frames apart."""
     first = np.arange(max(0, count - frames))
@@ -173,6 +201,8 @@ def _relative_error(matches: Matches, pairs: Pairs) -> tuple[NDArray[np.float64]
 
 def _motions(trajectory: Trajectory, pairs: Pairs) -> tuple[Rotation, NDArray[np.float64]]:
     """Rotation and translation from the first to the second pose of each pair, in the first's own frame."""
+    from scipy.spatial.transform import Rotation
+
     first, second = pairs
     positions = np.array(trajectory.positions)
     rotations = Rotation.from_quat(np.array(trajectory.orientations))

@@ -17,6 +17,7 @@ from operators.evaluation.trajectory import (
     match,
     path_length,
     relative_errors,
+    segment_drift,
 )
 
 
@@ -37,6 +38,10 @@ class TrajectoryMetrics(Operator):
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
     rpe_seconds: float = Param(1.0, gt=0, doc="span of the relative error over time", unit="s")
     rpe_metres: float = Param(1.0, gt=0, doc="span of the relative error over the true path", unit="m")
+    drift_metres: tuple[float, ...] = Param(
+        (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0),
+        doc="lengths of the segments of the true path that the drift is the mean of, as KITTI has them; m",
+    )
     out: str | None = Param(None, doc="folder for estimate.tum, ground_truth.tum and metrics.json; made if missing")
 
     def setup(self) -> None:
@@ -78,6 +83,7 @@ class TrajectoryMetrics(Operator):
         except ValueError as error:
             self._figures["ate"] = f"not computed for {len(matches.estimate)} matched poses: {error}"
         self._figures |= relative_errors(matches, self.rpe_seconds, self.rpe_metres)
+        self._figures |= segment_drift(matches, self.drift_metres)
         if self.out is not None:
             self._write(Path(self.out).expanduser())
 

@@ -4,14 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.fusion.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, updated
-from operators.fusion.late_filter import Hypothesis, Node, Sample
+from operators.fusion.error_state import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    SIZE,
+    VELOCITY,
+    Noise,
+    State,
+    updated,
+)
 from operators.fusion.measurements import AngularRate, RestingForce
+from operators.fusion.nodes import Hypothesis, Node, Sample
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
@@ -90,6 +100,17 @@ def first_node(
         made.append(Hypothesis(0.0, state))
     last = samples[-1]
     return Node(last.time, tuple(made), last.gyro, last.accel)
+
+
+def coasting_node(stamp: int, prior: Prior, gravity: float) -> Node:
+    """Returns the estimate of a body without inertial sensor: level, with the heading known or not, at any velocity."""
+    up = np.array([0.0, 0.0, gravity])
+    quiet = Noise(1e-3, 1e-3, 0.0, 0.0)
+    samples = [Sample(stamp - 1, np.zeros(3), up, quiet), Sample(stamp, np.zeros(3), up, quiet)]
+    if prior.heading is None:
+        prior = replace(prior, heading=0.0, heading_sigma=math.pi)
+    prior = replace(prior, gyro_bias=1.0, accel_bias=1e-3, moving_velocity=10.0, moving_accel=1.0)
+    return first_node(samples, prior, gravity, at_rest=False)
 
 
 def _levelling(up: Array) -> Array:

@@ -10,12 +10,13 @@ import math
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.fusion.control import Command
 from operators.fusion.error_state import (
     ROTATION,
     Noise,
@@ -26,48 +27,20 @@ from operators.fusion.error_state import (
     updated,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge
-from operators.fusion.measurements import Model, from_plain, to_plain
+from operators.fusion.measurements import from_plain, to_plain
+from operators.fusion.nodes import (
+    Entry,
+    Hypothesis,
+    Measurement,
+    Node,
+    Sample,
+    node_of,
+    plain_node,
+    plain_sample,
+    sample_of,
+)
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, eq=False)
-class Sample:
-    """Readings of the inertial sensor: time (ns), rad/s (3,), m/s² (3,), and their noise."""
-
-    time: int
-    gyro: Array
-    accel: Array
-    noise: Noise
-
-
-@dataclass(frozen=True, eq=False)
-class Measurement:
-    """Holds what a sensor said about a time (ns), with covariance (M, M)."""
-
-    time: int
-    sensor: str
-    model: Model
-    noise: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Hypothesis:
-    """One of several estimates, with the logarithm of its weight."""
-
-    weight: float
-    state: State
-
-
-@dataclass(frozen=True, eq=False)
-class Node:
-    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor."""
-
-    time: int
-    hypotheses: tuple[Hypothesis, ...]
-    gyro: Array
-    accel: Array
-    health: Mapping[str, Health] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -96,7 +69,7 @@ class LateFilter:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
         self._nodes = [start]
-        self._entries: list[Sample | Measurement] = []
+        self._entries: list[Entry] = []
         self._keys: list[tuple[int, int, str, int]] = []
         self._sample_times: list[int] = []
         self._samples: list[Sample] = []
@@ -134,6 +107,15 @@ class LateFilter:
         self._insert(measurement, (measurement.time, 1, measurement.sensor, self._count))
         return True
 
+    def command(self, command: Command) -> bool:
+        """Takes a control input, which counts where there are no inertial samples; False where it is too late."""
+        if command.time < max(self.time - round(self._config.window * 1e9), self._nodes[0].time):
+            self.ignored["control input: too late"] += 1
+            return False
+        self._count += 1
+        self._insert(command, (command.time, 2, "", self._count))
+        return True
+
     def estimate(self, time: int) -> tuple[State, Array]:
         """Returns the state at a time, not before the newest entry, and the gyroscope's reading."""
         node = self._nodes[-1]
@@ -145,12 +127,17 @@ class LateFilter:
         """The oldest estimate of the window and what was given since: the rest follows from them."""
         first = max(0, bisect_right(self._sample_times, self._nodes[0].time))
         return {
-            "base": _plain_node(self._nodes[0]),
-            "samples": [_plain_sample(s) for s in self._samples[first:]],
+            "base": plain_node(self._nodes[0]),
+            "samples": [plain_sample(s) for s in self._samples[first:]],
             "measurements": [
                 [e.time, e.sensor, to_plain(e.model), e.noise, key[3]]
                 for e, key in zip(self._entries, self._keys, strict=True)
                 if isinstance(e, Measurement)
+            ],
+            "commands": [
+                [e.time, e.linear, e.angular, e.lag, key[3]]
+                for e, key in zip(self._entries, self._keys, strict=True)
+                if isinstance(e, Command)
             ],
             "count": self._count,
             "ignored": dict(self.ignored),
@@ -159,11 +146,13 @@ class LateFilter:
     @classmethod
     def restored(cls, config: FilterConfig, state: Mapping[str, Any]) -> LateFilter:
         """Goes on where a snapshot was taken."""
-        made = cls(config, _node_of(state["base"]))
-        rows = [(_sample_of(s), 0, "", 0) for s in state["samples"]]
-        entries: list[tuple[Sample | Measurement, int, str, int]] = list(rows)
+        made = cls(config, node_of(state["base"]))
+        rows = [(sample_of(s), 0, "", 0) for s in state["samples"]]
+        entries: list[tuple[Entry, int, str, int]] = list(rows)
         for time, sensor, model, noise, number in state["measurements"]:
             entries.append((Measurement(int(time), sensor, from_plain(model), noise), 1, sensor, int(number)))
+        for time, linear, angular, lag, number in state.get("commands", ()):
+            entries.append((Command(int(time), linear, angular, float(lag)), 2, "", int(number)))
         entries.sort(key=lambda row: (row[0].time, *row[1:]))
         made._samples = [row[0] for row in rows]
         made._sample_times = [s.time for s in made._samples]
@@ -176,7 +165,7 @@ class LateFilter:
     def _noise(self) -> Noise:
         return self._samples[-1].noise if self._samples else self._config.unknown
 
-    def _insert(self, entry: Sample | Measurement, key: tuple[int, int, str, int]) -> None:
+    def _insert(self, entry: Entry, key: tuple[int, int, str, int]) -> None:
         place = bisect_right(self._keys, key)
         self._keys.insert(place, key)
         self._entries.insert(place, entry)
@@ -187,7 +176,7 @@ class LateFilter:
     def _advance(self) -> None:
         while len(self._nodes) <= len(self._entries):
             following = self._entries[len(self._nodes) - 1]
-            if self._config.inertial and isinstance(following, Measurement) and following.time > self._newest_sample():
+            if self._config.inertial and not isinstance(following, Sample) and following.time > self._newest_sample():
                 break  # until the readings up to there are known
             self._nodes.append(self._after(self._nodes[-1], following))
 
@@ -205,7 +194,7 @@ class LateFilter:
         gone = bisect_right(self._sample_times, self._nodes[0].time)
         del self._sample_times[:gone], self._samples[:gone]
 
-    def _after(self, node: Node, entry: Sample | Measurement) -> Node:
+    def _after(self, node: Node, entry: Entry) -> Node:
         if isinstance(entry, Sample):
             return self._moved(node, entry.time, entry.gyro, entry.accel, entry.noise)
         if entry.time > node.time:
@@ -218,6 +207,8 @@ class LateFilter:
             else:
                 gyro, accel, noise = node.gyro, node.accel, self._config.unknown
             node = self._moved(node, entry.time, gyro, accel, noise)
+        if isinstance(entry, Command):
+            return replace(node, command=entry)
         return self._measured(node, entry)
 
     def _moved(self, node: Node, time: int, gyro: Array, accel: Array, noise: Noise) -> Node:
@@ -231,16 +222,20 @@ class LateFilter:
                 for h in node.hypotheses
             )
         else:
-            hypotheses = tuple(replace(h, state=self._coasted(h.state, seconds, gyro)) for h in node.hypotheses)
-        return Node(time, hypotheses, gyro, accel, node.health)
+            hypotheses = tuple(replace(h, state=self._coasted(h.state, seconds, gyro, node)) for h in node.hypotheses)
+        return Node(time, hypotheses, gyro, accel, node.health, node.command)
 
-    def _coasted(self, state: State, seconds: float, gyro: Array) -> State:
-        """Goes on at the same velocities: what is felt is gravity alone."""
+    def _coasted(self, state: State, seconds: float, gyro: Array, node: Node) -> State:
+        """Goes on at the same velocities, or those that the body was told: what is felt is gravity alone."""
         steps = max(1, math.ceil(seconds / 0.05))
         turning = gyro if self._config.inertial else np.zeros(3)
-        for _ in range(steps):
+        for k in range(steps):
             force = state.accel_bias - state.rotation.T @ self._down
+            before = state.rotation
             state = propagated(state, turning, force, seconds / steps, self._config.unknown, self._down)
+            if node.command is not None and not self._config.inertial:
+                now = node.time + round((k + 1) / steps * seconds * 1e9)
+                state = node.command.drive(state, before, now, seconds / steps)
         return state
 
     def _measured(self, node: Node, entry: Measurement) -> Node:
@@ -267,42 +262,7 @@ class LateFilter:
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
                 ]
             )
-        return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after})
-
-
-def _plain_node(node: Node) -> dict[str, Any]:
-    return {
-        "time": node.time,
-        "readings": [node.gyro, node.accel],
-        "hypotheses": [[h.weight, *(getattr(h.state, f.name) for f in fields(State))] for h in node.hypotheses],
-        "health": {
-            name: [
-                *(h.used, h.widened, h.refused, h.unconfirmed, h.last_used, h.nis),
-                [[d.time, d.residual, d.noise] for d in h.doubts],
-            ]
-            for name, h in node.health.items()
-        },
-    }
-
-
-def _node_of(content: Mapping[str, Any]) -> Node:
-    hypotheses = tuple(Hypothesis(float(weight), State(*arrays)) for weight, *arrays in content["hypotheses"])
-    health = {}
-    for name, (used, widened, refused, unconfirmed, last, nis, doubts) in content["health"].items():
-        kept = tuple(Doubt(int(time), residual, noise) for time, residual, noise in doubts)
-        health[name] = Health(used, widened, refused, unconfirmed, last, nis, kept)
-    gyro, accel = content["readings"]
-    return Node(int(content["time"]), hypotheses, gyro, accel, health)
-
-
-def _plain_sample(sample: Sample) -> list[Any]:
-    noise = sample.noise
-    return [sample.time, sample.gyro, sample.accel, noise.gyro, noise.accel, noise.gyro_walk, noise.accel_walk]
-
-
-def _sample_of(content: Sequence[Any]) -> Sample:
-    time, gyro, accel, *noise = content
-    return Sample(int(time), gyro, accel, Noise(*noise))
+        return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
 
 
 def combined(hypotheses: Sequence[Hypothesis]) -> State:

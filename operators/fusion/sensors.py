@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Literal
 
 import numpy as np
@@ -38,7 +39,17 @@ from operators.geometry.geodesy import east_north_up
 
 Array = NDArray[np.float64]
 Use = Literal[
-    "auto", "inertial", "position", "pose", "orientation", "velocity", "wheels", "heading", "doppler", "range"
+    "auto",
+    "inertial",
+    "control",
+    "position",
+    "pose",
+    "orientation",
+    "velocity",
+    "wheels",
+    "heading",
+    "doppler",
+    "range",
 ]
 Found = tuple[int, str, Model, Array]
 _I3 = np.eye(3)
@@ -59,6 +70,7 @@ class SensorSettings(BaseModel):
     )
     share: float = Field(0.999, gt=0, lt=1, description="share of true measurements that the gate lets through")
     agreeing: int = Field(3, ge=2, description="refused measurements that must agree until the filter yields to them")
+    lag: float = Field(0.2, gt=0, description="seconds in which velocities follow a control input")
     still: float = Field(0.002, ge=0, description="wheels slower than this (m/s at the rim) stand still")
     azimuth: float = Field(
         math.pi / 2, description="of magnetic north, radians from x towards y; a half π less declination if y is north"
@@ -83,6 +95,7 @@ _FITTING: dict[str, tuple[type[Message], ...]] = {
     "velocity": (Odometry, Twist),
     "wheels": (Odometry, Twist),
     "heading": (MagneticField,),
+    "control": (Twist,),
     "doppler": (RadarScan,),
     "range": (LandmarkSightings,),
 }
@@ -110,6 +123,18 @@ def use_of(name: str, message: Message, settings: SensorSettings) -> str:
         fitting = " or ".join(t.__name__ for t in _FITTING[use])
         raise ValueError(f"{name}: {type(message).__name__} cannot be used as {use!r}, which takes {fitting}")
     return use
+
+
+def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
+    """Returns the settings' names that no stream ends with, each with the nearest stream that has no settings."""
+    taken = [stream for stream in streams for name in names if f"/{stream}".endswith(f"/{name}")]
+    free = [stream for stream in streams if stream not in taken]
+    found = {}
+    for name in names:
+        if not any(f"/{stream}".endswith(f"/{name}") for stream in streams):
+            near = get_close_matches(name, free, 1, 0.5)
+            found[name] = f"; the nearest is {near[0]}" if near else ""
+    return found
 
 
 def measurements(

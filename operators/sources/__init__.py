@@ -1,22 +1,50 @@
 """Sources: datasets, devices, made-up sequences and a simulated robot."""
 
-from operators.sources.broad_imu import BroadImu
-from operators.sources.euroc_imu import EurocImu
-from operators.sources.kitti_odometry import KittiOdometry
-from operators.sources.kitti_raw import KittiRaw
-from operators.sources.recorded import (
-    RecordedCamera,
-    RecordedImu,
-    RecordedLidar,
-    RecordedPose,
-    RecordedRgbdCamera,
-    RecordedStereoCamera,
-    RecordedTransforms,
-)
-from operators.sources.rgbd_folder import RgbdFolder
-from operators.sources.simulated_robot import SimulatedRobot
-from operators.sources.synthetic_rgbd import SyntheticRgbd
-from operators.sources.victoria_park import VictoriaPark
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from operators.sources.broad_imu import BroadImu
+    from operators.sources.euroc_imu import EurocImu
+    from operators.sources.kitti_odometry import KittiOdometry
+    from operators.sources.kitti_raw import KittiRaw
+    from operators.sources.recorded import (
+        RecordedCamera,
+        RecordedImu,
+        RecordedLidar,
+        RecordedPose,
+        RecordedRgbdCamera,
+        RecordedStereoCamera,
+        RecordedTransforms,
+    )
+    from operators.sources.rgbd_folder import RgbdFolder
+    from operators.sources.simulated_robot import SimulatedRobot
+    from operators.sources.synthetic_rgbd import SyntheticRgbd
+    from operators.sources.victoria_park import VictoriaPark
+else:  # most need a library of their own, which a graph without them need not load
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "broad_imu": ("BroadImu",),
+            "euroc_imu": ("EurocImu",),
+            "kitti_odometry": ("KittiOdometry",),
+            "kitti_raw": ("KittiRaw",),
+            "recorded": (
+                "RecordedCamera",
+                "RecordedImu",
+                "RecordedLidar",
+                "RecordedPose",
+                "RecordedRgbdCamera",
+                "RecordedStereoCamera",
+                "RecordedTransforms",
+            ),
+            "rgbd_folder": ("RgbdFolder",),
+            "simulated_robot": ("SimulatedRobot",),
+            "synthetic_rgbd": ("SyntheticRgbd",),
+            "victoria_park": ("VictoriaPark",),
+        },
+    )
 
 __all__ = [
     "BroadImu",

@@ -54,7 +54,6 @@ from operators.sources.simulator.settings import (
     Truth,
     Wheels,
 )
-from operators.sources.simulator.worlds import make_world
 
 if TYPE_CHECKING:
     from operators.sources.simulator.rig import Rig
@@ -151,6 +150,7 @@ class SimulatedRobot(Source):
         from operators.sources.simulator.drive import bumps, sway
         from operators.sources.simulator.stage import Stage
         from operators.sources.simulator.truth import TrueGraph
+        from operators.sources.simulator.worlds import make_world
 
         if self.image_frame == self.depth_frame:
             raise ValueError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")

@@ -11,12 +11,17 @@ from rich.markup import escape
 from rich.table import Table
 
 from operators.training.console import Data, Json, SplitSeed, Weights, friendly, out_console, print_notes
+from operators.training.graph_evaluation import evaluate_graph
 
 Sample = TypeVar("Sample")
 
 evaluate = typer.Typer(
-    name="evaluate", help="Score a network file on labelled data.", no_args_is_help=True, rich_markup_mode="rich"
+    name="evaluate",
+    help="Score a network file on labelled data, or a graph by its metrics.",
+    no_args_is_help=True,
+    rich_markup_mode="rich",
 )
+evaluate.command("graph")(evaluate_graph)
 
 
 @evaluate.command("detector")

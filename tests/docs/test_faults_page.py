@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 from typing import get_args
 
+from dataflow.chaos import kinds
 from dataflow.chaos import plan as chaos
 from dataflow.graph import load_graph
 from dataflow.supervision.health import LEVELS
@@ -37,8 +38,8 @@ def test_the_plan_on_the_page_is_the_shipped_one_and_has_faults_of_every_kind(re
 
     assert f"```yaml\n{plan.read_text(encoding='utf-8')}```" in page(repository)
     faults = list(islice(chaos.load_plan(plan, graph), 200))
-    kinds = {*chaos.TO_OPERATORS, *chaos.TO_SOURCES, *chaos.TO_PROCESSES, "malformed", "param"}
-    assert {fault.kind for fault in faults} == kinds
+    known = {*kinds.TO_OPERATORS, *kinds.TO_SOURCES, *kinds.TO_PROCESSES, "malformed", "param"}
+    assert {fault.kind for fault in faults} == known
 
 
 def test_every_kind_of_fault_and_every_state_has_a_row(repository: Path) -> None:

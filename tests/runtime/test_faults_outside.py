@@ -32,7 +32,7 @@ network: {shared_memory: false}
 operators:
   left: {use: "SOURCE", params: {count: COUNT}}
   smooth: {use: runtime_operators:Smooth, inputs: {x: left/fast}}
-  sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}
+  sum: {use: runtime_operators:Sum, inputs: {x: left/fast}, live: {queue: oldest, size: 1000}}
 """
 
 

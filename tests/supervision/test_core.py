@@ -56,15 +56,23 @@ def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
     assert killed(play.commands) == ["sum"]
 
 
+def test_a_run_starts_and_ends_without_waiting_for_a_tick() -> None:
+    play = Play(record="run.mcap")
+
+    play.tell(Begin())
+    assert play.core.status.phase == "running"
+    play.tell(*(play.ended(label) for label in play.processes))
+
+    assert play.over is not None
+    assert play.over.failure is None
+
+
 def test_the_end_is_told_to_the_recorder_when_the_others_have_closed() -> None:
     play = Play(record="run.mcap").starts()
-    order = []
 
-    play.tell(*(play.ended(label) for label in play.processes))
-    for command in play.wait(1.0):
-        order += [label for label, _ in sent([command], "leave")]
+    given = play.tell(*(play.ended(label) for label in play.processes))
 
-    assert order == ["left", "sum", "@recorder"]
+    assert [label for label, _ in sent(given, "leave")] == ["left", "sum", "@recorder"]
     assert dict(sent(play.commands, "leave"))["@recorder"]["outcome"] == "complete"
     assert Withdraw() in play.commands
     assert play.over is not None

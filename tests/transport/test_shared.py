@@ -183,6 +183,7 @@ def test_messages_of_a_killed_producer_stay_readable_and_it_leaves_nothing() -> 
         msgpack.packb(("x", 1)),
         b"\xc1",
     ],
+    ids=["no shared memory", "a number too large", "too few fields", "no msgpack"],
 )
 def test_a_reference_to_anything_else_is_refused(shared: Shared, body: bytes) -> None:
     head = msgpack.packb((DEPTH, 0, 3, 7, 0, ""))

@@ -71,6 +71,22 @@ def test_a_constant_drift_is_the_relative_error() -> None:
     assert figures["ate_rmse_m"] == pytest.approx(0.02, rel=0.05)
 
 
+def test_drift_is_the_mean_error_of_segments_as_kitti_defines_it() -> None:
+    """A straight path measured 2 % too long, that turns by 0.1 degrees a metre."""
+    count = 301
+    x = np.arange(count) * 1.0
+    path = transform_matrix(np.column_stack([x, 0 * x, 0 * x]), quaternion_from_yaw(0 * x))
+    far = transform_matrix(np.column_stack([1.02 * x, 0 * x, 0 * x]), quaternion_from_yaw(np.radians(0.1) * x))
+    figures = score(far, path)
+    assert figures["drift_deg_per_m"] == pytest.approx(0.1, rel=0.02)
+    straight = far.copy()
+    straight[:, :3, :3] = np.eye(3)
+    figures = score(straight, path)
+    assert figures["drift_percent"] == pytest.approx(2.0, rel=0.02)
+    assert figures["drift_segments"] == 20 + 10 + 0  # those that begin before 200 m and 100 m
+    assert "drift_percent" not in score(path[:50], path[:50])
+
+
 def test_scale_is_found_only_by_sim3() -> None:
     path = circle()
     half = path.copy()

@@ -10,6 +10,7 @@ from made_motion import Motion
 from scipy.spatial.transform import Rotation
 
 from dataflow.messages import (
+    Diagnostics,
     Imu,
     LandmarkSightings,
     MagneticField,
@@ -210,9 +211,10 @@ def test_odometry_without_velocity_counts_by_its_steps() -> None:
     assert np.linalg.norm(estimated[:3, 3] - true[:3, 3]) < 0.15
 
 
-def test_radar_gives_the_velocity_and_what_moves_is_refused() -> None:
+@pytest.mark.parametrize("settings", [{"use": "doppler", "sigma": 0.03}, {"sigma": 0.03}], ids=["doppler", "auto"])
+def test_radar_gives_the_velocity_and_what_moves_is_refused(settings: dict[str, Any]) -> None:
     robot = Robot()
-    sensors = {"robot/radar": {"use": "doppler", "sigma": 0.03}}
+    sensors = {"robot/radar": settings}
     operator, played = fused({"robot/imu": robot.imu, "robot/radar": robot.scans()}, start="origin", sensors=sensors)
     figures = operator.summary()
     assert figures["robot/radar, refused"] >= 0.8 * len(robot.scans()) - 8
@@ -293,6 +295,43 @@ def test_without_inertial_sensor_poses_are_smoothed() -> None:
     assert operator.summary()["robot/pose, refused"] == 0
 
 
+def test_without_inertial_sensor_a_control_input_carries_the_estimate_through_an_outage() -> None:
+    """A body on a circle at 1 m/s and 0.5 rad/s, whose positions end after 3 s."""
+    stamps = [100_000_000 * k for k in range(1, 61)]
+    circle = [transform(stamp * 1e-9) for stamp in stamps]
+    poses = [
+        Pose.from_matrix(T, stamp=s, frame="world", child_frame="base_link", covariance=np.eye(6) * 1e-4)
+        for s, T in zip(stamps, circle, strict=True)
+    ]
+    told = [Twist(stamp=s + 1, frame="base_link", linear=[1, 0, 0], angular=[0, 0, 0.5]) for s in stamps]
+    ends = []
+    for commands in (told, told[:30]):
+        operator = EkfFusion(
+            motion="constant_velocity",
+            free_acceleration=0.05,
+            free_turning=0.05,
+            sensors={"robot/pose": {"use": "pose"}, "robot/told": {"use": "control", "lag": 0.2}},
+        )
+        played = play(operator, {"measurements": {"robot/pose": poses[:30], "robot/told": commands}})
+        state = operator.snapshot()
+        other = EkfFusion(motion="constant_velocity", sensors=operator.sensors)
+        other.setup()
+        other.restore(state)
+        assert other.summary() == operator.summary()
+        assert operator._filter is not None
+        ends.append(float(np.linalg.norm(operator._filter.estimate(stamps[-1])[0].position - circle[-1][:3, 3])))
+        assert played["odometry"]
+    assert ends[0] < 0.1
+    assert operator._filter.estimate(stamps[-1])[0].covariance[0, 0] > 0.1**2
+
+
+def transform(t: float) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("z", 0.5 * t).as_matrix()
+    T[:2, 3] = 2 * np.sin(0.5 * t), 2 - 2 * np.cos(0.5 * t)
+    return T
+
+
 def test_what_is_ignored_is_counted_with_its_reason() -> None:
     robot = Robot(3.0)
     fixes = robot.fixes()
@@ -360,6 +399,21 @@ def test_a_sensor_that_cannot_be_used_is_named(message: Message, settings: dict[
         operator.process({"ns/robot/imu": imu}, Context(imu.stamp), extrinsics())
     with pytest.raises(ValueError, match=words):
         operator.process({"ns/robot/x": message}, Context(message.stamp), extrinsics())
+
+
+def test_settings_of_no_stream_are_reported_with_the_nearest_stream() -> None:
+    robot = Robot(3.0)
+    sensors = {"robot/pos": {"sigma": 0.1}, "robot/fx": {"sigma": 0.1}}
+    operator = EkfFusion(sensors=sensors, origin=ORIGIN, **HEADING)
+    streams = {"robot/imu": robot.imu, "robot/fix": robot.fixes(), "robot/pos": robot.poses(Pose)}
+    given: dict[str, Any] = {"measurements": streams, "extrinsics": [extrinsics()]}
+    played = play(operator, given, static=["extrinsics"])
+    status = played["status"][-1]
+    assert isinstance(status, Diagnostics)
+    texts = dict(zip(status.names, status.messages, strict=True))
+    assert texts["settings of robot/fx"] == "no stream so far has this name; the nearest is measurements/robot/fix"
+    assert "settings of robot/pos" not in texts
+    assert operator.summary()["settings of robot/fx"] == "of no stream; the nearest is measurements/robot/fix"
 
 
 def test_settings_are_checked() -> None:

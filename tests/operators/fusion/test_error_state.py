@@ -24,7 +24,7 @@ from operators.fusion.error_state import (
     propagated,
     updated,
 )
-from operators.fusion.late_filter import FilterConfig, LateFilter, Measurement, Sample
+from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import (
     AngularRate,
     FullPose,
@@ -38,6 +38,7 @@ from operators.fusion.measurements import (
     from_plain,
     to_plain,
 )
+from operators.fusion.nodes import Measurement, Sample
 
 rng = np.random.default_rng(3)
 NOISE = Noise(gyro=2e-3, accel=2e-2, gyro_walk=1e-4, accel_walk=1e-3)

@@ -7,12 +7,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from operators.sources import simulated_robot
+from operators.sources.simulator import worlds
 
 
 @pytest.fixture(scope="session", autouse=True)
 def shared_worlds() -> Iterator[None]:
-    made = simulated_robot.make_world
-    simulated_robot.make_world = functools.lru_cache(maxsize=16)(made)
+    made = worlds.make_world
+    worlds.make_world = functools.lru_cache(maxsize=16)(made)
     yield
-    simulated_robot.make_world = made
+    worlds.make_world = made

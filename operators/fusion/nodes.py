@@ -1,0 +1,103 @@
+"""What the filter is given and what it makes of it: samples, measurements, and the estimate after each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.fusion.control import Command
+from operators.fusion.error_state import Noise, State
+from operators.fusion.gate import Doubt, Health
+from operators.fusion.measurements import Model
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Sample:
+    """Readings of the inertial sensor: time (ns), rad/s (3,), m/s² (3,), and their noise."""
+
+    time: int
+    gyro: Array
+    accel: Array
+    noise: Noise
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Holds what a sensor said about a time (ns), with covariance (M, M)."""
+
+    time: int
+    sensor: str
+    model: Model
+    noise: Array
+
+
+Entry = Sample | Measurement | Command
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """One of several estimates, with the logarithm of its weight."""
+
+    weight: float
+    state: State
+
+
+@dataclass(frozen=True, eq=False)
+class Node:
+    """The estimate after an entry: its time (ns), the readings of that time, and what became of each sensor."""
+
+    time: int
+    hypotheses: tuple[Hypothesis, ...]
+    gyro: Array
+    accel: Array
+    health: Mapping[str, Health] = field(default_factory=dict)
+    command: Command | None = None
+
+
+def plain_node(node: Node) -> dict[str, Any]:
+    """Returns a node as numbers, texts, arrays, and lists and mappings of these."""
+    c = node.command
+    return {
+        "time": node.time,
+        "readings": [node.gyro, node.accel],
+        "command": None if c is None else [c.time, c.linear, c.angular, c.lag],
+        "hypotheses": [[h.weight, *(getattr(h.state, f.name) for f in fields(State))] for h in node.hypotheses],
+        "health": {
+            name: [
+                *(h.used, h.widened, h.refused, h.unconfirmed, h.last_used, h.nis),
+                [[d.time, d.residual, d.noise] for d in h.doubts],
+            ]
+            for name, h in node.health.items()
+        },
+    }
+
+
+def node_of(content: Mapping[str, Any]) -> Node:
+    """Returns the node that `plain_node` was given."""
+    hypotheses = tuple(Hypothesis(float(weight), State(*arrays)) for weight, *arrays in content["hypotheses"])
+    health = {}
+    for name, (used, widened, refused, unconfirmed, last, nis, doubts) in content["health"].items():
+        kept = tuple(Doubt(int(time), residual, noise) for time, residual, noise in doubts)
+        health[name] = Health(used, widened, refused, unconfirmed, last, nis, kept)
+    gyro, accel = content["readings"]
+    told = content.get("command")
+    command = None if told is None else Command(int(told[0]), told[1], told[2], float(told[3]))
+    return Node(int(content["time"]), hypotheses, gyro, accel, health, command)
+
+
+def plain_sample(sample: Sample) -> list[Any]:
+    """Returns a sample as numbers and arrays."""
+    noise = sample.noise
+    return [sample.time, sample.gyro, sample.accel, noise.gyro, noise.accel, noise.gyro_walk, noise.accel_walk]
+
+
+def sample_of(content: Sequence[Any]) -> Sample:
+    """Returns the sample that `plain_sample` was given."""
+    time, gyro, accel, *noise = content
+    return Sample(int(time), gyro, accel, Noise(*noise))

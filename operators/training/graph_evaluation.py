@@ -1,0 +1,97 @@
+"""`dataflow evaluate graph`: runs a graph on data and prints what its metrics say, in one table."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from operators.training.console import Json, fail, friendly, out_console
+
+DATA_NAMES = ("data", "path", "folder", "recording")
+"""Parameters of a graph that `--data FOLDER` may mean."""
+
+
+def evaluate_graph(
+    graph: Annotated[Path, typer.Argument(help="The graph file: its metrics operators do the scoring.")],
+    data: Annotated[
+        list[str] | None,
+        typer.Option("--data", metavar="FOLDER|NAME=FOLDER", help="The data: sets the graph's parameter for it."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Sets another parameter of the graph.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Run a graph and print the figures of its metrics.
+
+    `--data FOLDER` sets the parameter data, path, folder or recording, whichever the graph has; `--data NAME=FOLDER`
+    one of another name. Examples:
+
+      dataflow evaluate graph graphs/lidar.yaml --data ../data/kitti_raw
+      dataflow evaluate graph graphs/localize.yaml --set duration=20s --json
+    """
+    with friendly():
+        if not graph.is_file():
+            raise FileNotFoundError(f"no graph file {str(graph)!r} (looked for {graph.absolute()})")
+        given = [*data_settings(parameters_of(graph), data or ()), *(settings or ())]
+    command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--json", "--quiet"]
+    ran = subprocess.run(
+        [*command, *(word for one in given for word in ("--set", one))], stdout=subprocess.PIPE, text=True, check=False
+    )
+    if ran.returncode:
+        raise typer.Exit(ran.returncode)  # the run has said why
+    figures = {name: summary for name, summary in jsonlib.loads(ran.stdout)["summaries"].items() if summary}
+    if not figures:
+        fail(f"no operator of {graph} gives figures: wire a metrics operator, such as operators.evaluation:...Metrics")
+    if json:
+        typer.echo(jsonlib.dumps({"graph": str(graph), "settings": given, "figures": figures}, indent=2))
+        return
+    out_console.print(table_of(figures))
+
+
+def parameters_of(graph: Path) -> Mapping[str, Any]:
+    """Returns the parameters that a graph file declares. Raises ValueError for a file that is no YAML."""
+    try:
+        content = YAML(typ="safe").load(graph.read_text(encoding="utf-8"))
+    except YAMLError as error:
+        raise ValueError(f"{graph} is no YAML: {error}") from None
+    found = content.get("params") if isinstance(content, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
+
+
+def data_settings(parameters: Mapping[str, Any], data: Sequence[str]) -> list[str]:
+    """Returns `NAME=FOLDER` for every `FOLDER` or `NAME=FOLDER`. Raises ValueError where no parameter is for it."""
+    made = []
+    for entry in data:
+        name, _, _ = entry.partition("=")
+        if name in parameters and "=" in entry:
+            made.append(entry)
+            continue
+        able = [known for known in DATA_NAMES if known in parameters]
+        if len(able) != 1:
+            listed = ", ".join(parameters) or "none"
+            which = f"both {' and '.join(able)}" if able else f"none of {', '.join(DATA_NAMES)}"
+            raise ValueError(f"--data {entry}: the graph has {which}: say NAME={entry}; its parameters: {listed}")
+        made.append(f"{able[0]}={entry}")
+    return made
+
+
+def table_of(figures: Mapping[str, Mapping[str, Any]]) -> Table:
+    """Returns a table of all figures by operator."""
+    table = Table("operator", "figure", "value")
+    for operator, summary in figures.items():
+        for k, (name, value) in enumerate(summary.items()):
+            shown = f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+            table.add_row(escape(operator) if k == 0 else "", escape(name), shown)
+        table.add_section()
+    return table

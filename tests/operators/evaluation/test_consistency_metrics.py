@@ -1,0 +1,81 @@
+"""Consistency of covariances: honest ones lie in the band, and those that are not do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from dataflow.messages import Odometry, Pose
+from dataflow.testing import play
+from operators.evaluation import ConsistencyMetrics
+
+SECOND = 10**9
+
+
+def figures(factor: float, *, flat: bool = False, **params: object) -> dict[str, float | int | str]:
+    """Of 400 poses whose covariances are `factor` times what their errors have."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(0, 0.1, (6, 6))
+    C = A @ A.T + np.eye(6) * 1e-3
+    estimates, truths = [], []
+    for k in range(400):
+        error = rng.multivariate_normal(np.zeros(6), C)
+        R = Rotation.random(random_state=k)
+        truth = Pose(
+            stamp=(k + 1) * SECOND,
+            frame="world",
+            child_frame="base",
+            position=rng.uniform(-5, 5, 3),
+            orientation=R.as_quat(),
+        )
+        given = C * factor
+        if flat:
+            given = given.copy()
+            given[2, :] = given[:, 2] = 0.0
+        estimates.append(
+            Odometry(
+                stamp=truth.stamp,
+                frame="world",
+                child_frame="base",
+                position=truth.position - error[:3],
+                orientation=(Rotation.from_rotvec(error[3:]).inv() * R).as_quat(),
+                pose_covariance=given,
+            )
+        )
+        truths.append(truth)
+    operator = ConsistencyMetrics(**params)
+    play(operator, {"estimate": estimates, "ground_truth": truths})
+    return dict(operator.summary())
+
+
+def test_honest_covariances_lie_in_the_band() -> None:
+    found = figures(1.0)
+    for part in ("pose", "position", "orientation"):
+        assert found[f"{part}_nees_mean"] == pytest.approx(1.0, abs=0.08)
+        assert found[f"{part}_above_95_percent"] == pytest.approx(5.0, abs=3.0)
+        assert str(found[f"{part}_band_95_percent"]).endswith(", in")
+
+
+@pytest.mark.parametrize(("factor", "mean"), [(0.25, 4.0), (4.0, 0.25)], ids=["too sure", "too unsure"])
+def test_covariances_that_are_not_honest_lie_outside(factor: float, mean: float) -> None:
+    found = figures(factor)
+    assert found["pose_nees_mean"] == pytest.approx(mean, rel=0.1)
+    assert str(found["pose_band_95_percent"]).endswith(", out")
+
+
+def test_directions_without_variance_do_not_count() -> None:
+    found = figures(1.0, flat=True)
+    assert found["position_nees_mean"] == pytest.approx(1.0, abs=0.1)
+    assert figures(1.0, planar=True)["heading_nees_mean"] == pytest.approx(1.0, abs=0.15)
+
+
+def test_frames_that_differ_are_named() -> None:
+    operator = ConsistencyMetrics()
+    operator.setup()
+    pose = Pose(stamp=1, frame="map", child_frame="base", position=[0, 0, 0], orientation=[0, 0, 0, 1])
+    with pytest.raises(ValueError, match="the ground truth is in 'world' but the estimate 'map'"):
+        operator.process(pose, (pose.replace(frame="world"),))
+    operator.process(pose, ())
+    operator.finish()
+    assert operator.summary()["estimates without finite covariance"] == 1

@@ -1,0 +1,60 @@
+"""`dataflow evaluate graph`: one table of a graph's figures, and data given by a word."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from operators.training.evaluation import evaluate
+from operators.training.graph_evaluation import data_settings
+
+GRAPH = """
+graph: scored
+params: {frames: 4}
+operators:
+  camera:
+    use: operators.sources:SyntheticRgbd
+    params: {frames: "${frames}"}
+  odometry:
+    use: operators.odometry:VisualOdometry
+    inputs:
+      image: camera/image
+      depth: camera/depth
+      image_info: camera/image_info
+      depth_info: camera/depth_info
+  metrics:
+    use: operators.evaluation:TrajectoryMetrics
+    inputs: {estimate: odometry/odometry, ground_truth: camera/ground_truth}
+"""
+
+
+def test_a_graph_is_run_and_its_figures_are_printed(tmp_path: Path) -> None:
+    (tmp_path / "scored.yaml").write_text(GRAPH)
+    ran = CliRunner().invoke(evaluate, ["graph", str(tmp_path / "scored.yaml"), "--set", "frames=5", "--json"])
+    assert ran.exit_code == 0, ran.output
+    assert json.loads(ran.stdout)["figures"]["metrics"]["matched"] == 5
+
+
+@pytest.mark.parametrize(
+    ("parameters", "data", "found"),
+    [
+        ({"path": 1, "seed": 2}, ["here"], ["path=here"]),
+        ({"data": 1, "model": 2}, ["here", "model=x=y.onnx"], ["data=here", "model=x=y.onnx"]),
+        ({"path": 1}, ["a=b"], ["path=a=b"]),  # a folder with a strange name
+    ],
+)
+def test_data_is_given_to_the_parameter_that_is_for_it(
+    parameters: dict[str, int], data: list[str], found: list[str]
+) -> None:
+    assert data_settings(parameters, data) == found
+
+
+def test_a_graph_without_data_is_named() -> None:
+    with pytest.raises(ValueError, match=r"none of data, path.*its parameters: seed"):
+        data_settings({"seed": 1}, ["here"])
+    ran = CliRunner().invoke(evaluate, ["graph", "nowhere.yaml"])
+    assert ran.exit_code == 1
+    assert "no graph file 'nowhere.yaml'" in ran.stderr.replace("\n", " ")

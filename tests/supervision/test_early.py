@@ -1,0 +1,93 @@
+"""A nursery that is started before the graph is known: what it becomes, and that nothing of it is left."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from dataflow.firing.threads import environment
+from dataflow.graph import load_text
+from dataflow.supervision import supervisor
+from dataflow.supervision.early import EarlyNursery, early_nursery
+from dataflow.supervision.run import run
+
+GRAPH = """\
+graph: early
+namespace: test
+operators:
+  left: {use: "runtime_operators:Counter", params: {count: 5}}
+  sum: {use: "own_sum:OwnSum", inputs: {x: left/fast}}
+"""
+
+OWN = """\
+import os
+from runtime_operators import Sum
+
+class OwnSum(Sum):
+    def summary(self):
+        return {"word": os.environ["A_WORD"], "parent": os.getppid()}
+"""
+
+
+def nursery_of(early: EarlyNursery) -> int:
+    assert early._nursery is not None
+    return early._nursery._process.pid
+
+
+def runs(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
+
+
+def test_processes_of_an_early_nursery_find_modules_and_variables_that_came_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "own_sum.py").write_text(OWN)
+    with early_nursery() as early:
+        pid = nursery_of(early)
+        monkeypatch.setattr(sys, "path", [*sys.path, str(tmp_path)])
+        monkeypatch.setenv("A_WORD", "said later")
+        report = run(load_text(GRAPH), early=early)
+
+    assert report.summaries["sum"] == {"word": "said later", "parent": pid}
+    assert not runs(pid)
+
+
+def test_a_graph_with_other_threads_gets_a_nursery_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[str] = []
+    real = supervisor.Nursery
+    monkeypatch.setattr(supervisor, "Nursery", lambda given: started.append(given["OMP_NUM_THREADS"]) or real(given))
+    with early_nursery() as early:
+        run(load_text(GRAPH.replace("own_sum:OwnSum", "runtime_operators:Sum") + "threads: 2\n"), early=early)
+
+    assert started == ["2"]
+
+
+def test_a_nursery_that_nobody_takes_is_ended_at_once() -> None:
+    with early_nursery() as early:
+        pid = nursery_of(early)
+        assert runs(pid)
+
+    assert not runs(pid)
+
+
+def test_one_that_has_died_is_replaced() -> None:
+    with early_nursery() as early:
+        assert early._nursery is not None
+        early._nursery._process.kill()
+        early._nursery._process.wait()
+        report = run(load_text(GRAPH.replace("own_sum:OwnSum", "runtime_operators:Sum")), early=early)
+
+    assert report.summaries["sum"]["count"] == 5
+
+
+def test_threads_are_those_of_the_graph_unless_it_says_nothing() -> None:
+    with early_nursery() as early:
+        taken = early.take(1)
+
+    assert taken is not None
+    assert taken.environment == environment(1)
+    taken.close()
+    assert os.environ.get("DATAFLOW_THREADS") is None
