@@ -30,8 +30,8 @@ def histograms(points: Array, normals: Array, radius: float, neighbours: int) ->
     total = np.bincount(rows, weights, len(points))
     joined = simple + joined / np.maximum(total, 1e-12)[:, None]
     blocks = joined.reshape(len(points), 3, BINS)
-    shares: Array = blocks / np.maximum(blocks.sum(axis=2, keepdims=True), 1e-12)
-    return shares.reshape(len(points), 3 * BINS)
+    blocks /= np.maximum(blocks.sum(axis=2, keepdims=True), 1e-12)
+    return np.asarray(blocks, np.float64).reshape(len(points), 3 * BINS)
 
 
 def _simple(points: Array, normals: Array, rows: NDArray[np.intp], to: NDArray[np.intp], length: Array) -> Array:

@@ -74,7 +74,7 @@ class Registered:
 
     @property
     def score(self) -> float:
-        """What motions are compared by."""
+        """The measures by which motions are compared."""
         return self.fitness - self.violation
 
 

@@ -1,4 +1,4 @@
-"""How much each sensor counts: less, the less its innovations are what its noise explains."""
+"""The say of each sensor: less, the less its innovations are explained by its noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What agents do and where they are going, from how they move."""
+"""Infers activities and goals of agents from how they move."""
 
 from __future__ import annotations
 

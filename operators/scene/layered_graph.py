@@ -33,7 +33,7 @@ class GraphSettings:
 
 @dataclass(frozen=True)
 class Act:
-    """What an agent does, how sure that is, to what (-1 for nothing), since when (ns), and where it is going."""
+    """The activity of an agent: its score, its object (-1 for none), since when (ns), and the goals it may have."""
 
     agent: int
     activity: str

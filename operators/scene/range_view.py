@@ -1,4 +1,4 @@
-"""What one cloud says of places: seen through, confirmed, hidden, or not looked at."""
+"""Tells of places what one cloud says: seen through, confirmed, hidden, or not looked at."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ROW = 1 << 16
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """What is known of places (N,): `looked` where a ray went that way; of these, `free` and `confirmed`."""
+    """Knowledge of places (N,): `looked` where a ray went that way; of these, `free` and `confirmed`."""
 
     looked: Mask
     free: Mask
