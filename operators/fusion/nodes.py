@@ -1,4 +1,4 @@
-"""What the filter is given and what it makes of it: samples, measurements, and the estimate after each."""
+"""Input of the late filter and its record: samples, measurements, and the estimate after each."""
 
 from __future__ import annotations
 

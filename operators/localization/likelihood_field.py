@@ -1,4 +1,4 @@
-"""How well points fit a map: the likelihood field of an occupancy grid, and its free places."""
+"""The likelihood field of an occupancy grid, by which points are scored, and its free places."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How much each sensor counts: less, the less its innovations are what its noise explains."""
+"""Weights of sensors: each counts less, the larger its innovations are than usual."""
 
 from __future__ import annotations
 
