@@ -3,6 +3,7 @@
     python benchmarks/firings.py
     python benchmarks/firings.py --against OTHER_TREE     # another checkout in turns with this one: ratios
     python benchmarks/firings.py --memory                 # 1,000,000 messages, a minute or more
+    python benchmarks/firings.py --processes              # the chain with a process for each operator
 
 Chains (a source, relays, a sink) and fans (a source, sinks) of small messages run in one process as fast as they go,
 each in a Python of its own. Time is taken inside that process every 20 messages, so start-up is not in it; CPU time is
@@ -43,6 +44,8 @@ class Case:
     recorded: bool = False
     fan: bool = False
     live: bool = False
+    each: bool = False
+    """A process for each operator."""
 
 
 CASES = (
@@ -78,7 +81,8 @@ def measure(case: Case, tree: Path, count: int, marks: list[int] | None = None) 
     with tempfile.TemporaryDirectory() as folder:
         graph = Path(folder) / "graph.yaml"
         graph.write_text(json.dumps(graph_of(case, count, marks or [])))  # JSON is YAML
-        command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--one-process", "--json", "--quiet"]
+        placement = "--process-each" if case.each else "--one-process"
+        command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), placement, "--json", "--quiet"]
         command += ["--record", str(Path(folder) / "run.mcap")] if case.recorded else []
         command += ["--live"] if case.live else []
         path = os.pathsep.join([str(tree), str(HERE)])
@@ -180,6 +184,22 @@ def memory(tree: Path) -> str:
     return f"memory after 100,000 messages {after:.1f} MiB, after 1,000,000 {end:.1f} MiB: {end / after:.3f} x"
 
 
+def processes(rounds: int, trees: dict[str, Path], messages: int) -> str:
+    """Messages per second, end to end, through a chain with a process for each operator, as Markdown."""
+    chain = Case("chain of 5 relays and a sink, a process each", 6, each=True)
+    cases = chain, replace(chain, name="the same, all streams recorded", recorded=True)
+    found: dict[str, dict[str, list[float]]] = {case.name: {name: [] for name in trees} for case in cases}
+    for _ in range(rounds):
+        for case in cases:
+            for name, tree in trees.items():
+                found[case.name][name].append(measure(case, tree, messages)["per_second"] / case.operators)
+    lines = [f"| messages/s | {' | '.join(trees)} |", "| --- |" + " --- |" * len(trees)]
+    for which, by_tree in found.items():
+        texts = [f"{statistics.median(each):,.0f} ({min(each):,.0f} - {max(each):,.0f})" for each in by_tree.values()]
+        lines.append(f"| {which} | {' | '.join(texts)} |")
+    return "\n".join(lines)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--firings", type=int, default=40_000, help="how many each graph makes")
@@ -188,12 +208,16 @@ def main() -> None:
     parser.add_argument("--only", default="", help="cases whose name holds one of these words, separated by commas")
     parser.add_argument("--live", action="store_true", help="live runs")
     parser.add_argument("--memory", action="store_true", help="memory after many messages, instead")
+    parser.add_argument("--processes", action="store_true", help="a process for each operator, instead")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     if arguments.memory:
         print(memory(HERE.parent))
         return
     trees = {"now": HERE.parent} | ({"before": arguments.against.resolve()} if arguments.against else {})
+    if arguments.processes:
+        print(processes(arguments.rounds, trees, arguments.firings // 8))
+        return
     words = arguments.only.split(",")
     cases = [replace(case, live=arguments.live) for case in CASES if any(word in case.name for word in words)]
     found = compared(arguments.rounds, cases, trees, arguments.firings)

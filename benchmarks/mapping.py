@@ -211,6 +211,7 @@ def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float
     """Points (N, 3) drawn evenly from the surface."""
     corners = vertices[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    corners, area = corners[area > 0], area[area > 0]  # Open3D gives some corners that are not finite
     chosen = rng.choice(len(corners), int(area.sum() * per_square_metre), p=area / area.sum())
     root, second = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
     weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)

@@ -255,7 +255,7 @@ def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
                 f"({', '.join(p.name for p in dynamic) or 'none'}): return a mapping from port to message"
             )
         returned = {dynamic[0].name: returned}
-    if not isinstance(returned, Mapping):
+    if returned.__class__ is not dict and not isinstance(returned, Mapping):
         raise OutputError(f"{spec.name} returned a {type(returned).__name__}; return a message, a mapping or None")
     emitted: dict[str, Message] = {}
     for name, message in returned.items():
@@ -269,6 +269,8 @@ def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
                 f"{spec.name}.{name} emits {port.type_text()}, got {getattr(message, 'SCHEMA', type(message).__name__)}"
             )
         emitted[name] = message
+    if len(emitted) < 2:
+        return emitted
     return {name: emitted[name] for name in spec.outputs if name in emitted}
 
 

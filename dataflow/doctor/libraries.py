@@ -13,6 +13,8 @@ from dataflow.doctor.finding import Finding, State
 
 GROUP = "libraries"
 DISTRIBUTION = "robot-dataflow"
+FOR_DEVELOPERS = "dev"
+"""The extra that only those need who work on dataflow itself."""
 LOADED = (
     "zenoh",
     "rerun",
@@ -76,6 +78,8 @@ def check_versions(declared: list[str], version_of: Callable[[str], str]) -> Ite
             continue
         found = _EXTRA.search(match["marker"] or "")
         extra = found[1] if found else ""
+        if extra == FOR_DEVELOPERS:
+            continue
         name, bounds = match["name"], match["bounds"].strip(" ()")
         try:
             installed = version_of(name)

@@ -50,8 +50,21 @@ class AdmissionQueue:
             queue.pop()  # the new promise holds all that the old one did
         queue.append(arrival)
 
+    @property
+    def holds(self) -> bool:
+        """Tells whether anything waits."""
+        return any(self._queues.values())
+
     def take(self) -> tuple[str, Arrival] | None:
         """The arrival with the oldest stamp (an end last), and its stream."""
+        if len(self._queues) == 1:
+            for stream, queue in self._queues.items():
+                if not queue:
+                    return None
+                arrival = queue.popleft()
+                if arrival.kind == "message":
+                    self._messages[stream] -= 1
+                return stream, arrival
         waiting = [(q[0].kind == "end", q[0].stamp, s) for s, q in self._queues.items() if q]
         if not waiting:
             return None

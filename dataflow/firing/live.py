@@ -21,7 +21,8 @@ from dataflow.firing.restarts import Restarts
 from dataflow.firing.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
-from dataflow.sync import NEVER, Aligner, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+from dataflow.sync.single import make_aligner
 
 OWN_CLOCK = 1_000_000_000
 """A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
@@ -87,6 +88,8 @@ class LiveRunner(OperatorRunner):
         self._seen: dict[str, tuple[int, int]] = {}  # stream → incarnation, last stamp that the aligner was given
         self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
         self._changed: dict[str, Any] = {}
+        self._told = True
+        """Whether the aligner may have something to decide: it was told something since it had not."""
 
     # Counts
 
@@ -117,14 +120,14 @@ class LiveRunner(OperatorRunner):
         return [*mine, *theirs], more + Counter(others)
 
     def has_drops(self) -> bool:
-        return self._log.pending or super().has_drops()
+        return self._log.pending or self.aligner.has_drops()
 
     # What streams say
 
     def push(self, stream: str, entry: Entry) -> None:
         if stream in self._static:
             self._statics[stream] = Entry(entry.stamp, entry.value, entry.seq, entry.incarnation, entry.digest, stream)
-        elif entry.incarnation < self._jumped.get(_producer(stream), 0):
+        elif self._jumped and entry.incarnation < self._jumped.get(_producer(stream), 0):
             self._log.add(dropped(self._input_of(stream), stream, entry, "reset"))  # of the time before the jump
             return
         else:
@@ -134,13 +137,15 @@ class LiveRunner(OperatorRunner):
         self._arrive(stream, Arrival("message", entry.stamp, entry))
 
     def _note(self, stream: str, entry: Entry) -> None:
+        stamp = entry.stamp
         incarnation, last = self._seen.get(stream, (entry.incarnation, NEVER))
-        if entry.incarnation > incarnation and entry.stamp <= last and not self.ended:
+        if entry.incarnation > incarnation and stamp <= last and not self.ended:
             self._reset(stream, entry)
-        self._seen[stream] = (entry.incarnation, entry.stamp)
-        if self._newest == NEVER and abs(entry.stamp - self._event_time()) > OWN_CLOCK:
-            self._shift = entry.stamp - self._event_clock()  # a device whose clock is not this machine's
-        self._newest = max(self._newest, entry.stamp)
+        self._seen[stream] = (entry.incarnation, stamp)
+        if self._newest == NEVER and abs(stamp - self._event_time()) > OWN_CLOCK:
+            self._shift = stamp - self._event_clock()  # a device whose clock is not this machine's
+        if stamp > self._newest:
+            self._newest = stamp
 
     def advance(self, stream: str, frontier: int) -> None:
         self._arrive(stream, Arrival("frontier", frontier))
@@ -163,9 +168,12 @@ class LiveRunner(OperatorRunner):
             if self.restarts.due_in() > 0:
                 return False
             self._start_again()
-        if super().step():
-            self.wake()
-            return True
+        if self._told:
+            if super().step():
+                self._told = self.idle == NEVER
+                self._wake_again()
+                return True
+            self._told = self.node.every is not None
         while not self.ended:
             taken = self.queue.take()
             if taken is not None:
@@ -173,9 +181,16 @@ class LiveRunner(OperatorRunner):
             elif not self._give_up():
                 return False
             if super().step():
-                self.wake()
+                self._told = self.idle == NEVER
+                self._wake_again()
                 return True
+            self._told = self.node.every is not None
         return False
+
+    def _wake_again(self) -> None:
+        """Asks for another step, unless nothing is left that could be decided now or later."""
+        if self._told or self.restarts.pending or self.queue.holds or self.aligner.waiting() is not None:
+            self.wake()
 
     def _bound_ticks(self, period: int) -> None:
         """Of the ticks that came due while the operator was busy, only the newest are made up for, as many as its queue
@@ -293,7 +308,8 @@ class LiveRunner(OperatorRunner):
         for held, count in old.buffered().items():
             if count and self.spec.inputs[held].kind != "sampled":
                 self._drops_before[held, "reset"] += count
-        self.aligner = Aligner(old.spec)
+        self.aligner = make_aligner(old.spec)
+        self._told = True
         for static in self._statics.values():
             self.aligner.push(static.stream, static)
         for stream, end in old.ends.items():
@@ -314,6 +330,7 @@ class LiveRunner(OperatorRunner):
 
     def _admit(self, stream: str, arrival: Arrival) -> None:
         """Tells the aligner. What breaks a promise of its stream is refused and counted; a live run goes on."""
+        self._told = True
         try:
             match arrival.kind:
                 case "message":
@@ -343,7 +360,7 @@ class LiveRunner(OperatorRunner):
         for name, frontier in self.patience.exhausted(held.stamp, held.needs).items():
             if self.aligner.force(name, frontier):
                 self._timeouts[name] += 1
-                moved = True
+                self._told = moved = True
         return moved
 
 

@@ -9,7 +9,10 @@ from typing import Any
 from dataflow.firing.ports import Emitter
 from dataflow.operator import Operator
 from dataflow.records.firing import Emission, FiringRecord, Kind, Outcome
-from dataflow.sync import NEVER, Drop, Firing, input_refs
+from dataflow.sync import NEVER, Drop, Firing, InputRef, input_refs
+
+_NO_INPUTS: Mapping[str, InputRef] = {}
+_NO_NAMES: frozenset[str] = frozenset()
 
 
 class FiringLog:
@@ -65,6 +68,32 @@ class FiringLog:
         )
         self.emitter.record(record)
         self.index += 1
+
+    def add_step(
+        self, stamp: int, started: int, outputs: tuple[Emission | None, ...], detail: Mapping[str, Any]
+    ) -> None:
+        """Hands on the record of a source's step; `started` is wall time in ns."""
+        index = self.index
+        self.index = index + 1
+        self.emitter.record(
+            FiringRecord(
+                self.operator,
+                self.incarnation,
+                index,
+                "fire",
+                stamp,
+                False,
+                _NO_INPUTS,
+                _NO_NAMES,
+                _NO_NAMES,
+                outputs,
+                "ok",
+                (),
+                detail,
+                started,
+                time.time_ns() - started,
+            )
+        )
 
     def add_setup(self, operator: Operator, started: int, emissions: tuple[Emission | None, ...]) -> None:
         """The record of `setup()`: parameters, files, static messages."""

@@ -65,7 +65,10 @@ class OutputPorts:
         """
         if not messages:
             return self._nothing
-        self.check(messages, firing)
+        for name, message in messages.items():
+            if message.stamp < firing or message.stamp <= self.states[name].last:
+                self.check(messages, firing)
+                break
         emissions: list[Emission | None] = []
         for name, state in self.states.items():
             emitted = messages.get(name)

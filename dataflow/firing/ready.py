@@ -24,6 +24,11 @@ class Ready:
         self._soonest: list[tuple[float, int]] = []
         """The same as a heap; what `_due` does not confirm is outdated."""
 
+    @property
+    def any(self) -> bool:
+        """Tells whether a runner has woken."""
+        return bool(self._woken)
+
     def add(self, runner: Runner) -> None:
         """Takes a runner in; it is asked at once."""
         runner.place = len(self._runners)

@@ -20,7 +20,8 @@ from dataflow.firing.protocol import Runner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
 from dataflow.records.firing import Emission, Kind
-from dataflow.sync import FOREVER, NEVER, Aligner, Drop, Entry, Firing, format_duration, format_stamp
+from dataflow.sync import FOREVER, NEVER, Drop, Entry, Firing, format_duration, format_stamp
+from dataflow.sync.single import make_aligner
 
 MOST_TICKS = 1_000_000
 """Ticks that may be due at once, with no message between them: 10 Hz for a day and more. A timer that owes more was led
@@ -32,6 +33,9 @@ emits says the same at once."""
 
 MOST_DROPPED = 10_000
 """Stamps that one step may drop before it returns to whoever drives it, who has other things to look at."""
+
+
+_NOTHING: Mapping[str, Any] = {}
 
 
 class OperatorRunner(Runner):
@@ -53,9 +57,11 @@ class OperatorRunner(Runner):
         self.paranoid, self.snapshots = paranoid, snapshots
         self._next_snapshot: int | None = None
         self._warm: int | None = None
+        self.idle = NEVER
+        """The output frontier after the last step, where that left nothing to decide; else NEVER."""
         self.calls = Calls(node, self.operator, seed)
         self.records = FiringLog(node.name, emitter)
-        self.aligner = Aligner(align_spec(node, self.spec, static))
+        self.aligner = make_aligner(align_spec(node, self.spec, static))
 
     def take_over(self, operator: Operator, stamp: int) -> None:
         """Begins in the middle: with an operator that is set up and has the state it had before `stamp`. To be called
@@ -127,6 +133,7 @@ class OperatorRunner(Runner):
             self.ports.promise(frontier)
             self.done = max(self.done, frontier)
             if self.aligner.paused:
+                self.idle = NEVER
                 self.wake()
             return self.aligner.paused
         work = self.work
@@ -140,10 +147,10 @@ class OperatorRunner(Runner):
             work.end()
             self.working_since = None
         if firing.kind == "finish":
-            self.ended, self.done = True, FOREVER
+            self.ended, self.done, self.idle = True, FOREVER, FOREVER
             self.ports.end(self.aligner.final_stamp(), "end of input")
             return True
-        frontier = self.aligner.idle_frontier()
+        frontier = self.idle = self.aligner.idle_frontier()
         if frontier == NEVER:
             frontier = firing.stamp
             self.wake()
@@ -204,6 +211,9 @@ class OperatorRunner(Runner):
         *,
         injected: bool = False,
     ) -> None:
+        if error is None and kind != "finish" and not self.has_drops():
+            self.records.add_firing(kind, started, firing, outputs, "ok", (), _NOTHING)
+            return
         detail: dict[str, Any] = {}
         if error is not None:
             detail = {"error": error, **({"injected": True} if injected else {})}

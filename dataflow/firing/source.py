@@ -20,6 +20,7 @@ from dataflow.messages.base import Message
 from dataflow.operator import OutputError, Source, outputs_of
 from dataflow.sync import NEVER
 
+_NOTHING: Mapping[str, int] = {}
 JUMP_AFTER = 3
 """So many steps in a row with stamps in the past are a clock that has jumped back; fewer are stray messages."""
 
@@ -74,18 +75,27 @@ class SourceRunner:
         return None if self._next is None else step_stamp(self._next)
 
     def take(self) -> dict[str, Message] | None:
-        """The next step without emitting it, None at the end: for the thread that reads a source in a live run."""
+        """The next step without emitting it, None at the end: for the thread that reads a source in a live run.
+
+        `check_draws` is to follow, as soon as the step is on its way.
+        """
         step, self._next = self._next, None
         if step is not None:
             return step
-        with self.work:
-            self._tripwire.set()
-            try:
-                step = self.pull()
-                self._tripwire.check(self.node.name)
-            except SharedGenerators as error:
-                raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
-        return step
+        self._tripwire.set()
+        work = self.work
+        work.begin()
+        try:
+            return self.pull()
+        finally:
+            work.end()
+
+    def check_draws(self) -> None:
+        """Raises `OperatorFailure` if the step that was taken has drawn from generators that operators depend on."""
+        try:
+            self._tripwire.check(self.node.name)
+        except SharedGenerators as error:
+            raise OperatorFailure(self.node.name, f"stream() after stamp {self.last}", error) from error
 
     def pull(self) -> dict[str, Message] | None:
         """Reads the source's next non-empty step; for live sources called on the reader's own thread.
@@ -100,17 +110,20 @@ class SourceRunner:
             for step in self._steps:
                 messages = outputs_of(self.operator, step)
                 if messages:
-                    stamps = {m.stamp for m in messages.values()}
-                    if len(stamps) != 1:
-                        raise OutputError(
-                            f"{self.node.name} yielded stamps {sorted(stamps)} together; "
-                            "one step of stream() has one stamp"
-                        )
-                    (self._read,) = stamps
+                    self._read = step_stamp(messages)
+                    if len(messages) > 1:
+                        self._check_stamps(messages)
                     return messages
         except BaseException as error:
             raise OperatorFailure(self.node.name, f"stream() after stamp {self._read}", error) from error
         return None
+
+    def _check_stamps(self, messages: Mapping[str, Message]) -> None:
+        stamps = {m.stamp for m in messages.values()}
+        if len(stamps) != 1:
+            raise OutputError(
+                f"{self.node.name} yielded stamps {sorted(stamps)} together; one step of stream() has one stamp"
+            )
 
     def admit(self) -> tuple[int, int]:
         """Emits the step that was looked at; returns how many messages and bytes it was."""
@@ -134,7 +147,8 @@ class SourceRunner:
         except OutputError as error:
             raise OperatorFailure(self.node.name, "stream()", error) from error
         self.firings += 1
-        self.records.add("fire", stamp, started, outputs=emissions, detail=self._take_refused())
+        refused = self._take_refused() if self.refused else _NOTHING
+        self.records.add_step(stamp, started, emissions, refused)
         self.ports.publish()
         return step_size(step)
 
@@ -246,9 +260,16 @@ class SourceRunner:
 
 
 def step_stamp(step: Mapping[str, Message]) -> int:
-    return next(iter(step.values())).stamp
+    for message in step.values():
+        return message.stamp
+    raise AssertionError("a step has a message")
 
 
 def step_size(step: Mapping[str, Message]) -> tuple[int, int]:
     """Tells how many messages and bytes a step is."""
-    return len(step), sum(m.nbytes() for m in step.values())
+    size = 0
+    for message in step.values():
+        for array in message.arrays():
+            if array is not None:
+                size += array.nbytes
+    return len(step), size

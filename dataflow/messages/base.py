@@ -255,7 +255,7 @@ class Message(_Declared):
         """xxh3-128 (16 bytes) over schema, stamp, header fields and, per array, dtype, shape and bytes."""
         cached: bytes | None = self.__dict__.get("_digest")
         if cached is None:
-            cached = self.__dict__["_digest"] = self.compute_digest()
+            cached = self.__dict__["_digest"] = (self._made or self._compile()).digest(self)
         return cached
 
     def compute_digest(self) -> bytes:

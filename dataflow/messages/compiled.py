@@ -50,6 +50,8 @@ class Compiled(NamedTuple):
     digest: Callable[[Any], bytes]
     header: Callable[[Any], tuple[Any, ...]]
     arrays: Callable[[Any], tuple[Any, ...]]
+    content: Callable[[Any], tuple[Any, tuple[Any, ...]]]
+    """Returns (schema, scalars, (dtype, shape) of each array), and the arrays."""
     dtypes: tuple[Mapping[str, np.dtype[Any]], ...]
     """Of each array field the dtypes by their numpy names, such as `<f4`."""
 
@@ -104,13 +106,14 @@ def compile_class(
         "def _arrays(_self):",
         "    _state = _self.__dict__",
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in arrays)})",
+        *_content(scalars, arrays),
     ]
     exec(compile("\n".join(text), f"<message {schema!r}>", "exec"), names)
-    construct, adopt, digest, header, held = (
-        names[f"_{n}"] for n in ("construct", "adopt", "digest", "header", "arrays")
+    construct, adopt, digest, header, held, content = (
+        names[f"_{n}"] for n in ("construct", "adopt", "digest", "header", "arrays", "content")
     )
     dtypes = tuple({d.str: np.dtype(d.str) for d in f.dtypes} for f in arrays)
-    return Compiled(construct, adopt, digest, header, held, dtypes)
+    return Compiled(construct, adopt, digest, header, held, content, dtypes)
 
 
 def _construct(
@@ -229,6 +232,22 @@ def _digest(
         "    return _hash.digest()",
     ]
     return text
+
+
+def _content(scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]) -> list[str]:
+    described = [
+        f"(_a{k}.dtype.str, _a{k}.shape), "
+        if not spec.optional
+        else f"None if _a{k} is None else (_a{k}.dtype.str, _a{k}.shape), "
+        for k, spec in enumerate(arrays)
+    ]
+    return [
+        "def _content(_self):",
+        "    _state = _self.__dict__",
+        *(f"    _a{k} = _state[{spec.name!r}]" for k, spec in enumerate(arrays)),
+        f"    _scalars = ({''.join(f'_state[{f.name!r}], ' for f in scalars)})",
+        f"    return (_schema, _scalars, ({''.join(described)})), ({''.join(f'_a{k}, ' for k in range(len(arrays)))})",
+    ]
 
 
 def _updated(hasher: Any, data: bytes) -> Any:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from dataflow.messages.base import Message
 from dataflow.messages.clouds import PointCloud
-from dataflow.messages.images import CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.messages.images import CompressedDepth, CompressedImage, DepthImage, Image, RelativeDepth
 from dataflow.messages.mapping import OccupancyGrid
 from dataflow.messages.png import png, turbo
 from dataflow.messages.segmentation import SegmentationMap
@@ -105,6 +105,11 @@ def _depth(message: DepthImage) -> Pixels:
     return turbo(1.0 - _scaled(np.where(depth > 0, depth, np.nan)))
 
 
+def _nearness(message: RelativeDepth) -> Pixels:
+    """Near is red and far is blue, as DepthImage has it."""
+    return turbo(_scaled(_thin(message.data).astype(np.float64)))
+
+
 def _scaled(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Values from 0.05 to 0.95, between which colours are bright, from their first to their last percent; NaN stays."""
     finite = values[np.isfinite(values)]
@@ -147,6 +152,7 @@ def _cloud(message: PointCloud) -> Pixels:
 _PICTURES: dict[type[Message], Callable[[Any], Pixels]] = {
     Image: _image,
     DepthImage: _depth,
+    RelativeDepth: _nearness,
     SegmentationMap: _classes,
     OccupancyGrid: _grid,
     PointCloud: _cloud,

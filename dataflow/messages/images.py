@@ -72,6 +72,31 @@ class DepthImage(Message):
         return int(self.data.shape[1])
 
 
+class RelativeDepth(Message):
+    """Nearness per pixel: inverse depth up to an unknown factor and constant, as one image alone tells it."""
+
+    frame: str = scalar("str", "optical frame of the camera (z forward, x right, y down)")
+    data: F32 = array(
+        "float32",
+        "H W",
+        "nearness, larger is nearer; NaN where not known; at least one pixel",
+        unit="1/m up to factor and constant",
+    )
+
+    def validate(self) -> None:
+        not_empty(self, "data")
+
+    @property
+    def height(self) -> int:
+        """Rows."""
+        return int(self.data.shape[0])
+
+    @property
+    def width(self) -> int:
+        """Columns."""
+        return int(self.data.shape[1])
+
+
 class CompressedDepth(Message):
     """A depth image as a 16-bit grey PNG; the pixel value 0 is no return.
 

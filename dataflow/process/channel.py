@@ -7,7 +7,6 @@ one reads end-of-file at once. The two ends differ in one thing: a process waits
 
 from __future__ import annotations
 
-import select
 import socket
 import struct
 import threading
@@ -16,6 +15,8 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 import msgpack
+
+from dataflow.process.polling import readable
 
 LONGEST = 1 << 30
 """Bytes of one message, at most."""
@@ -93,8 +94,7 @@ class Channel:
 
 def ready(channels: Iterable[Channel], timeout: float) -> list[Channel]:
     """Returns those channels from which `receive` has something to read, after at most `timeout` seconds."""
-    readable, _, _ = select.select(list(channels), [], [], max(0.0, timeout))
-    return readable
+    return readable(channels, timeout)
 
 
 def _pair() -> tuple[socket.socket, int]:

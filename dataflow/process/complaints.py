@@ -35,9 +35,11 @@ class Complaints:
 def print_without_waiting(line: str) -> bool:
     """Prints a line to stderr; False when nobody reads it at the moment."""
     try:
-        _, writable, _ = select.select([], [sys.stderr], [], 0.0)
-    except (ValueError, OSError):  # it is no file, or closed
-        writable = [sys.stderr]
+        room = select.poll()
+        room.register(sys.stderr, select.POLLOUT)
+        writable = bool(room.poll(0))
+    except (ValueError, OSError, TypeError):  # it is no file, or closed
+        writable = True
     if writable:
         print(line, file=sys.stderr, flush=True)
-    return bool(writable)
+    return writable

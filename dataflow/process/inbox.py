@@ -2,6 +2,9 @@
 
 One thread takes, any may put. Whoever waits here waits for one eventfd: the writers of the rings, the readers of the
 rings that this process writes to (when they were full and have room again) and its own threads all wake it by that.
+
+The thread that takes has the *turn*: it alone touches what the process has. While it waits for want of anything to do,
+another thread may have the turn for a moment, and do what it would else have to wake that one for.
 """
 
 from __future__ import annotations
@@ -9,6 +12,7 @@ from __future__ import annotations
 import os
 import queue
 import select
+import threading
 from collections import deque
 from collections.abc import Sequence
 from typing import Any
@@ -19,13 +23,20 @@ Item = tuple[Any, ...]
 
 
 class Inbox:
-    """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own."""
+    """A queue that also takes in rings. `wake`: the eventfd that was handed down; without one, its own.
+
+    Whoever makes it has the turn.
+    """
 
     def __init__(self, wake: int | None = None, incoming: Sequence[Incoming] = ()) -> None:
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if wake is None else wake
         self._incoming = tuple(incoming)
         self._items: deque[Item] = deque()
         self._asleep = False
+        self._turn = threading.Lock()
+        self._turn.acquire()
+        self._poll = select.poll()
+        self._poll.register(self.wake, select.POLLIN)
 
     def put(self, item: Item) -> None:
         """Appends an item; on any thread."""
@@ -33,16 +44,35 @@ class Inbox:
         if self._asleep:
             os.eventfd_write(self.wake, 1)
 
+    def take_turn(self) -> bool:
+        """Takes the turn until `give_turn`, on any thread, if the one that has it waits and nothing is there for it."""
+        if not self._asleep or not self._turn.acquire(blocking=False):
+            return False
+        if self._items:
+            self._turn.release()
+            return False
+        return True
+
+    def give_turn(self, *, wake: bool) -> None:
+        """Gives the turn back. `wake`: there is something to do for the thread that waits."""
+        self._turn.release()
+        if wake:
+            os.eventfd_write(self.wake, 1)
+
     def get(self, timeout: float) -> Item:
         """Returns the next item, or raises `queue.Empty` when there is none in time, or something else woke it."""
-        if self.empty() and timeout > 0:
+        if timeout > 0 and self.empty():
             self._wait(timeout)
         return self.get_nowait()
 
     def _wait(self, timeout: float) -> None:
         self._asleep = True
         if not self._items and not sum(not ring.sleep() for ring in self._incoming):
-            woken, _, _ = select.select([self.wake], [], [], timeout)
+            self._turn.release()
+            try:
+                woken = self._poll.poll(timeout * 1000)
+            finally:
+                self._turn.acquire()
             if woken:
                 self._forget_wakes()
         self._asleep = False
@@ -57,10 +87,12 @@ class Inbox:
 
     def empty(self) -> bool:
         """Tells whether there is nothing, in the rings either."""
+        items = self._items
         for ring in self._incoming:
             if ring.arrived():
-                self._items.extend(("envelope", key, payload) for key, payload in ring.take())
-        return not self._items
+                for key, payload in ring.take():
+                    items.append(("envelope", key, payload))
+        return not items
 
     def counters(self) -> dict[str, int]:
         """Returns what has arrived through the rings."""

@@ -55,6 +55,14 @@ class Inlet:
         except DecodeError as error:  # from outside: of our own, the next number would show the gap
             self.refuse_malformed(stream, error)
             return
+        order = self._orders.get(stream)
+        if order is not None and envelope.stream == stream and order.goes_on(envelope):
+            self.received += 1
+            self._deliver(stream, envelope)
+        else:
+            self._take_any(stream, envelope)
+
+    def _take_any(self, stream: str, envelope: Envelope) -> None:
         if envelope.kind is Kind.PROBE:
             if stream not in self._probed:
                 self._probed.add(stream)
@@ -66,9 +74,9 @@ class Inlet:
         else:
             self._take_in_order(stream, envelope)
 
-    def refuse(self, stream: str, what: str, number: int = 1) -> None:
+    def refuse(self, stream: str, what: str) -> None:
         """Counts, and complains about, what arrived on a key and does not belong to its stream."""
-        self.misplaced += number
+        self.misplaced += 1
         self._complaints.say(f"misplaced {stream}", f"dropped {what} on {stream!r}: it does not go on from that stream")
 
     def refuse_malformed(self, stream: str, error: Exception) -> None:
@@ -80,14 +88,10 @@ class Inlet:
         """Notes that the process that makes these streams was restarted: it is to be probed again."""
         for stream in streams:
             self._probed.discard(stream)
-            self._order(stream).announce()
 
     def statics_missing(self, streams: Iterable[str]) -> set[str]:
         """Returns those of some streams that are static and have not come."""
         return {stream for stream in streams if stream in self._static} - self._seen
-
-    def _order(self, stream: str) -> StreamOrder:
-        return self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder(self._first))
 
     def _take_static(self, stream: str, envelope: Envelope) -> None:
         """Takes the one message of a static stream, if it has one, and its end; both come again after a restart.
@@ -105,21 +109,17 @@ class Inlet:
             self._deliver(stream, envelope)
 
     def _take_in_order(self, stream: str, envelope: Envelope) -> None:
-        order = self._order(stream)
-        if order.goes_on(envelope):
-            self.received += 1
-            self._deliver(stream, envelope)
-            return
+        order = self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder(self._first))
         verdict = order.take(envelope)
-        if verdict.refused:
-            if verdict.damaged and not self.live:
-                raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")
-            self.refuse(stream, _described(envelope), verdict.refused)
+        if verdict.damaged and not self.live:
+            raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")
         if verdict.gap is not None:
             self._lost(stream, *verdict.gap)
-        for taken in verdict.taken:
+        if verdict.taken is None:
+            self.refuse(stream, _described(envelope))
+        else:
             self.received += 1
-            self._deliver(stream, taken)
+            self._deliver(stream, verdict.taken)
 
     def _lost(self, stream: str, first: int, following: int) -> None:
         """Messages were lost: to a link that broke, or before this process was there."""

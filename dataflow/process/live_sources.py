@@ -10,7 +10,7 @@ import contextlib
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from dataflow.chaos.faults import SourceFaults
@@ -34,6 +34,7 @@ RETURN_WITHIN = 3.0
 """Seconds that `stream()` has to return when the process is closed."""
 
 Step = Mapping[str, Message]
+InItsPlace = Callable[[Callable[[Step], None], Step], bool]
 
 
 class Reader:
@@ -85,6 +86,7 @@ class Reader:
                 continue
             for given in self._faults.apply(step, time.monotonic()):
                 self._hand_over(given)
+            runner.check_draws()
         runner.close_stream()
         return False
 
@@ -104,13 +106,25 @@ class Reader:
         return True
 
     def _hand_over(self, step: Step) -> None:
+        """Emits a step, where the main thread has nothing else to do; else hands it over to that."""
         owner = self._owner
+        if not self.unread.count and owner.in_its_place(self._emit, step):
+            return
         if self.unread.count >= owner.backlog.messages or self.unread.size >= owner.backlog.nbytes:
             self._lost += 1
             owner.tell_backlog(self.unread.count, self.unread.size)
             return
         self.unread.put(*step_size(step))
         owner.inbox.put(("source", self, step, self._lost))
+        self._lost = 0
+
+    def _emit(self, step: Step) -> None:
+        try:
+            self._owner.emit(self, step, self._lost)
+        except OperatorFailure as failure:
+            self.condemned = failure
+        except ChannelClosed:
+            return  # the control thread sees to it
         self._lost = 0
 
 
@@ -126,7 +140,10 @@ class LiveSources:
         backlog: Window,
         *,
         resumed: bool,
+        in_its_place: InItsPlace = lambda act, step: False,
     ) -> None:
+        """`in_its_place` lets another thread do something in the place of the main one; False if that cannot be."""
+        self.in_its_place = in_its_place
         self.inbox, self.pace, self.backlog = inbox, pace, backlog
         self.stopping = threading.Event()
         self.runners: list[SourceRunner] = []
@@ -176,29 +193,32 @@ class LiveSources:
             reader.unread.take(*step_size(step))
         if reader.condemned is not None and step is None:
             self.failed(reader, reader.condemned)
+        if step is not None:
+            try:
+                self.emit(reader, step, lost)
+            except OperatorFailure as failure:
+                if runner.node.live.restart.max == 0 or self.stopping.is_set():
+                    raise
+                reader.condemned = failure  # it comes back as this source's failure when the thread has ended
+        elif not runner.ended and reader.condemned is None:
+            if lost:
+                runner.refused["overflow"] += lost
+            runner.finish()
+
+    def emit(self, reader: Reader, step: Step, lost: int) -> None:
+        """Emits a step that was read, if flow control lets it in. Raises `OperatorFailure`."""
+        runner = reader.runner
         if runner.ended or reader.condemned is not None:
             return
         if lost:
             runner.refused["overflow"] += lost
-        if step is None:
-            runner.finish()
-        elif self._window.full or self.backlog.full:
+        if self._window.full or self.backlog.full:
             runner.refused["overflow"] += 1
             if self.backlog.full:
                 self.tell_backlog(self.backlog.count, self.backlog.size)
-        else:
-            self._emit(reader, step)
-
-    def _emit(self, reader: Reader, step: Step) -> None:
-        runner = reader.runner
-        incarnation = runner.records.incarnation
-        try:
-            admitted = runner.emit_live(step)
-        except OperatorFailure as failure:
-            if runner.node.live.restart.max == 0 or self.stopping.is_set():
-                raise
-            reader.condemned = failure  # it comes back as this source's failure when the thread has ended
             return
+        incarnation = runner.records.incarnation
+        admitted = runner.emit_live(step)
         if admitted is None:
             return
         if runner.records.incarnation != incarnation:

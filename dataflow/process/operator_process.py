@@ -1,8 +1,8 @@
 """An operator process: it runs one or more operators on one thread, between its inbox and its outlet.
 
-Zenoh's threads, the control thread and the readers of live sources only append to the inbox. The main thread takes from
-it, feeds the aligners, runs the firings that are decided, lets feeds admit what the window allows, and waits (bounded)
-when there is nothing to do.
+Other threads only append to the inbox. The main thread takes from it, feeds the aligners, runs the firings that are
+decided, lets feeds admit what the window allows, and waits (bounded) when there is nothing to do. Meanwhile the reader
+of a live source may emit a step itself, so that the main thread need not be woken for that.
 """
 
 from __future__ import annotations
@@ -11,31 +11,30 @@ import gc
 import queue
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-from dataflow.chaos.faults import OperatorFaults
 from dataflow.feeds.window import Window
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.source import SourceRunner
 from dataflow.firing.threads import limit_threads
-from dataflow.graph.model import Graph, Node
-from dataflow.process.channel import Channel, ChannelClosed
+from dataflow.graph.model import Graph
+from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
 from dataflow.process.handed import BACKLOG
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet, StreamDamaged
-from dataflow.process.live_sources import LiveSources
+from dataflow.process.live_sources import LiveSources, Step
+from dataflow.process.making import make_operators
 from dataflow.process.network import network_config
+from dataflow.process.orders import Orders
 from dataflow.process.outlet import Network, Outlet, incarnations_of
 from dataflow.process.pace import Pace
-from dataflow.process.planned_faults import do_fault
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
-from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
+from dataflow.process.runners import Runners, give, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
-from dataflow.remote import Remote
 from dataflow.sync import FOREVER, StreamOrderError
 from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
 from dataflow.transport.fanout import POOL_BYTES
@@ -70,7 +69,15 @@ class OperatorProcess:
         self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
         self.runners = Runners()
         self.feeding = Feeding(self.window, self.pace)
-        self.live = LiveSources(inbox, channel, self.pace, self.window, self.backlog, resumed=config.resume is not None)
+        self.live = LiveSources(
+            inbox,
+            channel,
+            self.pace,
+            self.window,
+            self.backlog,
+            resumed=config.resume is not None,
+            in_its_place=self._in_place_of_main,
+        )
         self.inlet = Inlet(
             config.label,
             channel,
@@ -93,17 +100,14 @@ class OperatorProcess:
                 config.resume or {}, {name: node.outputs for name, node in self.graph.nodes.items()}
             ),
         )
-        self.progress = Progress(channel, self.runners, self.feeding, self.live)
+        self.progress = Progress(channel, self.runners, self.feeding, self.live, paced=config.live)
         self.requests = Requests(
             config, self.runners, self.live, self.progress, self.outlet.recent, self.pace.event_time
         )
+        self.orders = Orders(self)
         self._watch: Watchdog | None = None
-        self._probing = False
-        self._released = False
-        self._stopping = False
+        self._running = False
         self._ended = False
-        self._left = False
-        self._asked: int | None = None
 
     # Life
 
@@ -135,7 +139,7 @@ class OperatorProcess:
         """Waits (bounded) for the static messages that were given before this process came to be: those who made them
         send them again. Raises `StreamDamaged`."""
         deadline = time.monotonic() + STATICS_WITHIN
-        while (missing := self.inlet.statics_missing(self.config.subscribe)) and not self._left:
+        while (missing := self.inlet.statics_missing(self.config.subscribe)) and not self.orders.left:
             if time.monotonic() > deadline:
                 raise StreamDamaged(
                     f"process {self.config.label!r} was restarted and did not get the static streams "
@@ -145,34 +149,7 @@ class OperatorProcess:
 
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
-        for name in self.config.nodes:
-            try:
-                self._make(self.graph.nodes[name])
-            except OperatorFailure:
-                raise
-            except Exception as error:
-                raise OperatorFailure(name, "construction", error) from error
-        log = make_log(self.graph, self.config, self.outlet)
-        if log is not None:
-            self.feeding.feeds.append(log)
-
-    def _make(self, node: Node) -> None:
-        config, outlet = self.config, self.outlet
-        if not node.source:
-            clock, tell = self.pace.event_time, self._on_outlived_failure
-            faults = self.runners.faults[node.name] = OperatorFaults()
-            self.runners.add(
-                make_runner(node, self.graph, config, outlet, faults=faults, event_clock=clock, on_failure=tell)
-            )
-            return
-        source = make_source(node, self.graph, config, outlet)
-        if isinstance(source.source, Remote) and not config.live:
-            raise ValueError("messages from outside come by the clock, which only a live run has: run it with --live")
-        self.runners.sources.append(source)
-        if config.live:
-            self.live.add(source)
-        else:
-            self.feeding.feeds.append(source)
+        make_operators(self)
 
     def set_up(self) -> None:
         """Calls `setup()` of every operator, with as many library threads as the graph allows."""
@@ -181,30 +158,56 @@ class OperatorProcess:
             maker.setup()
         gc.freeze()  # modules and operators live as long as the process: collections need not look at them
 
-    def _on_outlived_failure(self, failure: OperatorFailure, pause: float) -> None:
-        self.channel.send(
-            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
-        )
+    def release(self, first: int | None, at: float) -> None:
+        """All processes are linked: sends what was held back, and begins. Event time `first` (ns) is `at` (seconds)."""
+        self.outlet.release()
+        self.pace.begin(first, at)
+        self.runners.ready.wake_all()
+        self.live.start()
+        self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)
 
     def run(self) -> None:
         """Runs the main loop; returns when the supervisor has let the process go."""
-        while True:
-            if self._probing:
-                self.outlet.probe()
-            self.outlet.push()
-            self._take(self._wait_time() if self.inbox.empty() else 0.0)
-            if self._left:
-                break
-            self.live.restart_due()
-            worked = self._work()
-            self.outlet.flush_due()
-            self.progress.report(idle=self.inbox.empty())
-            self._answer_poll(idle=not worked)
+        self._running = True
+        try:
+            while self._turn_of_loop():
+                pass
+        finally:
+            self._running = False
         self.hand_over()
+
+    def _turn_of_loop(self) -> bool:
+        """Takes what there is and works on it; False when the process is to leave."""
+        if self.orders.probing:
+            self.outlet.probe()
+        self.outlet.push()
+        self._take(self._wait_time() if self.inbox.empty() else 0.0)
+        if self.orders.left:
+            return False
+        self.live.restart_due()
+        worked = self._work()
+        self.outlet.flush_due()
+        self.progress.report(idle=self.inbox.empty())
+        self._answer_poll(idle=not worked)
+        return True
+
+    def _in_place_of_main(self, act: Callable[[Step], None], step: Step) -> bool:
+        """Lets the thread that reads a source emit a step, where the main thread waits for something to do; False
+        where it does not. Operators are left to the main thread."""
+        inbox = self.inbox
+        if not inbox.take_turn():
+            return False
+        try:
+            if not self._running:
+                return False
+            act(step)
+        finally:
+            inbox.give_turn(wake=self.runners.ready.any)
+        return True
 
     def hand_over(self) -> None:
         """Sends the firing records that were not sent yet: after a failure here, the failed one among them."""
-        if self._released:
+        if self.orders.released:
             self.outlet.flush_all()
             self.outlet.push_all()
 
@@ -239,40 +242,43 @@ class OperatorProcess:
     # Inbox
 
     def _wait_time(self) -> float:
-        if self._probing:
+        if self.orders.probing:
             return PROBE_EVERY
         patient = self.runners.ready.next_due()
         due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), patient]
         return max(0.0, min(seconds for seconds in due if seconds is not None))
 
     def _next_due(self) -> float | None:
-        return self.feeding.next_due() if self._released else None
+        return self.feeding.next_due() if self.orders.released else None
 
     def _take(self, timeout: float) -> None:
         """Handles what is in the inbox, but not for long; waits up to `timeout` for the first."""
+        inbox = self.inbox
         try:
-            item = self.inbox.get(timeout=timeout) if timeout > 0 else self.inbox.get_nowait()
+            item = inbox.get(timeout=timeout)
         except queue.Empty:
             return
-        until = time.monotonic() + TAKE_WITHIN
-        more = self.inbox.qsize()
+        more = inbox.qsize()
         self._handle(item)
-        while more and (self.config.live or time.monotonic() < until):
-            self._handle(self.inbox.get_nowait())
+        if not more:
+            return
+        until = FOREVER if self.config.live else time.monotonic() + TAKE_WITHIN
+        while more and (until == FOREVER or time.monotonic() < until):
+            self._handle(inbox.get_nowait())
             more -= 1
 
     def _handle(self, item: tuple[Any, ...]) -> None:
-        match item:
-            case ("envelope", stream, payload):
-                self.inlet.take(stream, payload)
-            case ("control", kind, fields):
-                self._control(kind, fields)
-            case ("source", reader, step, lost):
-                self.live.take(reader, step, lost)
-            case ("source_failed", reader, failure):
-                self.live.failed(reader, failure)
-            case ("param", name, query):
-                self.requests.answer_parameter(name, query)
+        kind = item[0]
+        if kind == "envelope":
+            self.inlet.take(item[1], item[2])
+        elif kind == "control":
+            self.orders.obey(item[1], item[2])
+        elif kind == "source":
+            self.live.take(item[1], item[2], item[3])
+        elif kind == "source_failed":
+            self.live.failed(item[1], item[2])
+        elif kind == "param":
+            self.requests.answer_parameter(item[1], item[2])
 
     def _deliver(self, stream: str, envelope: Envelope) -> None:
         """Gives an envelope to the operators that take its stream. What contradicts what they have seen is refused, in
@@ -291,7 +297,7 @@ class OperatorProcess:
         """Runs what is decided; when nothing is and nothing has arrived, admits from the feeds. True when anything was
         done."""
         worked = False
-        while not self._left:
+        while not self.orders.left:
             if self._step_all() or (self.inbox.empty() and self._admit()):
                 worked = True
             elif self.inbox.empty():
@@ -304,18 +310,18 @@ class OperatorProcess:
             self.progress.report(idle=False)
             if not self.inbox.empty():
                 break
-        if not self._ended and self._released:
+        if not self._ended and self.orders.released:
             self._end_if_done()
         return worked
 
     def _step_all(self) -> bool:
         """One step of every operator that has something to do."""
-        if self.config.live and not self._released:
+        if self.config.live and not self.orders.released:
             return False  # a restarted process is sent messages before it is told what time it is
         return self.runners.ready.step()
 
     def _admit(self) -> bool:
-        return self._released and not self._stopping and self.feeding.admit()
+        return self.orders.released and not self.orders.stopping and self.feeding.admit()
 
     def _end_if_done(self) -> None:
         if self.feeding.ended and self.live.ended and all(runner.ended for runner in self.runners.operators):
@@ -331,9 +337,9 @@ class OperatorProcess:
 
     def _answer_poll(self, *, idle: bool) -> None:
         """Answers after the work that was there: a process is idle only when a look at everything found nothing."""
-        if self._asked is None:
+        if self.orders.asked is None:
             return
-        asked, self._asked = self._asked, None
+        asked, self.orders.asked = self.orders.asked, None
         self.outlet.flush_all()
         self.channel.send(
             "state",
@@ -348,52 +354,3 @@ class OperatorProcess:
 
     def _waits_for_clock(self) -> bool:
         return self._next_due() is not None or any(runner.next_due() is not None for runner in self.runners.operators)
-
-    # Control
-
-    def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
-        match kind:
-            case "probe":
-                self._probing = True
-            case "go":
-                self._release(fields["first"], fields["at"])
-            case "absent":
-                for stream in fields["streams"]:
-                    for consumer in self.runners.taking(stream):
-                        (consumer.absent.add if fields["absent"] else consumer.absent.discard)(stream)
-                if not fields["absent"]:
-                    self.inlet.restarted(fields["streams"])
-            case "ended_elsewhere":
-                for stream in fields["streams"]:
-                    for runner in self.runners.taking(stream):
-                        runner.end(stream, None, fields["reason"])
-            case "fault":
-                kind, operator = fields["fault"], fields["operator"]
-                do_fault(kind, operator, fields["fields"], runners=self.runners, live=self.live, outlet=self.outlet)
-            case "covered":
-                self.window.cover(fields["frontier"])
-                self.backlog.cover(fields.get("backlog", FOREVER))
-            case "grow":
-                self.window.grow()
-            case "poll":
-                self._asked = fields["round"]
-            case "stop":
-                self._stopping = True
-                self.feeding.finish("interrupted")
-                self.live.finish("interrupted")
-            case "gone":
-                self.outlet.consumer_gone(fields["ring"])
-            case "lacks":
-                self.outlet.send_again(fields["operator"])
-            case "leave":
-                self._left = True
-            case "lost":
-                raise ChannelClosed("the supervisor is gone")
-
-    def _release(self, first: int | None, at: float) -> None:
-        self._probing, self._released = False, True
-        self.outlet.release()
-        self.pace.begin(first, at)
-        self.runners.ready.wake_all()
-        self.live.start()
-        self._watch = Watchdog(self.channel, self.runners.operators, deadlines=self.config.live)

@@ -28,6 +28,7 @@ from dataflow.transport import (
 )
 from dataflow.transport.codec import parts_size
 
+_MESSAGE = Kind.MESSAGE
 BATCH_RECORDS = 64
 BATCH_SECONDS = 0.25
 PUSH_WITHIN = 2.0
@@ -160,7 +161,7 @@ class Outlet:
         parts = encode_parts(envelope)
         if listened is not None and self._network is not None:
             self._network.outside.put(listened, b"".join(parts))
-        self.sent += self._fanout.send(stream, parts, envelope=envelope, droppable=droppable)
+        self.sent += self._fanout.send(stream, parts, envelope, droppable=droppable)
 
     def _send_records(self, operator: str, batch: bytes) -> None:
         """Sends firing records, to the recorder and to who subscribes to them from outside."""
@@ -178,22 +179,19 @@ class Outlet:
     def message(self, stream: str, entry: Entry) -> None:
         for consumer in self._consumers(stream):
             consumer.push(stream, entry)
-        begun = entry.incarnation != self._next.get(stream, (0, 0))[0]
         self._next[stream] = entry.incarnation, entry.seq + 1
-        static, network = stream in self._static, self._network
+        network = self._network
         tapped = network is not None and network.taps.active
+        static = stream in self._static
         if not (static or tapped or self._is_taken(stream)):
             return
         message: Message = entry.value
-        now = time.time_ns()
-        envelope = Envelope(Kind.MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, wall=now)
+        envelope = Envelope(_MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, "", time.time_ns())
         if static:
             self._once[stream] = [envelope]
             if network is not None:
                 network.bus.declare_static(stream, encode(envelope))
         self._send(stream, envelope, droppable=not static)
-        if begun:  # by this a taker knows that the new incarnation is the stream's own
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, entry.stamp))
         if network is not None and tapped:
             network.taps.offer(stream, envelope)
 
@@ -217,8 +215,6 @@ class Outlet:
             return
         if self._live:
             self._channel.send("stream_ended", stream=stream, reason=reason)
-        if final_stamp is not None:  # by this a taker that has lost the last messages believes the end
-            self._send(stream, self._envelope(Kind.FRONTIER, stream, final_stamp), droppable=False)
         over = self._envelope(Kind.END, stream, NEVER if final_stamp is None else final_stamp, reason)
         self._send(stream, over, droppable=False)
 

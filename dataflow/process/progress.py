@@ -18,6 +18,8 @@ from dataflow.process.runners import Runners
 REPORT_EVERY = 0.02
 REPORT_IDLE = 0.01
 """Seconds between two reports of a process that has nothing more to do: others may be waiting for this one."""
+REPORT_LIVE = 0.05
+"""The same in a live run, where sources wait for nobody: every report wakes the supervisor, and that the sources."""
 COUNT_EVERY = 0.05
 """Seconds between two counts of what operators have done, while there is more to do. Flow control needs none."""
 
@@ -32,7 +34,11 @@ class Progress:
         feeding: Feeding,
         live: LiveSources,
         clock: Callable[[], float] | None = None,
+        *,
+        paced: bool = False,
     ) -> None:
+        """`paced`: the run is live."""
+        self._every, self._idle = (REPORT_LIVE, REPORT_LIVE) if paced else (REPORT_EVERY, REPORT_IDLE)
         self._channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
         self._clock = clock or time.monotonic
         self.counted: dict[str, list[int]] = {}
@@ -53,7 +59,7 @@ class Progress:
     def report(self, *, idle: bool) -> None:
         """Sends what has changed, if it is time to."""
         now = self._clock()
-        if now < self._reported + (REPORT_IDLE if idle else REPORT_EVERY):
+        if now < self._reported + (self._idle if idle else self._every):
             self._owed = self._owed or idle
             return
         self._owed = False
@@ -85,7 +91,7 @@ class Progress:
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""
-        return max(0.0, self._reported + REPORT_IDLE - self._clock()) if self._owed else None
+        return max(0.0, self._reported + self._idle - self._clock()) if self._owed else None
 
     def _made(self) -> int:
         operators = sum(runner.firings for runner in self._runners.operators)

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgpack
 
-from dataflow.records.firing import WITHHELD, FiringRecord, decode_batch, encode_batch
+from dataflow.records.firing import WITHHELD, FiringRecord, decode_batch, encode_single
 
 SEGMENT = 1 << 20
 """Bytes of one segment at first; one that must hold a larger record (a snapshot of a map) grows. Unused pages cost
@@ -40,13 +40,15 @@ class Reached:
 
     def take(self, record: FiringRecord, ports: Sequence[str]) -> None:
         """Goes on by the next record; `ports` are the operator's outputs as declared."""
-        if record.kind == "reset":
+        kind = record.kind
+        if kind == "reset":
             self.last.clear()
-        if record.kind == "param":
+        elif kind == "param":
             self.changed[record.detail["name"]] = record.detail["value"]
-        self.incarnation = max(self.incarnation, record.incarnation)
+        if record.incarnation > self.incarnation:
+            self.incarnation = record.incarnation
         for port, emission in zip(ports, record.outputs, strict=False):
-            if emission is not None and emission.seq != WITHHELD and record.kind != "setup":
+            if emission is not None and emission.seq != WITHHELD and kind != "setup":
                 self.last[port] = emission.stamp
 
 
@@ -71,7 +73,7 @@ class BlackBox:
 
     def add(self, record: FiringRecord) -> None:
         """Keeps a record; to be called before the messages of its firing are sent."""
-        data = encode_batch([record])
+        data = encode_single(record)
         if self._length + _FRAME.size + len(data) > self._room:
             self._begin(1 - self._active, self._words[4 * self._active + _GENERATION] + 1, least=len(data))
         self._append(_RECORD, data)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import select
 import signal
 import socket
 import subprocess
@@ -17,6 +16,7 @@ from typing import Any
 import msgpack
 
 from dataflow.process.channel import QueuedChannel
+from dataflow.process.polling import readable
 from dataflow.supervision.nursery_process import MORE, MOST_DESCRIPTORS, SPAWN
 
 LEAVE_WITHIN = 15.0
@@ -85,7 +85,7 @@ class Child:
     @property
     def dead(self) -> bool:
         """Tells whether it has ended, for when nobody is left to tell."""
-        return self._pidfd is not None and bool(select.select([self._pidfd], [], [], 0)[0])
+        return self._pidfd is not None and bool(readable([self._pidfd], 0))
 
     def close(self) -> list[str]:
         """Closes everything that belongs to it; returns its last line, if it had no end."""

@@ -14,7 +14,6 @@ import contextlib
 import ctypes
 import gc
 import os
-import select
 import signal
 import socket
 import sys
@@ -25,6 +24,8 @@ from typing import Any
 
 import msgpack
 import psutil  # type: ignore[import-untyped]
+
+from dataflow.process.polling import readable
 
 LEAVE_WITHIN = 12.0
 """Seconds that its children get after the supervisor is gone."""
@@ -73,11 +74,11 @@ def serve(connection: socket.socket) -> None:
     children: dict[int, int] = {}  # pidfd → pid
     descriptors: list[int] = []
     while True:
-        readable, _, _ = select.select([connection.fileno(), *children], [], [])
-        for pidfd in readable:
+        ready = readable([connection.fileno(), *children], None)
+        for pidfd in ready:
             if pidfd != connection.fileno():
                 _ended(connection, children, pidfd)
-        if connection.fileno() in readable:
+        if connection.fileno() in ready:
             request, given, _, _ = socket.recv_fds(connection, 1, MOST_DESCRIPTORS)
             if not request:
                 break
@@ -145,12 +146,12 @@ def _await_death(pid: int) -> bool:
     """Waits (bounded) for a child that was killed."""
     pidfd = os.pidfd_open(pid)
     try:
-        readable, _, _ = select.select([pidfd], [], [], DIE_WITHIN)
+        dead = bool(readable([pidfd], DIE_WITHIN))
     finally:
         os.close(pidfd)
-    if readable:
+    if dead:
         os.waitpid(pid, 0)
-    return bool(readable)
+    return dead
 
 
 def _tell(connection: socket.socket, what: str, pid: int, fact: Any, descriptors: Iterable[int] = ()) -> None:
@@ -164,12 +165,11 @@ def _outlive(children: dict[int, int]) -> None:
     """The supervisor is gone: the children notice by themselves and leave; those that do not are killed."""
     deadline = time.monotonic() + LEAVE_WITHIN
     while children and (left := deadline - time.monotonic()) > 0:
-        readable, _, _ = select.select(list(children), [], [], left)
-        for pidfd in readable:
+        for pidfd in readable(list(children), left):
             _ended(None, children, pidfd)
     for pidfd, pid in list(children.items()):
         signal.pidfd_send_signal(pidfd, signal.SIGKILL)
-        if select.select([pidfd], [], [], DIE_WITHIN)[0]:
+        if readable([pidfd], DIE_WITHIN):
             _ended(None, children, pidfd)
         else:
             with contextlib.suppress(ProcessLookupError, PermissionError):

@@ -39,15 +39,16 @@ _INT64_MIN, _INT64_MAX = -(2**63), 2**63 - 1
 _PADDING = bytes(ALIGNMENT)
 _HEAD_FIELDS: Final = 6
 _KINDS: Final = {int(kind): kind for kind in Kind}
+_MESSAGE: Final = Kind.MESSAGE
 _SMALL_BODY: Final = 4096
 _SMALL_ARRAY: Final = 64
-"""Bytes of a body, and elements of an array in it, up to which it is decoded as a whole: then a hostile one, whose
-arrays claim lengths that they do not have, costs less than a megabyte."""
+"""Bytes of a head or body, and elements of an array in it, up to which it is decoded as a whole: then a hostile one,
+whose arrays claim lengths that they do not have, costs less than a megabyte."""
 
 
 def encode_head(envelope: Envelope) -> bytes:
     """Returns the msgpack head alone; raises `ValueError` when it is longer than the prelude can say."""
-    head: bytes = msgpack.packb(
+    head: bytes = _pack(
         (envelope.stream, envelope.incarnation, envelope.seq, envelope.stamp, envelope.wall, envelope.reason)
     )
     if len(head) > 0xFFFF:
@@ -68,9 +69,8 @@ def encode_parts(envelope: Envelope) -> list[Buffer]:
         return [PRELUDE.pack(MAGIC, VERSION, envelope.kind, len(head), 0) + head]
     if message.stamp != envelope.stamp:
         raise ValueError(f"envelope on {envelope.stream!r}: stamp {envelope.stamp}, but its message's {message.stamp}")
-    arrays = message.arrays()
-    described = [None if a is None else (a.dtype.str, a.shape) for a in arrays]
-    body = msgpack.packb((message.SCHEMA, message.header(), described))
+    content, arrays = (message._made or message.compiled()).content(message)
+    body = _pack(content)
     offset = PRELUDE.size + len(head) + len(body)
     parts: list[Buffer] = [PRELUDE.pack(MAGIC, VERSION, envelope.kind, len(head), len(body)) + head + body]
     for data in arrays:
@@ -104,6 +104,8 @@ def decode(buffer: Buffer, limits: Limits = DEFAULT_LIMITS, types: TypeOf = mess
 
     The message's arrays are read-only views of `buffer`: nobody may write to it afterwards. Raises only `DecodeError`.
     """
+    if limits is DEFAULT_LIMITS and (found := _usual(buffer, types)) is not None:
+        return found
     view = _bytes_view(buffer)
     head, body_start, body_bytes = _head(view, limits)
     body_end = body_start + body_bytes
@@ -130,8 +132,61 @@ def _unpacking(**limits: int) -> Callable[[Any], Any]:
     return partial(msgpack.unpackb, raw=False, use_list=False, max_map_len=0, max_ext_len=0, max_bin_len=0, **limits)
 
 
-_unpack_body = _unpacking(max_array_len=_SMALL_ARRAY)
+_pack: Final = msgpack.Packer(autoreset=True).pack
+_unpack_small = _unpacking(max_array_len=_SMALL_ARRAY, max_str_len=DEFAULT_LIMITS.string_bytes)
 _head_unpackers: dict[int, Callable[[Any], Any]] = {}
+
+
+def _usual(buffer: Buffer, types: TypeOf) -> Envelope | None:
+    """The envelope of a message with a small head and body, in one go; None where anything is rare, or wrong.
+
+    This is what nearly every envelope is, so no function is called here that need not be.
+    """
+    try:
+        magic, version, kind, head_bytes, body_bytes = PRELUDE.unpack_from(buffer)
+        if kind != 1 or magic != MAGIC or version != VERSION or head_bytes > _SMALL_BODY or body_bytes > _SMALL_BODY:
+            return None
+        view = memoryview(buffer)
+        if not view.readonly:
+            view = view.toreadonly()
+        start = PRELUDE.size + head_bytes
+        offset = end = start + body_bytes
+        stream, incarnation, seq, stamp, wall, reason = _unpack_small(view[PRELUDE.size : start])
+        if (
+            not (stream.__class__ is reason.__class__ is str and stream)
+            or not (incarnation.__class__ is seq.__class__ is stamp.__class__ is wall.__class__ is int)
+            or not (0 <= incarnation <= _INT64_MAX and 0 <= seq <= _INT64_MAX)
+            or not (_INT64_MIN <= stamp <= _INT64_MAX and _INT64_MIN <= wall <= _INT64_MAX)
+        ):
+            return None
+        schema, header, described = _unpack_small(view[start:end])
+        cls = types(schema)
+        made = cls._made or cls.compiled()
+        arrays: list[npt.NDArray[Any] | None] = []
+        for dtypes, description in zip(made.dtypes, described, strict=True):
+            if description is None:
+                arrays.append(None)
+                continue
+            code, shape = description
+            dtype = dtypes[code]
+            size = dtype.itemsize
+            for extent in shape:
+                if extent.__class__ is not int or extent <= 0:
+                    return None
+                size *= extent
+            offset += -offset % ALIGNMENT
+            if dtype.kind == "b" or len(shape) > DEFAULT_LIMITS.dimensions:
+                return None
+            arrays.append(np.ndarray(shape, dtype, view, offset))  # raises where it does not fit
+            offset += size
+        if offset != len(view) or offset - end > DEFAULT_LIMITS.payload_bytes or header.__class__ is not tuple:
+            return None
+        message = cls.__new__(cls)
+        if not made.adopt(message, stamp, header, arrays):
+            return None
+        return Envelope(_MESSAGE, stream, incarnation, seq, stamp, message, reason, wall)
+    except Exception:  # whatever it is, the general way finds it, and says what is wrong and where
+        return None
 
 
 def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:
@@ -189,10 +244,6 @@ def _out_of_range(**numbers: tuple[Any, int]) -> DecodeError:
 
 
 def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits, types: TypeOf) -> Message:
-    if end - start <= min(_SMALL_BODY, limits.string_bytes) and limits.strings >= _SMALL_ARRAY:
-        found = _small_message(view, head, start, end, limits, types)
-        if found is not None:
-            return found
     body = Body(view[start:end], head, limits)
     body.array("body", 3)
     schema = body.value("schema")
@@ -232,38 +283,6 @@ def _message(view: memoryview, head: Head, start: int, end: int, limits: Limits,
         return cls.from_parts(head.stamp, scalars, arrays)
     except Exception as error:  # MessageError, and whatever a type's own checks meet in values nobody foresaw
         raise DecodeError(f"{where(head)}: {type(error).__name__}: {short(error)}") from None
-
-
-def _small_message(view: memoryview, head: Head, start: int, end: int, limits: Limits, types: TypeOf) -> Message | None:
-    """The message with a small body, decoded as a whole; None where anything is not as it should be, or rare."""
-    try:
-        schema, header, described = _unpack_body(view[start:end])
-        cls = types(schema)
-        made = cls.compiled()
-        arrays: list[npt.NDArray[Any] | None] = []
-        offset = end
-        for dtypes, description in zip(made.dtypes, described, strict=True):
-            if description is None:
-                arrays.append(None)
-                continue
-            code, shape = description
-            dtype = dtypes[code]
-            size = dtype.itemsize
-            for extent in shape:
-                if type(extent) is not int or extent <= 0:
-                    return None
-                size *= extent
-            offset += -offset % ALIGNMENT
-            if dtype.kind == "b" or size > limits.payload_bytes - (offset - end) or len(shape) > limits.dimensions:
-                return None
-            arrays.append(np.ndarray(shape, dtype, view, offset))  # raises where it does not fit
-            offset += size
-        if offset != len(view) or type(header) is not tuple:
-            return None
-        message = cls.__new__(cls)
-        return message if made.adopt(message, head.stamp, header, arrays) else None
-    except Exception:  # whatever it is, the general way finds it, and says what is wrong and where
-        return None
 
 
 def _array(

@@ -37,7 +37,7 @@ class Fanout:
         self._pool: SharedPool | None = None
 
     def send(
-        self, key: str, parts: Sequence[Buffer], *, envelope: Envelope | None = None, droppable: bool = True
+        self, key: str, parts: Sequence[Buffer], envelope: Envelope | None = None, *, droppable: bool = True
     ) -> int:
         """Sends to all that take a key; returns how many those are.
 
@@ -47,7 +47,7 @@ class Fanout:
         takers = self.takers.get(key)
         if not takers:
             return 0
-        size = sum(map(len, parts))
+        size = len(parts[0]) if len(parts) == 1 else sum(map(len, parts))
         if size >= THRESHOLD and envelope is not None and self._pool_bytes:
             self._lend(takers, parts, size, envelope, droppable=droppable)
         else:

@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from dataflow.transport.envelope import Buffer, DecodeError
+from dataflow.transport.envelope import Buffer, DecodeError, Kind
 from dataflow.transport.pool import Block
 from dataflow.transport.ring import RingReader, RingWriter
 from dataflow.transport.shared import (
@@ -28,8 +28,10 @@ from dataflow.transport.shared import (
 )
 
 _FIRST, _LAST = 1 << 31, 1 << 30
+_WHOLE = _FIRST | _LAST
 _CHANNEL = _LAST - 1
 _AT_ONCE = 1024
+_REFERENCE = bytes([Kind.REFERENCE])
 STILL = 0.3
 
 
@@ -128,16 +130,16 @@ class Outgoing:
         self, channel: int, parts: Sequence[Buffer], size: int, *, droppable: bool = True, block: Block | None = None
     ) -> None:
         """Sends one envelope, given as consecutive buffers, or keeps it until there is room."""
-        if not self.present():
+        if (self.away or self._reader != self._ring.reader()) and not self.present():
             if block is not None:
                 self.claim.drop(block)
             return
         if block is not None and self._most is not None:
             self._lent.append((block.slot, block.generation, block.capacity))
         if not self._waiting and size <= self._ring.largest:
-            if self._ring.put(channel | _FIRST | _LAST, parts):
+            if self._ring.put(channel | _WHOLE, parts):
                 return
-            frames = [(channel | _FIRST | _LAST, parts)]
+            frames = [(channel | _WHOLE, parts)]
         else:
             frames = list(self._frames(channel, parts, size))
         self._waiting.append(_Waiting(frames, size, droppable, block))
@@ -161,7 +163,7 @@ class Outgoing:
 
     def _frames(self, channel: int, parts: Sequence[Buffer], size: int) -> Iterator[tuple[int, Sequence[Buffer]]]:
         if size <= self._ring.largest:
-            yield channel | _FIRST | _LAST, parts
+            yield channel | _WHOLE, parts
             return
         whole = memoryview(b"".join(parts))
         most = self._ring.largest
@@ -226,16 +228,23 @@ class Incoming:
         """Says that the wait is over: until the next one nobody needs to wake this process."""
         self._ring.awake()
 
-    def take(self) -> Iterator[tuple[str, Buffer]]:
-        """Yields (key, payload) of what has arrived."""
+    def take(self) -> list[tuple[str, Buffer]]:
+        """Returns (key, payload) of what has arrived."""
+        found: list[tuple[str, Buffer]] = []
         for flagged, content in self._ring.take(_AT_ONCE):
-            whole = self._whole(flagged, content)
-            if whole is None:
-                continue
-            payload = self._resolved(whole) if is_reference(whole) else whole
+            channel = flagged & _CHANNEL
+            if flagged < _WHOLE or self._pieces:
+                whole = self._whole(flagged, content)
+                if whole is None:
+                    continue
+                content = whole
+            payload: Buffer = content
+            if content[5:6] == _REFERENCE and is_reference(content):
+                payload = self._resolved(content)
             self.messages += 1
             self.nbytes += len(payload)
-            yield self._keys[flagged & _CHANNEL], payload
+            found.append((self._keys[channel], payload))
+        return found
 
     def _whole(self, flagged: int, content: bytes) -> bytes | None:
         """Puts pieces together; None while some are missing, and for those of which the first went to another."""

@@ -27,6 +27,9 @@ CAPACITY = 1 << 20
 _HEADER = 4096
 _HEAD, _TAIL, _ASLEEP, _BLOCKED, _READERS = (64 * k // 8 for k in range(5))  # a cache line each
 _FRAME = struct.Struct("<II")
+_ROUNDED = _FRAME.size + 7
+"""What a frame takes of the ring is its content and this, without the last three bits: whole words, so that a head
+never wraps."""
 _SKIP = 0xFFFFFFFF
 _REORDERS = platform.machine() not in ("x86_64", "AMD64")
 
@@ -94,10 +97,10 @@ class RingWriter(_End):
 
         The reader then wakes the writer once it has taken something. Raises `RingError` for a frame that never fits.
         """
-        size = sum(map(len, parts))
+        size = len(parts[0]) if len(parts) == 1 else sum(map(len, parts))
         if size > self.largest:
             raise RingError(f"a frame of {size} bytes does not fit a ring of {self.capacity} bytes")
-        needed, head, words, memory = _room(size), self._head, self._words, self._memory
+        needed, head, words, memory = (size + _ROUNDED) & ~7, self._head, self._words, self._memory
         at = head & (self.capacity - 1)
         skipped = self.capacity - at if at + needed > self.capacity else 0
         if head - words[_TAIL] + skipped + needed > self.capacity and not self._has_room(skipped + needed):
@@ -116,7 +119,8 @@ class RingWriter(_End):
             self._fence()
             self._fence()
         self._head = words[_HEAD] = head + skipped + needed
-        self._fence()
+        with self._lock:  # a fence: see `_fence`
+            pass
         if words[_ASLEEP]:
             words[_ASLEEP] = 0
             os.eventfd_write(self._wake, 1)
@@ -156,11 +160,12 @@ class RingReader(_End):
             if size == _SKIP:
                 tail += self.capacity - at
                 continue
-            if at + _room(size) > self.capacity or tail + _room(size) > head:
+            room = (size + _ROUNDED) & ~7
+            if at + room > self.capacity or tail + room > head:
                 raise RingError(f"a frame of {size} bytes lies beyond what was written to the ring")
             start = _HEADER + at + _FRAME.size
             taken.append((channel, self._memory[start : start + size]))
-            tail += _room(size)
+            tail += room
         if tail != self._tail:
             self._tail = tail
             self._words[_TAIL] = tail
@@ -182,8 +187,3 @@ class RingReader(_End):
     def awake(self) -> None:
         """Says that the wait is over."""
         self._words[_ASLEEP] = 0
-
-
-def _room(size: int) -> int:
-    """Returns what a frame takes of the ring: its head and content, in whole words, so that a head never wraps."""
-    return (_FRAME.size + size + 7) & ~7

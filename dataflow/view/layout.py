@@ -19,13 +19,14 @@ from dataflow.messages import (
     Mesh,
     Message,
     Planes,
+    RelativeDepth,
     SceneGraph,
     SegmentationMap,
     Tracks,
 )
 
 COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
-DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth)
+DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 
 _TRUTH = {"truth", "groundtruth", "gt"}

@@ -6,13 +6,14 @@ import numpy as np
 
 from dataflow.messages import Transforms
 from dataflow.messages.geometry import invert
+from operators.geometry.frame_tree import FrameTree, TransformError, told_by
 from operators.geometry.se3 import Matrix
 
 
 def transform_between(extrinsics: Transforms | None, source: str, target: str) -> Matrix:
     """Returns `T_target_source` (4, 4): the identity where the frames are one or no extrinsics are given.
 
-    Raises ValueError where the extrinsics do not relate the two frames directly, in either direction.
+    Raises ValueError where the extrinsics do not relate the two frames, in either direction or over others.
     """
     if extrinsics is None or source == target:
         return np.eye(4)
@@ -22,5 +23,13 @@ def transform_between(extrinsics: Transforms | None, source: str, target: str) -
         return T_target_source
     if (source, target) in known:
         return invert(extrinsics.matrices()[known.index((source, target))])
+    tree = FrameTree()
+    for told in told_by(extrinsics):
+        tree.fix(*told)
     listed = ", ".join(f"{child} in {parent}" for parent, child in known) or "none"
-    raise ValueError(f"extrinsics hold no transform between {source!r} and {target!r}; they hold {listed}")
+    try:
+        return tree.lookup(target, source, 0)
+    except TransformError:
+        raise ValueError(
+            f"extrinsics hold no transform between {source!r} and {target!r}; they hold {listed}"
+        ) from None

@@ -52,6 +52,13 @@ def log(T: Matrix) -> Vector:
     return np.concatenate([(np.eye(3) - 0.5 * W + d * (W @ W)) @ p, w])
 
 
+def interpolated(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:
+    """Returns the motion (4, 4) on the way from T_a (share 0) to T_b (share 1) at a constant twist, or beyond."""
+    a_inverse = np.eye(4)
+    a_inverse[:3, :3], a_inverse[:3, 3] = T_a[:3, :3].T, -T_a[:3, :3].T @ T_a[:3, 3]
+    return np.asarray(T_a @ exp(share * log(a_inverse @ T_b)))
+
+
 def adjoint(T: Matrix) -> Matrix:
     """Returns the (6, 6) for which T exp(x) T^-1 = exp(adjoint(T) x)."""
     R = T[:3, :3]

@@ -4,5 +4,6 @@ from operators.odometry.base_odometry import BaseOdometry
 from operators.odometry.lidar_odometry import LidarOdometry
 from operators.odometry.stereo_visual_odometry import StereoVisualOdometry
 from operators.odometry.visual_odometry import VisualOdometry
+from operators.odometry.wheel_odometry import WheelOdometry
 
-__all__ = ["BaseOdometry", "LidarOdometry", "StereoVisualOdometry", "VisualOdometry"]
+__all__ = ["BaseOdometry", "LidarOdometry", "StereoVisualOdometry", "VisualOdometry", "WheelOdometry"]

@@ -29,6 +29,7 @@ ACTIVITIES = (
 _WINDOW = 1.0  # seconds of the past that tell how an agent moves
 _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
 _RISING = 0.15  # m/s, of the head
+_NEARNESS = 4.0  # log odds that a goal loses for each metre that it is farther away than the nearest
 
 
 class Motion:
@@ -123,7 +124,9 @@ class GoalInference:
                 belief[each.id] = fade * self._belief.get(each.id, 0.0) + self._trust * (saved - walked)
             self._belief = belief
         self._last = (time, here.copy())
-        scores = {each.id: self._belief.get(each.id, 0.0) - self._near(here, each) for each in candidates}
+        away = {each.id: float(np.hypot(*(each.center[:2] - here))) for each in candidates}
+        nearest = min(away.values(), default=0.0)
+        scores = {i: self._belief.get(i, 0.0) - _NEARNESS * (d - nearest) for i, d in away.items()}
         scores[-1] = -self._elsewhere
         most = max(scores.values())
         weights = {i: float(np.exp(v - most)) for i, v in scores.items()}
@@ -140,8 +143,3 @@ class GoalInference:
         self._belief = {int(i): float(v) for i, v in state["belief"]}
         last = state["last"]
         self._last = None if last is None else (float(last[0]), np.array(last[1], np.float64))
-
-    @staticmethod
-    def _near(here: Array, candidate: Body) -> float:
-        """Returns the prior cost of a candidate: nearer ones are likelier."""
-        return 2.0 * float(np.hypot(*(candidate.center[:2] - here)))

@@ -59,10 +59,10 @@ class Cells:
         weighted = np.concatenate([self.points, other.points]) * hits[:, None]
         self.hits = np.asarray(np.bincount(of, hits, len(keys)))
         sums = np.stack([np.bincount(of, column, len(keys)) for column in weighted.T], axis=1)
-        self.points = sums / np.maximum(self.hits, 1e-9)[:, None]
+        self.points = np.asarray(sums / np.maximum(self.hits, 1e-9)[:, None], np.float64)
         # a voxel that is seen again was not free after all
-        self.free = np.maximum(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)), 0.0)
-        self.other = np.bincount(of, np.concatenate([self.other, other.other]), len(keys))
+        self.free = np.asarray(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)).clip(min=0))
+        self.other = np.asarray(np.bincount(of, np.concatenate([self.other, other.other]), len(keys)))
         self._keys, self._tree = keys, None
 
     def carve(self, free: NDArray[np.bool_]) -> None:
@@ -134,14 +134,15 @@ def completed(box: tuple[Array, Array, float], view: Array, usual: tuple[float, 
 
     `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. `usual` are the
     shorter and longer side of such objects: the side across the view tells which of the two lies along it. The box
-    grows away from the viewer, less where views differ.
+    grows away from the viewer, less where views differ. No side is much shorter than is usual.
     """
     center, size, yaw = box[0].copy(), box[1].copy(), box[2]
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     along = axes @ view
     deep = int(np.argmax(np.abs(along)))
-    across = float(size[1 - deep])
     short, long = usual
+    across = float(size[1 - deep])
+    size[1 - deep] = max(across, 0.8 * short)  # narrower things are seen in part
     target = long if across < np.sqrt(short * long) else short
     lack = max(0.0, target - float(size[deep])) * min(1.0, abs(float(along[deep])) * 1.2)
     size[deep] += lack

@@ -24,7 +24,7 @@ class GraphSettings:
     smoothing: float = 0.4
     agents: tuple[str, ...] = ("person", "robot", "ball")
     goals: tuple[str, ...] = ("chair", "table", "mug", "bottle", "door", "shelf")
-    trust: float = 4.0
+    trust: float = 2.0
     memory: float = 4.0
     elsewhere: float = 2.5
     least_goal: float = 0.1

@@ -17,6 +17,7 @@ from operators.tracking.assignment import assign
 Array = NDArray[np.float64]
 _MOST = 6.0
 _PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most")
+_BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
 _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 
@@ -29,7 +30,7 @@ class MapSettings:
     margin: float = 0.1
     bin: float = 0.012
     overlap: float = 0.25
-    confirm: float = 2.0
+    confirm: float = 1.0
     views: int = 3
     vacated: float = 1.0
     missed: float = 0.12
@@ -87,7 +88,8 @@ class MapObject:
         """Puts the box around what is surely the object's, as deep as usual for its class where one side was seen."""
         sure = self.cells.sure()
         if len(sure):
-            box = standing_box(sure)
+            center, size, yaw = standing_box(sure)
+            box = (center, size + 2 * _BRINK, yaw)
             known = usual.get(self.class_id)
             if known is not None:
                 box = completed(box, self.view / max(self.views, 1), known)

@@ -48,7 +48,7 @@ class SemanticMap(Operator):
 
     voxel: float = Param(0.03, gt=0.005, le=0.2, doc="side of the voxels that objects consist of", unit="m")
     overlap: float = Param(0.25, gt=0, le=1, doc="share of a view's points that are near those of the object it is of")
-    confirm: float = Param(2.0, gt=0, doc="evidence from which an object is given, in log odds")
+    confirm: float = Param(1.0, gt=0, doc="evidence from which an object is given, in log odds")
     views: int = Param(3, ge=1, doc="and views from which it was seen")
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
     movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")

@@ -76,11 +76,13 @@ def test_a_live_source_that_draws_beside_operators_is_refused(monkeypatch: pytes
     work = AtWork()
     runner._tripwire = Tripwire(work)
 
-    assert runner.take() is not None  # no operator fires in this process
+    assert runner.take() is not None
+    runner.check_draws()  # no operator fires in this process
     work.fires = True
+    assert runner.take() is not None
 
     with pytest.raises(OperatorFailure, match=r"draw from self\.rng"):
-        runner.take()
+        runner.check_draws()
 
 
 def test_draws_while_an_operator_is_at_work_are_its_own() -> None:

@@ -101,3 +101,41 @@ def test_a_failed_process_waits_for_the_supervisor_whatever_else_wakes_it() -> N
             return item
 
     assert await_leave(Woken()) == "failed"  # type: ignore[arg-type]
+
+
+def test_the_turn_is_another_threads_only_while_the_one_that_has_it_waits_for_nothing(wired: Wired) -> None:
+    waiting, done = threading.Event(), threading.Event()
+    inbox = wired.inbox
+    assert not inbox.take_turn()  # this thread has it
+    found = []
+
+    def act() -> None:
+        waiting.wait(LONG)
+        while not inbox.take_turn():
+            if done.is_set():
+                return
+        found.append(inbox.empty())
+        inbox.give_turn(wake=False)
+        inbox.put(("control", "go", {}))
+
+    thread = threading.Thread(target=act)
+    thread.start()
+    waiting.set()
+    assert inbox.get(timeout=LONG) == ("control", "go", {})
+    done.set()
+    thread.join()
+    assert found == [True]
+    assert not inbox.take_turn()
+
+
+def test_the_thread_that_waits_is_woken_for_what_another_has_left_it(wired: Wired) -> None:
+    def act() -> None:
+        while not wired.inbox.take_turn():
+            pass
+        wired.inbox.give_turn(wake=True)
+
+    thread = threading.Thread(target=act)
+    thread.start()
+    with pytest.raises(queue.Empty):
+        wired.inbox.get(timeout=LONG)
+    thread.join()

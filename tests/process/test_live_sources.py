@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -67,11 +68,15 @@ class Sources:
             window,
             backlog,
             resumed=False,
+            in_its_place=self.in_its_place,
         )
         self.runner = SourceRunner(node_of(use, restarts, params), self.emitted, live=True)
         self.live.add(self.runner)
         self.runner.setup()
         self.live.start()
+
+    def in_its_place(self, act: Any, step: Any) -> bool:
+        return False
 
     def run(self) -> None:
         """Handles what the reader hands over until the source has ended."""
@@ -199,3 +204,39 @@ def test_the_restart_that_is_pending_is_forgotten_when_the_run_is_stopped() -> N
 
     assert sources.emitted.ends == ["interrupted"]
     assert process_operators.Count.lives == 1
+
+
+class InPlace(Sources):
+    """The thread that reads a source emits in the place of the main one, which waits."""
+
+    def __init__(self, use: str, **params: Any) -> None:
+        self.emitting: list[str] = []
+        super().__init__(use, **params)
+
+    def in_its_place(self, act: Any, step: Any) -> bool:
+        self.emitting.append(threading.current_thread().name)
+        act(step)
+        return True
+
+
+def test_a_reader_emits_itself_where_the_main_thread_waits() -> None:
+    sources = InPlace("Count", number=3)
+
+    sources.run()
+
+    assert sources.emitting == ["source camera"] * 3
+    assert sources.emitted.messages == [(0, k, 1000 + k) for k in range(3)]
+    assert sources.emitted.ends == ["end of source"]
+
+
+@pytest.mark.parametrize("restarts", [0, 1])
+def test_a_step_that_a_reader_may_not_emit_fails_its_source(monkeypatch: pytest.MonkeyPatch, restarts: int) -> None:
+    monkeypatch.setattr(SourceRunner, "emit_live", _refuse_once(SourceRunner.emit_live))
+    sources = InPlace("Count", restarts=restarts, number=3)
+
+    if restarts:
+        sources.run()
+        assert sources.emitted.messages[-1][0] == 1
+    else:
+        with pytest.raises(OperatorFailure, match="no such port"):
+            sources.run()

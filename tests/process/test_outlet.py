@@ -88,13 +88,31 @@ def test_who_was_started_again_is_sent_the_static_messages_again_and_they_count_
 
 
 def test_the_end_of_a_stream_reaches_a_consumer_that_missed_messages() -> None:
-    """With the frontier before it, by which the consumer believes it."""
     linked = Linked(most=(3, 1 << 20))
     linked.outlet.release()
     for seq in range(200):
         linked.outlet.message(FAST, entry(FAST, seq + 1, seq))
     linked.outlet.end(FAST, 200, "over")
     found = linked.taken()
-    assert found[-2:] == [("fast", "FRONTIER", 200), ("fast", "END", 200)]
-    assert linked.outlet.counters()["unsent"] == 200 + 2 - len(found)
+    assert found[-1] == ("fast", "END", 200)
+    assert linked.outlet.counters()["unsent"] == 200 + 1 - len(found)
     assert linked.outlet.counters()["unsent"] > 0
+
+
+def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_message_and_end(linked: Linked) -> None:
+    linked.outlet = Outlet(
+        None,  # type: ignore[arg-type]
+        lambda stream: (),
+        fanout=Fanout([([INFO, FAST], Outgoing(*linked.descriptors, None))]),
+        namespace="test",
+        static=frozenset([INFO]),
+        live=False,
+        box=None,
+        firings=False,
+        incarnations={INFO: 2, FAST: 2},
+    )
+    linked.outlet.release()
+    linked.outlet.message(INFO, entry(INFO, 0, 0))
+    linked.outlet.end(INFO, None, "static")
+    linked.outlet.message(FAST, entry(FAST, 10, 0, incarnation=2))
+    assert linked.taken() == [("constant", "MESSAGE", 0), ("constant", "END", 1), ("fast", "MESSAGE", 0)]

@@ -28,6 +28,7 @@ from dataflow.messages import (
     OccupancyGrid,
     Odometry,
     PointCloud,
+    RelativeDepth,
     SegmentationMap,
     Switch,
     Text,
@@ -98,6 +99,16 @@ def test_depth_survives_to_the_millimetre_and_no_return_stays_none(tmp_path: Pat
     (meter,) = at(found, "/camera/depth", "EncodedDepthImage:meter")
     back = cv2.imdecode(np.array(blob.values[0], np.uint8), cv2.IMREAD_UNCHANGED) / meter.values[0]
     np.testing.assert_allclose(back, [[0, 0, 0.5], [1.2345, 6.0, 0]], atol=0.0005001)
+
+
+def test_nearness_has_the_colours_of_its_rank_and_unknown_pixels_are_black(tmp_path: Path) -> None:
+    data = np.array([[np.nan, 0.2], [0.5, 3.0]], np.float32)
+    found = draw(tmp_path, ("mono/relative", RelativeDepth(stamp=STAMP, frame="camera", data=data)))
+    (buffer,) = at(found, "/mono/relative", "Image:buffer")
+    unknown, far, _, near = np.frombuffer(bytes(buffer.values[0]), np.uint8).reshape(4, 3).astype(int)
+    assert unknown.tolist() == [0, 0, 0]
+    assert near[0] > near[2]  # red
+    assert far[0] < far[2] + 40  # dark blue
 
 
 def test_inverse_depth_is_decoded(tmp_path: Path) -> None:

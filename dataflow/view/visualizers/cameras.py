@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import rerun as rr
 
-from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image
+from dataflow.messages import CameraInfo, CompressedDepth, CompressedImage, DepthImage, Image, RelativeDepth
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 
@@ -84,6 +84,21 @@ def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
             else message.scale / (pixels - message.offset)
         )
     _depth(canvas, np.where(pixels > 0, depth, 0.0).astype(np.float32))
+
+
+@visualizer(RelativeDepth, "image")
+def relative_depth(canvas: Canvas, message: RelativeDepth) -> None:
+    """Colours by nearness, from the image's own first to its last percent; in space it has no place."""
+    known = np.isfinite(message.data)
+    values = message.data[known]
+    low, high = np.percentile(values, (1, 99)) if values.size else (0.0, 1.0)
+    share = np.clip((np.where(known, message.data, low) - low) / max(float(high - low), 1e-9), 0, 1)
+    colors = cv2.applyColorMap((share * 255).astype(np.uint8), cv2.COLORMAP_TURBO)[..., ::-1]
+    colors = np.where(known[..., None], colors, 0).astype(np.uint8)
+    picture = rr.Image(
+        bytes=colors.tobytes(), width=message.width, height=message.height, color_model="RGB", datatype="U8"
+    )
+    canvas.draw("", canvas.plane, picture)
 
 
 def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:

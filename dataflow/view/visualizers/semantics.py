@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
+
 import numpy as np
 import rerun as rr
 
@@ -20,7 +23,7 @@ def scene_graph(canvas: Canvas, message: SceneGraph) -> None:
     names = message.names()
     classes = [message.class_names[c] if message.class_names else str(c) for c in message.class_ids.tolist()]
     paint = colors.of_classes(classes)
-    relations = message.relations()
+    relations = _telling(message.relations())
     keys = [f"n{i}" for i in message.ids.tolist()]
     predicates = [f"{keys[s]} {p} {keys[o]}" for s, p, o in relations]
     canvas.log(
@@ -66,6 +69,18 @@ def scene_graph(canvas: Canvas, message: SceneGraph) -> None:
             radii=rr.Radius.ui_points(1.0),
         ),
     )
+
+
+def _telling(relations: Sequence[tuple[int, str, int]]) -> list[tuple[int, str, int]]:
+    """Returns the relations without those of the commonest predicates, so far as they are too many to be read."""
+    counts = Counter(predicate for _, predicate, _ in relations)
+    left = len(relations)
+    for predicate, count in counts.most_common():
+        if left <= MANY_LABELS or len(counts) == 1:
+            break
+        left -= count
+        del counts[predicate]
+    return [row for row in relations if row[1] in counts]
 
 
 @visualizer(Activity, "log")

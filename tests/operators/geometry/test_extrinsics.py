@@ -27,6 +27,18 @@ def transforms(parent: str, child: str, T: np.ndarray) -> Transforms:
     )
 
 
+def test_frames_may_be_related_over_others() -> None:
+    poses = [split_matrix(T) for T in (T_depth_color, T_depth_color @ T_depth_color)]
+    chain = Transforms(
+        stamp=0,
+        frames=("base", "base"),
+        child_frames=("camera", "lidar"),
+        translations=np.array([p for p, _ in poses]),
+        rotations=np.array([q for _, q in poses]),
+    )
+    np.testing.assert_allclose(transform_between(chain, "lidar", "camera"), T_depth_color, atol=1e-9)
+
+
 @given(st.integers(0, 100))
 def test_both_directions_map_the_same_point(seed: int) -> None:
     points = np.random.default_rng(seed).normal(size=(5, 3))

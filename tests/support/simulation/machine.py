@@ -91,14 +91,23 @@ class Lock:
         self._held = False
         self._waiters = Waiters(world)
 
-    def __enter__(self) -> None:
+    def acquire(self, blocking: bool = True) -> bool:
         while self._held:
+            if not blocking:
+                return False
             self._waiters.wait()
         self._held = True
+        return True
 
-    def __exit__(self, *error: object) -> None:
+    def release(self) -> None:
         self._held = False
         self._waiters.notify()
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
 
 
 class Event:
@@ -506,21 +515,39 @@ class Selectors:
 class Select:
     """The module `select`, for handles of processes and the one descriptor that an inbox waits for."""
 
+    POLLIN = select.POLLIN
+
+    def __init__(self, system: System) -> None:
+        self.poll = lambda: Poll(system)
+
+
+class Poll:
+    """`select.poll`, of real descriptors or of those of this machine."""
+
     def __init__(self, system: System) -> None:
         self._system = system
+        self._things: dict[int, Any] = {}
+        self._real = select.poll()
 
-    def select(self, reading: list[Any], writing: list[Any], odd: list[Any], timeout: float | None) -> Any:
-        if any(isinstance(each, int) and each >= FIRST for each in reading):
-            return self._wait([self._system.things[each] for each in reading], timeout), [], []
-        return select.select(reading, writing, odd, timeout)
+    def register(self, descriptor: int, events: int) -> None:
+        if descriptor >= FIRST:
+            self._things[descriptor] = self._system.things[descriptor]
+        else:
+            self._real.register(descriptor, events)
 
-    def _wait(self, things: list[Any], timeout: float | None) -> list[Any]:
+    def poll(self, milliseconds: float | None = None) -> list[tuple[int, int]]:
+        if not self._things:
+            return self._real.poll(milliseconds)
         world = self._system.world
         world.call()
-        until = None if timeout is None else world.now + timeout
-        while not (ready := [thing for thing in things if thing.readable]) and (until is None or world.now < until):
-            things[0].changed.wait(None if until is None else until - world.now)
+        until = None if milliseconds is None else world.now + milliseconds / 1000
+        while not (ready := self._ready()) and (until is None or world.now < until):
+            first = next(iter(self._things.values()))
+            first.changed.wait(None if until is None else until - world.now)
         return ready
+
+    def _ready(self) -> list[tuple[int, int]]:
+        return [(descriptor, select.POLLIN) for descriptor, thing in self._things.items() if thing.readable]
 
 
 class Signals:

@@ -1,0 +1,24 @@
+"""Tells which descriptors can be read; of any number, where select(2) knows those below 1,024 only."""
+
+from __future__ import annotations
+
+import select
+from collections.abc import Iterable
+from typing import Protocol, TypeVar
+
+
+class HasDescriptor(Protocol):
+    def fileno(self) -> int: ...
+
+
+Waited = TypeVar("Waited", bound=int | HasDescriptor)
+
+
+def readable(waited: Iterable[Waited], timeout: float | None) -> list[Waited]:
+    """Returns those that have something to read, or have ended, after at most `timeout` seconds (None: no limit)."""
+    by_descriptor = {each if isinstance(each, int) else each.fileno(): each for each in waited}
+    poll = select.poll()
+    for descriptor in by_descriptor:
+        poll.register(descriptor, select.POLLIN)
+    found = poll.poll(None if timeout is None else max(0.0, timeout) * 1000)
+    return [by_descriptor[descriptor] for descriptor, _ in found]

@@ -1,0 +1,104 @@
+"""Clouds of one scene laid onto each other without a guess."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dataflow.messages import Diagnostics, Message, PointCloud, Pose
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import transform_points
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.filtering import finite
+from operators.cloud.registration import Prepared, Registered, Settings, register
+from operators.geometry.se3 import about_fixed_axes
+
+
+class CloudRegistration(Operator):
+    """Finds the rigid motion from a cloud to a target cloud of the same scene, or says that it failed, and why.
+
+    Both clouds have their sensor at the origin of their frames: a motion is believed only where each sensor saw what
+    the other says, as far as it could, and where nothing hangs in what the other saw to be free. Clouds that share too
+    little, surfaces that leave a direction free, and two motions that explain the clouds as well are failures.
+
+    Method: fast point feature histograms by Rusu, Blodow and Beetz, 2009; RANSAC on their mutual matches; refined by
+    Segal, Haehnel and Thrun, "Generalized-ICP", 2009.
+    """
+
+    cloud: In[PointCloud] = In(doc="points in the frame of their sensor, which is the origin")
+    target: Sampled[PointCloud] = Sampled(doc="points of the same scene in the frame of their sensor")
+    pose: Out[Pose] = Out(doc="the cloud's sensor in the target's frame, with covariance; none where it failed")
+    aligned: Out[PointCloud] = Out(doc="the cloud in the target's frame; none where it failed")
+    status: Out[Diagnostics] = Out(doc="registered or failed, with the reason, overlap, fitness, violation and RMSE")
+
+    child_frame: str = Param("", doc="name of the cloud's frame in the pose; the cloud's own where empty")
+    voxel: float = Param(0.1, gt=0.005, doc="side of the voxels that the clouds are thinned to", unit="m")
+    trials: int = Param(60_000, ge=100, le=10_000_000, doc="triples of matches that are tried")
+    min_overlap: float = Param(0.5, gt=0, le=1, doc="least share of each cloud that the other sensor could see")
+    min_fitness: float = Param(0.9, gt=0, le=1, doc="least share of that which lies on the other cloud")
+    max_violation: float = Param(0.03, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
+
+    def setup(self) -> None:
+        self._settings = Settings(
+            voxel=self.voxel,
+            trials=self.trials,
+            min_overlap=self.min_overlap,
+            min_fitness=self.min_fitness,
+            max_violation=self.max_violation,
+        )
+        self._target: tuple[PointCloud, Prepared] | None = None
+        self._counts: Counter[str] = Counter()
+
+    def process(self, cloud: PointCloud, target: PointCloud) -> dict[str, Message]:
+        found = register(self._prepared(cloud), self._prepared_target(target), self._settings, self.rng)
+        self._counts["failed" if found.reason else "registered"] += 1
+        messages: dict[str, Message] = {"status": _status(cloud.stamp, found)}
+        if not found.reason:
+            messages["pose"] = Pose.from_matrix(
+                found.T,
+                stamp=cloud.stamp,
+                frame=target.frame,
+                child_frame=self.child_frame or cloud.frame,
+                covariance=about_fixed_axes(found.covariance, found.T),
+            )
+            aligned = cloud.replace(
+                frame=target.frame, points=transform_points(found.T, cloud.points).astype(np.float32)
+            )
+            if cloud.normals is not None:
+                aligned = aligned.replace(normals=(cloud.normals @ found.T[:3, :3].T).astype(np.float32))
+            messages["aligned"] = aligned
+        return messages
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return dict(self._counts)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._counts = Counter({key: int(count) for key, count in state.items()})
+
+    def summary(self) -> Mapping[str, int]:
+        return {"registered": self._counts["registered"], "failed": self._counts["failed"]}
+
+    def _prepared(self, cloud: PointCloud) -> Prepared:
+        return Prepared.of_cloud(cloud.points[finite(cloud.points)], self.voxel)
+
+    def _prepared_target(self, target: PointCloud) -> Prepared:
+        """Returns the target prepared, once for each."""
+        if self._target is None or self._target[0] is not target:
+            self._target = target, self._prepared(target)
+        return self._target[1]
+
+
+def _status(stamp: int, found: Registered) -> Diagnostics:
+    shares = {"overlap": found.overlap, "fitness": found.fitness, "violation": found.violation, "rmse m": found.rmse}
+    return Diagnostics(
+        stamp=stamp,
+        names=("cloud_registration",),
+        messages=(f"failed: {found.reason}" if found.reason else "registered",),
+        levels=np.array([Level.WARN if found.reason else Level.OK], np.uint8),
+        keys=tuple(shares),
+        values=tuple(f"{value:.4f}" for value in shares.values()),
+        owners=np.zeros(len(shares), np.int32),
+    )

@@ -1,0 +1,261 @@
+"""The rigid motion between two clouds of one scene, from features and then from surfaces, and whether to believe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import small_gicp
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from dataflow.messages.geometry import transform_points
+from operators.cloud.filtering import Voxels
+from operators.cloud.fpfh import histograms
+from operators.cloud.normals import estimate_normals
+from operators.geometry import se3
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+
+FEWEST = 100  # voxels with a normal that a cloud must have
+_TRIED = 12  # motions that are refined
+_RIVAL = 0.03  # a second motion whose score is that near to the best one's makes the result ambiguous
+_CORRELATED = 30.0  # voxels whose errors are alike, for the covariance
+_TELLING = 0.02  # share of the surfaces that must face along every direction
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Lengths in metres; the others are shares."""
+
+    voxel: float
+    trials: int
+    min_overlap: float
+    min_fitness: float
+    max_violation: float
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A cloud as needed here: voxels (V, 3) with normals, and their features (V, 33)."""
+
+    points: Array
+    normals: Array
+    features: Array
+
+    @classmethod
+    def of_cloud(cls, cloud: NDArray[np.float32], voxel: float) -> Prepared:
+        points = Voxels.by_size(cloud, voxel).means(cloud) if len(cloud) else np.zeros((0, 3))
+        normals = estimate_normals(points, neighbours=24, radius=4 * voxel, viewpoint=np.zeros(3))
+        known = np.isfinite(normals).all(axis=1)
+        points, normals = points[known], normals[known]
+        features = histograms(points, normals, 8 * voxel, 80) if len(points) > 1 else np.zeros((len(points), 33))
+        return cls(points, normals, features)
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """`T` (4, 4) maps the source to the target; `reason` is empty where it is to be believed.
+
+    All but `rmse` (metres) is the worse of both directions: `overlap` is the share of a cloud that the other sensor
+    should have seen, `fitness` the share of that which lies on the other cloud, `violation` the share of it that hangs
+    in what the other sensor saw to be free. `covariance` (6, 6) is of a right perturbation (translation, rotation).
+    """
+
+    T: Array
+    overlap: float
+    fitness: float
+    rmse: float
+    violation: float
+    covariance: Array
+    reason: str
+
+    @property
+    def score(self) -> float:
+        """What motions are compared by."""
+        return self.fitness - self.violation
+
+
+def register(source: Prepared, target: Prepared, settings: Settings, rng: np.random.Generator) -> Registered:
+    """Returns the motion from source to target, without a guess: FPFH matches, RANSAC, then generalised ICP.
+
+    Segal, Haehnel and Thrun, "Generalized-ICP", 2009, by small_gicp with one thread. Several motions are refined, and
+    where two of them explain the clouds as well, neither is believed.
+    """
+    if min(len(source.points), len(target.points)) < FEWEST:
+        return failure(f"fewer than {FEWEST} voxels with a normal")
+    pairs = _matches(source.features, target.features)
+    starts = _starts(source.points[pairs[:, 0]], target.points[pairs[:, 1]], settings, rng)
+    if not starts:
+        return failure("no motion agrees with the features")
+    tree = cKDTree(target.points)
+    starts.sort(key=lambda T: -_agreement(source, target, tree, T, 3 * settings.voxel))
+    distinct: list[Array] = []
+    for T in starts:
+        if all(_apart(T, other, settings.voxel) for other in distinct):
+            distinct.append(T)
+    tried = [refine(source, target, T, settings) for T in distinct[:_TRIED]]
+    tried.sort(key=lambda found: -found.score)
+    best = tried[0]
+    for other in tried[1:]:
+        near = other.score > best.score - _RIVAL and other.overlap > 0.7 * best.overlap
+        if not best.reason and near and _apart(best.T, other.T, settings.voxel):
+            return replace(best, reason="ambiguous: another motion explains the clouds as well")
+    return best
+
+
+def refine(source: Prepared, target: Prepared, guess: Array, settings: Settings) -> Registered:
+    """Returns the motion near a guess by generalised ICP, with what speaks for it."""
+    T = guess
+    for reach in (6 * settings.voxel, 3 * settings.voxel):
+        found = small_gicp.align(
+            target.points, source.points, init_T_target_source=T, registration_type="GICP",
+            downsampling_resolution=settings.voxel / 2, max_correspondence_distance=reach, num_threads=1,
+            max_iterations=40,
+        )  # fmt: skip
+        T = np.asarray(found.T_target_source)
+    back = np.linalg.inv(T)
+    one = _explained(transform_points(T, source.points), target.points, settings.voxel)
+    two = _explained(transform_points(back, target.points), source.points, settings.voxel)
+    overlap, fitness = min(one[0], two[0]), min(one[1], two[1])
+    violation, rmse = max(one[2], two[2]), max(one[3], two[3])
+    reason = ""
+    if overlap < settings.min_overlap:
+        reason = f"the clouds share {overlap:.0%}"
+    elif fitness < settings.min_fitness:
+        reason = f"{fitness:.0%} of what both saw agree"
+    elif violation > settings.max_violation:
+        reason = f"{violation:.0%} lie where the other sensor saw nothing"
+    elif not _told(source, target, T, settings.voxel):
+        reason = "degenerate: the shared surfaces leave a direction free"
+    rotation_last = [3, 4, 5, 0, 1, 2]  # small_gicp has rotation first
+    information = found.H[np.ix_(rotation_last, rotation_last)] + 1e-9 * np.eye(6)
+    covariance = np.linalg.inv(information) * _CORRELATED
+    return Registered(T, overlap, fitness, rmse, violation, covariance, reason)
+
+
+def failure(reason: str) -> Registered:
+    """Returns that there is no motion."""
+    return Registered(np.eye(4), 0.0, 0.0, float("nan"), 0.0, np.full((6, 6), np.nan), reason)
+
+
+def _explained(moved: Array, seen: Array, voxel: float) -> tuple[float, float, float, float]:
+    """Returns overlap, fitness, violation and RMSE of points in the frame of another cloud."""
+    distance, _ = cKDTree(seen).query(moved, distance_upper_bound=4 * voxel)
+    on = distance <= 1.5 * voxel
+    visible = _visible(moved, seen) | on
+    fitness = float((on & visible).sum() / max(1, visible.sum()))
+    rmse = float(np.sqrt(np.square(distance[on]).mean())) if on.any() else float("nan")
+    return float(visible.mean()), fitness, _violation(moved, seen), rmse
+
+
+def _told(source: Prepared, target: Prepared, T: Array, voxel: float) -> bool:
+    """Returns whether the surfaces that both clouds show face along every direction, and about every axis."""
+    moved = transform_points(T, source.points)
+    distance, index = cKDTree(target.points).query(moved, distance_upper_bound=1.5 * voxel)
+    near = np.isfinite(distance)
+    points, normals = moved[near], target.normals[index[near]]
+    centred = points - points.mean(axis=0)
+    arms = np.cross(centred, normals) / max(float(np.sqrt(np.square(centred).sum(axis=1).mean())), 1e-9)
+    for lean in (normals, arms):
+        _, axes = np.linalg.eigh(lean.T @ lean)
+        along = np.abs(lean @ axes)
+        if (np.where(along > 0.3, along**2, 0).mean(axis=0) < _TELLING).any():
+            return False
+    return True
+
+
+def _apart(A: Array, B: Array, voxel: float) -> bool:
+    off = se3.log(np.linalg.inv(A) @ B)
+    return bool(np.linalg.norm(off[:3]) > 4 * voxel or np.linalg.norm(off[3:]) > 0.1)
+
+
+_CELL = 0.03  # radians, of the panorama in which sight lines are compared
+
+
+def _panorama(points: Array) -> tuple[Indices, Array]:
+    """Returns the cell of each point's direction and its distance from the origin."""
+    distance = np.linalg.norm(points, axis=1)
+    azimuth = np.arctan2(points[:, 1], points[:, 0])
+    elevation = np.arcsin(np.clip(points[:, 2] / np.maximum(distance, 1e-9), -1, 1))
+    cell = np.floor((azimuth + np.pi) / _CELL).astype(np.int64) * 256 + np.floor((elevation + 2) / _CELL).astype(
+        np.int64
+    )
+    return cell.astype(np.intp), distance
+
+
+def _sight(points: Array) -> Array:
+    """Returns how far the sensor at the origin saw at least, per cell of the panorama; 0 where it saw nothing."""
+    cell, distance = _panorama(points)
+    nearest = np.full(256 * 256, np.inf)
+    np.minimum.at(nearest, cell, distance)
+    return np.where(np.isfinite(nearest), nearest, 0.0)
+
+
+def _visible(moved: Array, seen: Array) -> NDArray[np.bool_]:
+    cell, distance = _panorama(moved)
+    sight = _sight(seen)[cell]
+    return np.asarray((sight > 0) & (distance <= sight + 0.3))
+
+
+def _violation(moved: Array, seen: Array) -> float:
+    """Returns the share of points that hang in front of what the sensor at the origin saw in their direction."""
+    cell, distance = _panorama(moved)
+    sight = _sight(seen)[cell]
+    known = sight > 0
+    if known.sum() < 50:
+        return 1.0
+    return float((known & (distance < 0.92 * sight - 0.1)).sum() / known.sum())
+
+
+def _matches(source: Array, target: Array) -> Indices:
+    """Returns pairs (M, 2) of features that are each other's nearest."""
+    forward = cKDTree(target).query(source)[1]
+    backward = cKDTree(source).query(target)[1]
+    own = np.arange(len(source))
+    mutual = backward[forward] == own
+    return np.column_stack([own[mutual], forward[mutual]])
+
+
+def _starts(source: Array, target: Array, settings: Settings, rng: np.random.Generator) -> list[Array]:
+    """Returns motions with most matches in agreement, best first: RANSAC on triples whose sides are equally long."""
+    if len(source) < 4:
+        return []
+    triples = rng.integers(0, len(source), (settings.trials, 3))
+    fits = np.ones(settings.trials, np.bool_)
+    for a, b in ((0, 1), (1, 2), (2, 0)):
+        one = np.linalg.norm(source[triples[:, a]] - source[triples[:, b]], axis=1)
+        two = np.linalg.norm(target[triples[:, a]] - target[triples[:, b]], axis=1)
+        fits &= (np.abs(one - two) <= 2 * settings.voxel) & (one > 6 * settings.voxel)
+    triples = triples[fits][:2000]
+    motions = _rigid(source[triples], target[triples])
+    votes = np.zeros(len(motions), np.int64)
+    for k, T in enumerate(motions):
+        votes[k] = (np.linalg.norm(transform_points(T, source) - target, axis=1) <= 2.5 * settings.voxel).sum()
+    order = np.argsort(-votes, kind="stable")[:60]
+    return [motions[k] for k in order if votes[k] >= 4]
+
+
+def _rigid(source: Array, target: Array) -> Array:
+    """Returns the motions (K, 4, 4) of triples (K, 3, 3). Umeyama, 1991."""
+    a, b = source.mean(axis=1, keepdims=True), target.mean(axis=1, keepdims=True)
+    u, _, vt = np.linalg.svd(np.einsum("kni,knj->kij", target - b, source - a))
+    flip = np.ones((len(source), 3))
+    flip[:, 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
+    R = (u * flip[:, None, :]) @ vt
+    T = np.tile(np.eye(4), (len(source), 1, 1))
+    T[:, :3, :3] = R
+    T[:, :3, 3] = b[:, 0] - np.einsum("kij,kj->ki", R, a[:, 0])
+    return T
+
+
+def _agreement(source: Prepared, target: Prepared, tree: cKDTree, T: Array, reach: float) -> float:
+    """Returns the share of the source that lies on the target with the same normal, less what hangs in free space."""
+    moved = transform_points(T, source.points)
+    distance, index = tree.query(moved, distance_upper_bound=reach)
+    near = np.isfinite(distance)
+    normals = source.normals @ T[:3, :3].T
+    same = np.einsum("ij,ij->i", normals[near], target.normals[index[near]]) > 0.7
+    return float(same.sum() / len(moved)) - _violation(moved, target.points)

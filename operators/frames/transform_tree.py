@@ -1,0 +1,146 @@
+"""Poses looked up in a tree of frames, as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from typing import Any
+
+from dataflow.messages import Diagnostics, Message, Odometry, Pose, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.operator import Context, Duration, In, Operator, Out, Param, Sampled
+from operators.geometry.frame_tree import FrameTree, TransformError, told_by
+from operators.status import counted_status
+
+LAG = "1s"
+_MAY_STILL_COME = ("unknown frame", "not connected", "too late")
+
+
+class TransformTree(Operator, merge=True):
+    """Joins fixed and moving transforms into one tree, and tells where one frame is in another at the stamps asked for.
+
+    A pose is asked for at the stamp of every message of `at`, and answered as soon as all transforms on the way are
+    known at that stamp or after it: between two stamps they are interpolated on SE(3), at a constant twist. One answer
+    is given at a time, oldest first, stamped as the question. A question that cannot be answered in time is dropped;
+    one before a transform's first stamp or in a gap, at once. A transform that contradicts the tree (a loop, a second
+    parent, a repeated stamp) is left out. Status names and counts each.
+
+    Method: Foote, "tf: the transform library", 2013; REP 105 for the tree's shape.
+    """
+
+    moving: In[Transforms | Pose | Odometry] = In(many=True, doc="transforms, poses, odometry: frames that move")
+    at: In[Message] = In(doc="messages at whose stamps a pose is asked for, as a LiDAR's clouds")
+    fixed: Sampled[Transforms] = Sampled(many=True, required=False, doc="frames that do not move: extrinsics")
+    pose: Out[Pose] = Out(lag=LAG, doc="`child` in `frame` at the stamps asked for")
+    status: Out[Diagnostics] = Out(doc="whenever a question is dropped or a transform left out: which, why, counts")
+
+    frame: str = Param(min_length=1, doc="frame in which the pose is given")
+    child: str = Param(min_length=1, doc="frame whose pose is given")
+    patience: Duration = Param("500ms", ge=0, le=1_000_000_000, doc="how long a question waits for transforms to come")
+    gap: Duration = Param("1s", gt=0, doc="transforms farther apart in time are not interpolated between")
+    extrapolation: Duration = Param("0s", ge=0, doc="how far beyond its newest stamp a transform goes on as it moved")
+
+    def setup(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._begin()
+
+    def process(
+        self,
+        moving: Mapping[str, Message],
+        at: Message | None,
+        context: Context,
+        fixed: Mapping[str, Transforms] | None = None,
+    ) -> dict[str, Any]:
+        """Raises TransformError where fixed transforms contradict each other or the tree."""
+        self._now = context.stamp
+        self._take_fixed(fixed or {})
+        notes = self._take_moving(moving or {})
+        if at is not None:
+            self._asked.append(at.stamp)
+            self._counts["asked"] += 1
+        return self._settle(notes)
+
+    def finish(self) -> dict[str, Any]:
+        """Answers one question more where it can; what remains is counted."""
+        messages = self._settle([])
+        self._counts["unanswered at the end"] += len(self._asked)
+        self._asked.clear()
+        return messages
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: nothing before it can be interpolated with."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "tree": self._tree.snapshot(),
+            "asked": list(self._asked),
+            "now": self._now,
+            "counts": dict(self._counts),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._tree.restore(state["tree"])
+        self._now = int(state["now"])
+        self._asked.extend(int(stamp) for stamp in state["asked"])
+        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return {name: count for name, count in self._counts.items() if count}
+
+    def _begin(self) -> None:
+        self._now = 0
+        self._tree = FrameTree(gap=self.gap, reach=self.extrapolation)
+        self._fixed: dict[str, Transforms] = {}
+        self._asked: deque[int] = deque()
+
+    def _take_fixed(self, fixed: Mapping[str, Transforms]) -> None:
+        for stream, transforms in fixed.items():
+            if self._fixed.get(stream) is not transforms:
+                for told in told_by(transforms):
+                    self._tree.fix(*told)
+                self._fixed[stream] = transforms
+
+    def _take_moving(self, moving: Mapping[str, Message]) -> list[str]:
+        notes: list[str] = []
+        for message in moving.values():
+            assert isinstance(message, Transforms | Pose | Odometry)
+            for told in told_by(message):
+                try:
+                    self._tree.add(message.stamp, *told)
+                except TransformError as error:
+                    self._drop(f"left out: {error.reason}", str(error), notes)
+        return notes
+
+    def _settle(self, notes: list[str]) -> dict[str, Any]:
+        """Answers the oldest question that can be answered, and drops those that cannot or have waited too long."""
+        messages: dict[str, Any] = {}
+        while self._asked:
+            stamp = self._asked[0]
+            try:
+                T = self._tree.lookup(self.frame, self.child, stamp)
+            except TransformError as error:
+                if error.reason in _MAY_STILL_COME and self._now - stamp < self.patience:
+                    break
+                self._drop(f"dropped: {error.reason}", str(error), notes)
+                self._asked.popleft()
+                continue
+            self._asked.popleft()
+            if self._now - stamp > self.spec.outputs["pose"].lag:
+                self._drop("dropped: answered too late", f"the answer for {stamp} came more than {LAG} later", notes)
+                continue
+            self._counts["answered"] += 1
+            messages["pose"] = Pose.from_matrix(T, stamp=stamp, frame=self.frame, child_frame=self.child)
+            break
+        if notes:
+            messages["status"] = self._status(notes)
+        return messages
+
+    def _drop(self, count: str, text: str, notes: list[str]) -> None:
+        self._counts[count] += 1
+        notes.append(text)
+
+    def _status(self, notes: list[str]) -> Diagnostics:
+        more = f" (and {len(notes) - 1} more)" if len(notes) > 1 else ""
+        return counted_status("transform_tree", self._now, notes[0] + more, Level.WARN, self._counts)

@@ -1,0 +1,112 @@
+"""CloudRegistration on scans of a made room, moved by known motions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataflow.messages import Diagnostics, Message, PointCloud, Pose
+from dataflow.messages.geometry import invert, transform_points
+from dataflow.testing import play
+from operators.cloud import CloudRegistration
+from operators.geometry import se3
+
+BOXES = np.array(  # centre and half extents of what stands in a room of 6 x 4 x 2.4 m
+    [[2.2, 1.2, 0.5, 0.5, 0.3, 0.5], [-2.3, -1.0, 0.9, 0.3, 0.6, 0.9], [0.4, -1.6, 0.35, 0.8, 0.25, 0.35],
+     [-1.2, 1.5, 1.0, 0.25, 0.3, 1.0], [2.7, -1.2, 0.2, 0.2, 0.5, 0.2]]
+)  # fmt: skip
+ROOM = np.array([3.0, 2.0, 1.2])
+
+
+def scan(T: np.ndarray, seed: int, boxes: np.ndarray = BOXES, room: np.ndarray = ROOM) -> np.ndarray:
+    """What a LiDAR at T (4, 4) in the room sees, (N, 3) in its own frame, with 1 cm of noise."""
+    azimuth, elevation = np.meshgrid(
+        np.linspace(-np.pi, np.pi, 240, endpoint=False) + 0.005, np.linspace(-0.5, 0.5, 32)
+    )
+    own = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1)
+    own = own.reshape(-1, 3)
+    d = own @ T[:3, :3].T
+    p = T[:3, 3] - [0, 0, room[2]]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = ((np.sign(d) * room - p) / d).min(axis=1)
+        for box in boxes:
+            one, two = ((box[:3] + s * box[3:] - T[:3, 3]) / d for s in (-1, 1))
+            near, far = np.minimum(one, two).max(axis=1), np.maximum(one, two).min(axis=1)
+            reach = np.where((near < far) & (near > 0) & (near < reach), near, reach)
+    reach += np.random.default_rng(seed).normal(0, 0.01, len(reach))
+    return own * reach[:, None]
+
+
+def at(x: float, y: float, yaw: float) -> np.ndarray:
+    T = se3.exp(np.array([0, 0, 0, 0, 0, yaw]))
+    T[:3, 3] = x, y, 0.9
+    return T
+
+
+def cloud(points: np.ndarray, stamp: int = 1, frame: str = "lidar") -> PointCloud:
+    return PointCloud(stamp=stamp, frame=frame, points=points.astype(np.float32))
+
+
+def registered(source: np.ndarray, target: np.ndarray, **params: object) -> dict[str, list[Message]]:
+    streams = {"cloud": [cloud(source)], "target": [cloud(target, frame="map")]}
+    return play(CloudRegistration(**{"trials": 20_000} | params), streams).outputs  # type: ignore[arg-type]
+
+
+def reason(outputs: dict[str, list[Message]]) -> str:
+    (status,) = outputs["status"]
+    assert isinstance(status, Diagnostics)
+    return status.messages[0]
+
+
+@pytest.mark.parametrize("there", [(0.8, 0.4, 2.0), (-1.0, -0.3, -1.0)])
+def test_two_scans_of_a_room_are_registered_without_a_guess(there: tuple[float, float, float]) -> None:
+    A, B = at(0.2, 0.1, 0.0), at(*there)
+    source = scan(B, 2)
+    outputs = registered(source, scan(A, 1))
+    assert reason(outputs) == "registered"
+    (pose,), (aligned,) = outputs["pose"], outputs["aligned"]
+    assert isinstance(pose, Pose)
+    assert isinstance(aligned, PointCloud)
+    truth = invert(A) @ B
+    off = se3.log(invert(truth) @ pose.matrix())
+    assert np.linalg.norm(off[:3]) < 0.02
+    assert np.linalg.norm(off[3:]) < 0.01
+    assert (pose.frame, pose.child_frame, aligned.frame) == ("map", "lidar", "map")
+    np.testing.assert_allclose(aligned.points, transform_points(pose.matrix(), source), atol=1e-5)
+    assert pose.covariance is not None
+    assert np.linalg.eigvalsh(pose.covariance).min() > 0
+    assert off[:3] @ np.linalg.solve(pose.covariance[:3, :3], off[:3]) < 30
+
+
+def test_scans_of_different_rooms_fail() -> None:
+    other = np.array([[1.0, -1.4, 0.4, 0.3, 0.3, 0.4], [-1.5, 0.5, 0.6, 0.4, 0.2, 0.6]])
+    outputs = registered(scan(at(0, 0, 1.0), 2, other, np.array([2.0, 2.6, 1.2])), scan(at(0.2, 0.1, 0), 1))
+    assert reason(outputs).startswith("failed: ")
+    assert outputs["pose"] == []
+    assert outputs["aligned"] == []
+
+
+def test_an_empty_symmetric_room_is_not_believed() -> None:
+    nothing = np.zeros((0, 6))
+    square = np.array([2.0, 2.0, 1.2])
+    outputs = registered(scan(at(0.4, 0, 1.0), 2, nothing, square), scan(at(0, 0, 0), 1, nothing, square))
+    assert reason(outputs).startswith("failed: ")
+
+
+def test_a_bare_passage_is_not_believed() -> None:
+    nothing = np.zeros((0, 6))
+    passage = np.array([200.0, 1.0, 1.2])
+    near = [s[np.linalg.norm(s, axis=1) < 8] for s in (scan(at(x, 0, 0), 1, nothing, passage) for x in (0.0, 1.0))]
+    assert reason(registered(near[1], near[0])).startswith("failed: ")
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((500, 3), np.nan), np.ones((50, 3))])
+def test_a_cloud_that_tells_nothing_fails(points: np.ndarray) -> None:
+    outputs = registered(points, scan(at(0, 0, 0), 1))
+    assert reason(outputs) == "failed: fewer than 100 voxels with a normal"
+
+
+def test_runs_repeat() -> None:
+    source, target = scan(at(0.8, 0.4, 2.0), 2), scan(at(0.2, 0.1, 0.0), 1)
+    one, two = (registered(source, target, trials=5000) for _ in range(2))
+    assert [m.digest() for m in one["status"] + one["pose"]] == [m.digest() for m in two["status"] + two["pose"]]
