@@ -20,7 +20,7 @@ _ITERATIONS, _CONVERGED = 20, 1e-9
 
 
 class Unknown(Exception):
-    """Reports that what is asked for does not follow from what is given, and why."""
+    """Nothing follows from what is given: says why."""
 
 
 @dataclass(frozen=True, eq=False)

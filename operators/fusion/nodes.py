@@ -1,4 +1,4 @@
-"""Keeps the filter's samples and measurements, and the estimate after each."""
+"""Input of the late filter and its record: samples, measurements, and the estimate after each."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ class PoseFusion(Operator):
         return {"two sensors contradicted each other": self._agreement.split} | figures
 
     def _of(self, name: str, message: Message, extrinsics: Transforms | None) -> RigidPose | None:
-        """What a message says about the body; None where that is nothing, which is counted."""
+        """The pose in a message; None where there is none, which is counted."""
         if isinstance(message, Imu):
             if message.orientation is None or message.orientation_covariance is None:
                 raise ValueError(f"{name}: its samples have no orientation with covariance")

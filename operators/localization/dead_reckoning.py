@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 _STILL = 1e-4
 _LEARNING = 0.02
 _MEMORY = 0.95
-"""What is left of a difference between wheels and gyroscope after another step."""
+"""Share of a difference between wheels and gyroscope that is left after another step."""
 
 
 class DeadReckoning:

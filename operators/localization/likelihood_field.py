@@ -1,4 +1,4 @@
-"""The likelihood field of an occupancy grid, which scores how well points fit it, and its free places."""
+"""The likelihood field of an occupancy grid, by which points are scored, and its free places."""
 
 from __future__ import annotations
 

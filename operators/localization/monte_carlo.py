@@ -56,7 +56,7 @@ class CloudConfig:
 
 @dataclass(frozen=True)
 class Fit:
-    """The fit of a sensor's observations, [0, 1]: lately (`fast`) and usually (`slow`)."""
+    """Fit of the observations of a sensor, [0, 1]: lately (`fast`) and usually (`slow`)."""
 
     fast: float
     slow: float

@@ -1,4 +1,4 @@
-"""The say of each sensor: less, the less its innovations are explained by its noise."""
+"""Weights of sensors: each counts less, the larger its innovations are than usual."""
 
 from __future__ import annotations
 
