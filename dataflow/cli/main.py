@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from dataflow.cli import inspection, latency, live, param, recordings, replay, run, top, verification, viewing
+from dataflow.cli import convert, inspection, latency, live, param, recordings, replay, run, top, verification, viewing
 from dataflow.cli.arguments import FLAG
 from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
@@ -77,6 +77,7 @@ def dataflow(
 
 
 _MAKE, _LOOK, _FOLLOW = "Run, replay, verify", "Look at graphs, operators and recordings", "Follow a running graph"
+_MATERIAL = "Work with recordings and bags"
 
 
 def _paragraphs(text: str) -> str:
@@ -100,6 +101,7 @@ _add(inspection.show, _LOOK)
 _add(inspection.operators, _LOOK)
 _add(recordings.info, _LOOK)
 _add(recordings.diff, _LOOK)
+_add(convert.convert, _MATERIAL)
 _add(latency.latency, _LOOK)
 _add(viewing.view, _LOOK)
 _add(live.list_running, _FOLLOW, "list")
