@@ -22,10 +22,10 @@ import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert, transform_points  # noqa: E402
-from operators.depth.stereo_depth import grey  # noqa: E402
 from operators.depth.stereo_matching import MatchingConfig, StereoMatcher  # noqa: E402
 from operators.geometry.pinhole import project, unproject  # noqa: E402
 from operators.geometry.stereo import rectified_pair  # noqa: E402
+from operators.image.preparation import grey_of  # noqa: E402
 from operators.sources import KittiOdometry, SimulatedRobot  # noqa: E402
 
 Disparity = NDArray[np.float32]
@@ -123,7 +123,7 @@ def kitti(folder: Path) -> None:
     steps: list[Any] = list(source.stream())[::4]
     print("\n| method | measured | agree within 1 px | median difference px |\n| --- | ---: | ---: | ---: |")
     for name, match in METHODS.items():
-        found = [match(grey(step["left"].data), grey(step["right"].data)) for step in steps]
+        found = [match(grey_of(step["left"].data), grey_of(step["right"].data)) for step in steps]
         rows = []
         for a, b, before, after in zip(found, found[1:], steps, steps[1:], strict=False):
             T = invert(after["ground_truth"].matrix()) @ before["ground_truth"].matrix()

@@ -8,6 +8,11 @@ def firings_key(namespace: str, operator: str) -> str:
     return f"{namespace}/@/firings/{operator}"
 
 
+def logs_key(namespace: str) -> str:
+    """Names the stream as which a viewer shows the log."""
+    return f"{namespace}/@/logs"
+
+
 def diagnostics_key(namespace: str) -> str:
     """The stream of `Diagnostics` about the run itself, in its recording."""
     return f"{namespace}/@/diagnostics"

@@ -15,6 +15,7 @@ An operator is a plain object: constructing it and calling `process()` needs no 
 from __future__ import annotations
 
 import hashlib
+import logging
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -124,6 +125,12 @@ class Operator:
             self.__generator = np.random.Generator(np.random.PCG64(int(self.__seed)))
         return self.__generator
 
+    @property
+    def log(self) -> logging.Logger:
+        """The logger of its class. In a run, lines from level info on are shown, recorded and kept with the operator's
+        name and the event time of the call; `dataflow logs` shows them. What is printed is, too."""
+        return logging.getLogger(f"{type(self).__module__}.{type(self).__qualname__}")
+
     def seed_rng(self, seed: SupportsInt) -> None:
         """Gives `rng` a new seed; the runtime does so before every call."""
         self.__generator, self.__seed = None, seed
@@ -211,6 +218,9 @@ class Source(Operator, abstract=True):
     def stream(self) -> Iterator[Mapping[str, Message]]:
         """Yields what is emitted at one stamp: a mapping from port to message. Stamps strictly increase."""
         raise TypeError(f"{type(self).__name__} is a source without stream()")
+
+    def stop_reading(self) -> None:
+        """Called on another thread when a live run ends: makes a `stream()` that waits for its device return."""
 
     def length(self) -> int | None:
         """Tells how many times `stream()` will yield, if known: for progress bars."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -13,9 +13,34 @@ class ModelError(ValueError):
     """A model file that does not fit its use: names the file, what it has and what would be right."""
 
 
-def open_session(file: Path) -> onnxruntime.InferenceSession:
-    """Opens an ONNX model for one CPU thread. Raises FileNotFoundError, or ModelError for a file that is no model."""
+Provider = Literal["cpu", "cuda", "tensorrt", "openvino", "rocm", "qnn", "coreml"]
+_PROVIDERS: dict[Provider, str] = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "rocm": "ROCMExecutionProvider",
+    "qnn": "QNNExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+}
+"""onnxruntime's names. All but the first come with builds of it for those devices."""
+
+
+def open_session(file: Path, provider: Provider = "cpu") -> onnxruntime.InferenceSession:
+    """Opens an ONNX model, for one thread on the CPU.
+
+    Raises FileNotFoundError, or ModelError for a file that is no model or a provider that is not there: what is asked
+    for is not silently done by the CPU.
+    """
     import onnxruntime  # heavy, and needed only where a network runs
+
+    available = onnxruntime.get_available_providers()
+    if _PROVIDERS[provider] not in available:
+        names = [name for name, full in _PROVIDERS.items() if full in available]
+        raise ModelError(
+            f"this onnxruntime has no provider {provider!r}; it has {', '.join(names)} (other builds: onnxruntime-gpu, "
+            f"onnxruntime-openvino, onnxruntime-qnn)"
+        )
 
     if not file.is_file():
         raise FileNotFoundError(f"no ONNX model {str(file)!r} (looked for {file.absolute()})")
@@ -26,6 +51,11 @@ def open_session(file: Path) -> onnxruntime.InferenceSession:
     options.use_deterministic_compute = True
     options.log_severity_level = 3
     try:
-        return onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+        return onnxruntime.InferenceSession(str(file), options, providers=_chosen(provider))
     except Exception as error:  # onnxruntime's exception classes share no public base
         raise ModelError(f"{file} cannot be loaded as an ONNX model: {error}") from error
+
+
+def _chosen(provider: Provider) -> list[str]:
+    """The provider, and the CPU for the layers that it does not know."""
+    return list(dict.fromkeys((_PROVIDERS[provider], _PROVIDERS["cpu"])))

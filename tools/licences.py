@@ -15,7 +15,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PARTS = ("", "notebook", "sim", "train")
+PARTS = ("", "notebook", "sim", "torch", "train")
 """The dependencies that users install: those of the package itself, and its extras but `dev`."""
 COPYLEFT = re.compile(r"\bA?GPL|(?<!Lesser )(?<!Library )General Public License", re.IGNORECASE)
 
@@ -113,9 +113,14 @@ def closure(requirements: Iterable[str]) -> dict[str, Distribution | None]:
 
 
 def declared(extra: str = "") -> list[str]:
-    """The requirements of pyproject.toml: the package's own, or an extra's."""
+    """The requirements of pyproject.toml: the package's own, or an extra's, with those of the extras that it names."""
     project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    return list(project["optional-dependencies"][extra] if extra else project["dependencies"])
+    found: list[str] = []
+    for text in project["optional-dependencies"][extra] if extra else project["dependencies"]:
+        requirement = Requirement(text)
+        own = canonical(requirement.name) == canonical(project["name"])
+        found += [line for other in sorted(requirement.extras) for line in declared(other)] if own else [text]
+    return found
 
 
 def packages() -> dict[str, tuple[str, str]]:

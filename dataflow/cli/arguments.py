@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from dataflow.cli.completion import shipped_graphs
 from dataflow.cli.output import fail, seconds
 
 if TYPE_CHECKING:
@@ -30,7 +31,14 @@ Settings = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
 ]
-GraphFile = Annotated[Path, typer.Argument(metavar="GRAPH", help="A graph file (.yaml).")]
+GraphFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="GRAPH",
+        autocompletion=shipped_graphs,
+        help="A graph file (.yaml), or a name that `dataflow graphs` lists.",
+    ),
+]
 AnyRecording = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap), or a bag: .bag, .db3, .mcap or a folder.")
 ]
@@ -98,6 +106,15 @@ def existing(path: Path, what: str) -> Path:
         raise fail(f"no file {path}: there is no folder {folder}")
     near = nearest(path.name, sorted(p.name for p in folder.iterdir() if p.is_file()))
     raise fail(f"no file {path}" + (f"; did you mean {folder / near}?" if near else f"; expected {what}"))
+
+
+def graph_file(path: Path) -> Path:
+    """`path` as a graph file: one that is there, or one that comes with dataflow, by its name."""
+    from dataflow.shipped import graph
+
+    if not path.exists() and (found := graph(path.as_posix().removeprefix("graphs/"))) is not None:
+        return found.path
+    return existing(path, "a graph file (dataflow graphs lists those that come with it)")
 
 
 def existing_recording(path: Path) -> Path:

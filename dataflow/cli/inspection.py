@@ -10,7 +10,7 @@ from rich.markup import escape
 from rich.padding import Padding
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, existing, find_modules_in
+from dataflow.cli.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, find_modules_in, graph_file
 from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say, visible
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ def check(
 
     faults: list[Problem] = []
     faulty = 0
-    for file in graphs:
-        existing(file, "a graph file")
+    graphs = [graph_file(file) for file in graphs]
     find_modules_in(path)
     for file in graphs:
         with friendly_errors():
@@ -88,7 +87,7 @@ def show(
         if json and mermaid:
             raise fail("--json and --mermaid exclude each other")
         find_modules_in(path)
-        loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+        loaded = load_graph(graph_file(graph), settings=settings or ())
         if json:
             print_json(loaded.to_json())
         elif mermaid:

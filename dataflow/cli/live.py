@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, Json, chosen_streams
+from dataflow.cli.completion import running_graphs, running_streams
 from dataflow.cli.output import (
     INTERRUPTED,
     count,
@@ -41,12 +42,14 @@ GraphName = Annotated[
     typer.Option(
         "--graph",
         metavar="NAME",
+        autocompletion=running_graphs,
         help="Which running graph, by name or process number, when several run. Environment: DATAFLOW_GRAPH.",
     ),
 ]
 Wait = Annotated[float, typer.Option("--wait", metavar="SECONDS", help="Wait so long for the graph to run.")]
 Streams = Annotated[
-    list[str] | None, typer.Argument(metavar="STREAM...", help="Streams; wildcards work. Default: all.")
+    list[str] | None,
+    typer.Argument(metavar="STREAM...", autocompletion=running_streams, help="Streams; wildcards work. Default: all."),
 ]
 
 GRAPH_VARIABLE = "DATAFLOW_GRAPH"

@@ -21,6 +21,7 @@ from dataflow.cli.arguments import (
     existing,
     existing_recording,
     find_modules_in,
+    graph_file,
     output_file,
     span,
     window,
@@ -152,7 +153,7 @@ def replay(
                 if loaded.network != recorded.network:
                     say_network_ignored(recording)
             else:
-                loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+                loaded = load_graph(graph_file(graph), settings=settings or ())
             if complete is not None:
                 alone = (start, end, rate, record, view, place) == (None,) * 6
                 if not alone or open_view or one_process or process_each or paranoid:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from typing import Annotated
@@ -14,12 +15,14 @@ from dataflow.cli.arguments import (
     Settings,
     existing,
     find_modules_in,
+    graph_file,
 )
 from dataflow.cli.execution import checked_outputs, execute, plan_options
 from dataflow.cli.output import fail, friendly_errors
 from dataflow.cli.run_options import (
     Json,
     Live,
+    LogLevel,
     OneProcess,
     Open,
     Paranoid,
@@ -32,6 +35,8 @@ from dataflow.cli.run_options import (
     Timeout,
     View,
 )
+
+LOG_LEVELS = ("debug", "info", "warning", "error")
 
 
 def run(
@@ -49,6 +54,7 @@ def run(
     chaos_seed: Annotated[
         int | None, typer.Option("--chaos-seed", metavar="N", help="Another seed than the plan's own.")
     ] = None,
+    log_level: LogLevel = None,
     quiet: Quiet = False,
     one_process: OneProcess = False,
     process_each: ProcessEach = False,
@@ -77,14 +83,19 @@ def run(
     began = time.monotonic()
     from dataflow.chaos.plan import load_plan
     from dataflow.graph import load_graph
+    from dataflow.process.speech import LEVEL_VARIABLE
     from dataflow.supervision.run import run as run_graph
 
     with friendly_errors():
         if chaos_seed is not None and chaos is None:
             raise fail("--chaos-seed varies a fault plan: name it with --chaos")
+        if log_level is not None:
+            if log_level not in LOG_LEVELS:
+                raise fail(f"--log-level {log_level}: expected one of {', '.join(LOG_LEVELS)}")
+            os.environ[LEVEL_VARIABLE] = log_level
         find_modules_in(path)
         live = live or chaos is not None
-        loaded = load_graph(existing(graph, "a graph file"), settings=settings or (), live=live)
+        loaded = load_graph(graph_file(graph), settings=settings or (), live=live)
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live

@@ -92,4 +92,13 @@ Live = Annotated[
 Paranoid = Annotated[
     bool, typer.Option("--paranoid", metavar=FLAG, help="Catch operators that write into their inputs.")
 ]
+LogLevel = Annotated[
+    str | None,
+    typer.Option(
+        "--log-level",
+        metavar="LEVEL",
+        help="The least level that operators' loggers hand on: debug, info, warning, error. Default: info. "
+        "Environment: DATAFLOW_LOG_LEVEL.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="No progress display.")]

@@ -16,6 +16,7 @@ from dataflow.cli.arguments import (
     check_offset,
     existing,
     find_modules_in,
+    graph_file,
     output_file,
 )
 from dataflow.cli.output import (
@@ -172,7 +173,7 @@ def verify(
         except BaselineError as error:
             raise fail(str(error)) from None
         find_modules_in(path)
-        loaded = None if graph is None else load_graph(existing(graph, "a graph file"), settings=settings or ())
+        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
         options: dict[str, Any] = {
             "graph": loaded,
             "first": first,

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 READY_WITHIN = 20.0
 """Seconds that a run waits for its viewer's process to be ready before it starts."""
+LOOK_EVERY = 0.25
+"""Seconds between two looks at the log of the graph that is followed."""
 DRAW_WITHIN = 15.0
 """Seconds that a viewer gets to draw the rest when its run has ended."""
 
@@ -201,8 +203,11 @@ def _view_running(
     sink: ViewerSink, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool
 ) -> None:
     from dataflow.client.attach import graph_of, still_runs, tap, types_of
-    from dataflow.messages import Message, MessageError
-    from dataflow.view import Serve
+    from dataflow.messages import Alarm, Message, MessageError
+    from dataflow.names import logs_key
+    from dataflow.recording import LogLine
+    from dataflow.transport.log_file import LogFollower
+    from dataflow.view import Serve, as_alarm
 
     found = running_graph(name, wait)
     running = graph_of(found)
@@ -215,19 +220,31 @@ def _view_running(
             say(f"[yellow]{escape(str(error))}; drawn by its fields[/]")
     types = types_of(running)
     first = {name: running.streams[name].types[0] for name in chosen}
-    with sink:
-        sink.open({name: Message if schema == "Message" else types(schema) for name, schema in first.items()}, shown)
+    drawn: dict[str, type[Message]] = {
+        name: Message if schema == "Message" else types(schema) for name, schema in first.items()
+    }
+    logs = logs_key(running.namespace)
+    if not streams:
+        drawn[logs] = Alarm
+    with sink, closing(LogFollower(found.pid)) as follower:
+        sink.open(drawn, shown)
         _Announcer(sink).announce()
         say(f"following {escape(running.name)} (process {found.pid})")
         with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
+            clock, look_due = 0, 0.0
             while True:
                 taken = client.take(timeout=0.5)
+                if not streams and time.monotonic() >= look_due:
+                    look_due = time.monotonic() + LOOK_EVERY
+                    for value in follower.lines():
+                        sink.log(logs, as_alarm(LogLine.from_json(value), clock))
                 if taken is None:
                     if not still_runs(found):
                         break
                     continue
                 envelope = taken.decode()
                 if envelope.message is not None:
+                    clock = max(clock, envelope.message.stamp)
                     sink.log(taken.stream, envelope.message)
         if isinstance(sink.target, Serve) and not until_end:
             say("the graph has ended; still serving until Ctrl-C")

@@ -11,7 +11,9 @@ from typing import Any
 
 import msgpack
 
-from dataflow.transport import Bus, NetworkConfig
+from dataflow.messages import Message
+from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
+from dataflow.transport.codec import encode
 from dataflow.transport.keys import runtime_key
 from dataflow.transport.publisher import BusError
 from dataflow.transport.registry import RunningGraph
@@ -56,6 +58,14 @@ class Parameter:
     live: bool
 
 
+@dataclass(frozen=True, slots=True)
+class Taker:
+    """A source that takes messages from outside: its port, and the names of the types it takes."""
+
+    port: str
+    types: tuple[str, ...]
+
+
 class Processes:
     """The processes of one running graph. Every call waits for at most `timeout` seconds."""
 
@@ -98,6 +108,23 @@ class Processes:
             f"nobody answered for {operator!r} within {timeout:g} s: it is being started again, hangs, or works on one "
             "firing for longer than that; the change is made when it comes to it"
         )
+
+    def takers(self, timeout: float) -> dict[str, Taker]:
+        """The sources that take messages from outside, by name."""
+        answers = self._bus.ask(runtime_key(self._namespace, "pub", "**"), timeout=timeout)
+        said = [msgpack.unpackb(answer, raw=False) for answer in answers]
+        return {each["operator"]: Taker(each["port"], tuple(each["types"])) for each in said}
+
+    def publish(self, operator: str, message: Message, timeout: float) -> int:
+        """Gives a message to a source that takes them from outside; returns its stamp, the event time of now where the
+        message has the stamp 0. Raises `Refused`, `NoAnswer`."""
+        payload = encode(Envelope(Kind.MESSAGE, operator, 0, 0, message.stamp, message))
+        for answer in self._bus.ask(runtime_key(self._namespace, "pub", operator), payload, timeout=timeout):
+            said = msgpack.unpackb(answer, raw=False)
+            if not said["ok"]:
+                raise Refused(said["error"])
+            return int(said["stamp"])
+        raise NoAnswer(f"{operator!r} did not answer within {timeout:g} s: whether it has the message is not known")
 
     def _until(self, operator: str, request: Mapping[str, Any], timeout: float) -> Iterator[dict[str, Any]]:
         """Answers to a request, which is repeated while nobody is there to take it."""

@@ -35,7 +35,7 @@ class Calls:
     def setup(self) -> dict[str, Message]:
         """`setup()`, then the messages of the static outputs. Raises `OperatorFailure`."""
         try:
-            with AT_WORK:
+            with AT_WORK.call(self.node.name, NEVER):
                 self._seed(firing_seed(self.seed, self.node.name, NEVER))
                 self.operator.setup()
                 limit_threads_again()
@@ -46,7 +46,7 @@ class Calls:
     def static_outputs(self) -> dict[str, Message]:
         """The messages of the static outputs of an operator that is set up. Raises `OperatorFailure`."""
         try:
-            with AT_WORK:
+            with AT_WORK.call(self.node.name, NEVER):
                 self._seed(firing_seed(self.seed, self.node.name, NEVER))
                 return self._static_outputs()
         except RAISED as error:
@@ -55,6 +55,7 @@ class Calls:
     def process(self, firing: Firing) -> dict[str, Message]:
         """Returns what `process()`, or `finish()`, gives for a firing, by port. Raises what the operator raises."""
         AT_WORK.fires = True
+        AT_WORK.operator, AT_WORK.stamp = self.node.name, firing.stamp
         AT_WORK.begun += 1
         try:
             seed = FiringSeed(self._seeded_by, firing.stamp)
@@ -66,7 +67,7 @@ class Calls:
 
     def reset(self, input: str, place: Place) -> None:
         """`on_reset()`. Raises what the operator raises."""
-        with AT_WORK:
+        with AT_WORK.call(self.node.name, place[1]):
             self._seed_change(f"reset {input}", place)
             self.operator.on_reset(input)
 
@@ -75,7 +76,7 @@ class Calls:
 
         Raises `ParameterError` and what the operator raises.
         """
-        with AT_WORK:
+        with AT_WORK.call(self.node.name, place[1]):
             self._seed_change(f"param {name}", place)
             self.operator.set_parameter(name, value)
             return self.operator.params.model_dump(mode="json")[name]
@@ -83,7 +84,7 @@ class Calls:
     def snapshot(self, place: Place) -> bytes | None:
         """The state, packed; None where the operator gives none. Raises `OperatorFailure`."""
         try:
-            with AT_WORK:
+            with AT_WORK.call(self.node.name, place[1]):
                 self._seed_change("snapshot", place)
                 state = self.operator.snapshot()
                 return None if state is None else pack_state(state)
@@ -93,7 +94,7 @@ class Calls:
     def restore(self, state: bytes, place: Place) -> None:
         """Takes over a packed state. Raises `OperatorFailure`."""
         try:
-            with AT_WORK:
+            with AT_WORK.call(self.node.name, place[1]):
                 self._seed_change("restore", place)
                 self.operator.restore(unpack_state(state))
         except RAISED as error:
@@ -101,7 +102,7 @@ class Calls:
 
     def summary(self, place: Place) -> dict[str, float | int | str]:
         """Returns what the operator sums up, as plain values. Raises `OperatorFailure`."""
-        with AT_WORK:
+        with AT_WORK.call(self.node.name, place[1]):
             self._seed_change("summary", place)
             return summary_of(self.operator, self.node.name)
 

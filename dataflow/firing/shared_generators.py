@@ -26,6 +26,13 @@ class AtWork:
         self.begun = self.ended = 0
         self.fires = False
         """Whether an operator of this process fires at all."""
+        self.operator, self.stamp = "", 0
+        """Of the last call that began: the operator, and its event time; 0 or less where it has none."""
+
+    def call(self, operator: str, stamp: int) -> AtWork:
+        """This, to be entered for a call of an operator."""
+        self.operator, self.stamp = operator, stamp
+        return self
 
     def __enter__(self) -> None:
         self.begun += 1

@@ -13,7 +13,7 @@ from dataflow.firing.failure import OperatorFailure, readable
 from dataflow.firing.log import FiringLog
 from dataflow.firing.ports import Emitter, OutputPorts
 from dataflow.firing.seeding import change_seed, seed_generators
-from dataflow.firing.shared_generators import SharedGenerators, Tripwire
+from dataflow.firing.shared_generators import AT_WORK, SharedGenerators, Tripwire
 from dataflow.firing.work import Work
 from dataflow.graph.model import Node
 from dataflow.messages.base import Message
@@ -69,7 +69,7 @@ class SourceRunner:
     def look_ahead(self) -> int | None:
         """The stamp of the next step, or None at the end. Raises `OperatorFailure`."""
         if self._next is None and not self.ended:
-            with self.work:
+            with self.work, AT_WORK.call(self.node.name, self._read):
                 self._next = self.pull()
         return None if self._next is None else step_stamp(self._next)
 

@@ -10,7 +10,7 @@ from dataflow.messages.inertial import Imu, MagneticField
 from dataflow.messages.mapping import Mesh, OccupancyGrid, Planes
 from dataflow.messages.poses import NavSatFix, Odometry, ParticleSet, Path, Pose, Transforms, Twist
 from dataflow.messages.ranging import LaserScan, RadarScan
-from dataflow.messages.scene import Activity, FeatureVector, SceneGraph
+from dataflow.messages.scene import Activity, Classification, FeatureVector, SceneGraph
 from dataflow.messages.segmentation import SegmentationMap
 from dataflow.messages.tracking import LandmarkSightings, Tracks, TrackState
 from dataflow.messages.values import Alarm, Number, Switch, Text
@@ -21,6 +21,7 @@ __all__ = [
     "Alarm",
     "Boxes3D",
     "CameraInfo",
+    "Classification",
     "Clusters",
     "CompressedDepth",
     "CompressedImage",

@@ -90,6 +90,32 @@ class Activity(Message):
         return len(self.subjects)
 
 
+class Classification(Message):
+    """Classes of whole images (N = 1) or of the objects found in them."""
+
+    frame: str = scalar("str", "frame of the sensor; empty where none applies", default="")
+    class_names: tuple[str, ...] = scalar(
+        "strs", "name of each class, indexed by class id; empty where they have no names", default=()
+    )
+    class_ids: I32 = array("int32", "N", "the likeliest class, an index into `class_names`")
+    scores: F32 = array("float32", "N", "its probability, [0, 1]")
+    probabilities: F32 | None = array("float32", "N C", "probability of every class, [0, 1]", default=None)
+    ids: I64 | None = array("int64", "N", "what each row is about, detection or track; None: the image", default=None)
+
+    def validate(self) -> None:
+        table_indices(self, "class_ids", "class_names")
+        within(self, 0.0, 1.0, "scores", "probabilities")
+        if self.probabilities is not None and self.class_names and self.probabilities.shape[1] != len(self.class_names):
+            raise MessageError(
+                f"Classification.probabilities must have one column for each of the {len(self.class_names)} "
+                f"class_names, got shape {self.probabilities.shape}"
+            )
+
+    def labels(self) -> tuple[str, ...]:
+        """The name of each row's class (its number where classes have no names)."""
+        return tuple(self.class_names[c] if self.class_names else str(c) for c in self.class_ids.tolist())
+
+
 class FeatureVector(Message):
     """Embeddings: of a whole image (N = 1), of the objects found in it, of places or of text."""
 

@@ -23,6 +23,7 @@ from dataflow.messages.base import Message
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.pace import Pace
+from dataflow.process.speech import SOURCE_THREAD
 
 MISSED_AFTER = 0.2
 """Seconds after which a step of a restarted source counts as missed."""
@@ -50,7 +51,7 @@ class Reader:
         self._last: int | None = None
         self._owner, self._faults, self._behind = owner, faults, behind
         self._lost = 0
-        self._thread = threading.Thread(target=self._run, name=f"source {runner.node.name}", daemon=True)
+        self._thread = threading.Thread(target=self._run, name=f"{SOURCE_THREAD}{runner.node.name}", daemon=True)
         self._thread.start()
 
     def join(self, timeout: float) -> bool:
@@ -278,14 +279,25 @@ class LiveSources:
 
     def finish(self, reason: str) -> None:
         """Ends the streams of all sources; their threads are to stop."""
-        self.stopping.set()
+        self._stop_reading()
         for runner in self.runners:
             runner.finish(reason)
+
+    def _stop_reading(self) -> None:
+        """Tells all threads to stop, and sources that wait for a device to let go of it; once."""
+        if self.stopping.is_set():
+            return
+        self.stopping.set()
+        for runner in self.runners:
+            try:
+                runner.source.stop_reading()
+            except Exception as error:  # its thread may return all the same, and the run ends anyway
+                print(f"{runner.node.name}: stop_reading(): {type(error).__name__}: {error}", file=sys.stderr)
 
     def await_readers(self) -> tuple[set[str], list[OperatorFailure]]:
         """Waits (bounded) for the threads; returns the sources whose thread did not return, and what went wrong in
         those that did."""
-        self.stopping.set()
+        self._stop_reading()
         deadline = time.monotonic() + RETURN_WITHIN
         late = {name for name, reader in self._readers.items() if not reader.join(deadline - time.monotonic())}
         for name in sorted(late):

@@ -35,6 +35,7 @@ from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, make_log, make_runner, make_source, open_box, statics_of
 from dataflow.process.watchdog import Watchdog
+from dataflow.remote import Remote
 from dataflow.sync import FOREVER, StreamOrderError
 from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
 from dataflow.transport.fanout import POOL_BYTES
@@ -93,7 +94,9 @@ class OperatorProcess:
             ),
         )
         self.progress = Progress(channel, self.runners, self.feeding, self.live)
-        self.requests = Requests(config, self.runners, self.live, self.progress, self.outlet.recent)
+        self.requests = Requests(
+            config, self.runners, self.live, self.progress, self.outlet.recent, self.pace.event_time
+        )
         self._watch: Watchdog | None = None
         self._probing = False
         self._released = False
@@ -163,6 +166,8 @@ class OperatorProcess:
             )
             return
         source = make_source(node, self.graph, config, outlet)
+        if isinstance(source.source, Remote) and not config.live:
+            raise ValueError("messages from outside come by the clock, which only a live run has: run it with --live")
         self.runners.sources.append(source)
         if config.live:
             self.live.add(source)

@@ -11,7 +11,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.names import diagnostics_key
-from dataflow.recording import RecordingWriter
+from dataflow.recording import LogLine, RecordingWriter
 from dataflow.recording.layout import ENDS, OUTCOME
 
 
@@ -34,6 +34,7 @@ class RecorderSink:
         self._diagnosed = 0
         self._clock = 0
         self._early: list[tuple[str, bytes]] = []
+        self._early_logs: list[LogLine] = []
         for stream in streams:
             types = graph.message_types(stream)
             if len(types) == 1 and types[0] is not Message:
@@ -66,6 +67,9 @@ class RecorderSink:
         early, self._early = self._early, []
         for operator, payload in early:
             self.writer.write_firings(operator, max(self._clock, 0), payload)
+        logs, self._early_logs = self._early_logs, []
+        for line in logs:
+            self.writer.write_log(self._clock, line)
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         self._ends[stream] = {"final": final_stamp, "reason": reason}
@@ -80,6 +84,13 @@ class RecorderSink:
             self._added.add(stream)
         self.writer.write(stream, message, seq=self._diagnosed, incarnation=0)
         self._diagnosed += 1
+
+    def log(self, line: LogLine) -> None:
+        """A line that is said before the first message is stored at its stamp, as the first firing records are."""
+        if self._clock > 0 or line.stamp is not None:
+            self.writer.write_log(line.stamp or self._clock, line)
+        else:
+            self._early_logs.append(line)
 
     def flush(self) -> None:
         self.writer.flush()

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import msgpack
 
 from dataflow.firing.source import SourceRunner
+from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
 from dataflow.process.config import ProcessConfig
 from dataflow.process.inbox import Inbox
@@ -15,7 +17,10 @@ from dataflow.process.live_sources import LiveSources
 from dataflow.process.progress import Progress
 from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
+from dataflow.remote import Remote
 from dataflow.transport import Bus
+from dataflow.transport.codec import decode
+from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import runtime_key
 
 
@@ -23,15 +28,25 @@ class Requests:
     """Takes requests on Zenoh's thread; changes parameters on the main thread, between two firings."""
 
     def __init__(
-        self, config: ProcessConfig, runners: Runners, live: LiveSources, progress: Progress, recent: RecentFirings
+        self,
+        config: ProcessConfig,
+        runners: Runners,
+        live: LiveSources,
+        progress: Progress,
+        recent: RecentFirings,
+        event_clock: Callable[[], int],
     ) -> None:
         self._config, self._runners, self._live = config, runners, live
-        self._progress, self._recent = progress, recent
+        self._progress, self._recent, self._event_clock = progress, recent, event_clock
+        self._given: dict[str, int] = {}
+        """The last stamp that each source was given from outside."""
 
     def serve(self, bus: Bus, namespace: str, inbox: Inbox) -> None:
         """Declares what is answered."""
         for name in self._config.nodes:
             bus.serve(runtime_key(namespace, "param", name), _to_inbox(inbox, name))
+            if isinstance(maker := self._runners[name], SourceRunner) and isinstance(maker.source, Remote):
+                bus.serve(runtime_key(namespace, "pub", name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
 
     def answer_parameter(self, name: str, query: Any) -> None:
@@ -47,6 +62,42 @@ class Requests:
             except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
                 answer = {"ok": False, "operator": name, "error": str(error)}
             query.reply(query.key_expr, msgpack.packb(answer))
+
+    def answer_publication(self, maker: SourceRunner, query: Any) -> None:
+        """Takes an envelope from outside for a source that is made for it; on Zenoh's thread.
+
+        A message with the stamp 0 is given the event time of now. A request without payload is answered with the port
+        and the type that the source takes.
+        """
+        with query:
+            source = maker.source
+            assert isinstance(source, Remote)
+            port = source.port
+            answer: dict[str, Any] = {
+                "operator": maker.node.name, "port": port.name, "types": [type_.SCHEMA for type_ in port.types],
+            }  # fmt: skip
+            payload = b"" if query.payload is None else query.payload.to_bytes()
+            if payload:
+                try:
+                    answer |= {"ok": True, "stamp": self._publish(maker, source, payload)}
+                except (DecodeError, MessageError, ValueError) as error:
+                    answer |= {"ok": False, "error": str(error)}
+            query.reply(query.key_expr, msgpack.packb(answer))
+
+    def _publish(self, maker: SourceRunner, source: Remote, payload: bytes) -> int:
+        """Hands a message to its source; returns its stamp. Raises `DecodeError`, `ValueError`."""
+        message = decode(payload).message
+        if message is None or not isinstance(message, source.port.types):
+            raise ValueError(f"expected a {source.port.type_text()}")
+        last = max(self._given.get(maker.node.name, maker.last), maker.last)
+        if message.stamp == 0:
+            message = message.replace(stamp=max(self._event_clock(), last + 1))
+        elif message.stamp <= last:
+            raise ValueError(f"the stamp {message.stamp} is not above {last}, the last one on this stream")
+        if maker.ended or not source.put(message):
+            raise ValueError("the source has ended" if maker.ended else "too many messages wait to be emitted")
+        self._given[maker.node.name] = message.stamp
+        return message.stamp
 
     @staticmethod
     def _value_asked(maker: Maker, asked: Any) -> Any:

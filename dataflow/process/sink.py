@@ -22,6 +22,7 @@ from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
+from dataflow.recording import LogLine
 from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Envelope, Kind
@@ -62,6 +63,9 @@ class StreamSink(Protocol):
 
     def diagnostics(self, message: Diagnostics) -> None:
         """Tells how every operator fares."""
+
+    def log(self, line: LogLine) -> None:
+        """An operator has logged or printed something."""
 
     def flush(self) -> None: ...
 
@@ -250,6 +254,10 @@ class SinkProcess:
             case "diagnostics":
                 assert self.sink is not None
                 self.sink.diagnostics(_diagnostics(fields))
+            case "logs":
+                assert self.sink is not None
+                for line in fields["lines"]:
+                    self.sink.log(LogLine.from_json(line))
             case "leave":
                 self._outcome = fields["outcome"]
                 self._left = True

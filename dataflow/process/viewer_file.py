@@ -7,10 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from dataflow.graph.model import Graph
-from dataflow.messages import Diagnostics
+from dataflow.messages import Alarm, Diagnostics
 from dataflow.messages.base import Message
+from dataflow.names import logs_key
 from dataflow.process.sink import SinkFailure
-from dataflow.view import Save, ViewerSink
+from dataflow.recording import LogLine
+from dataflow.view import Save, ViewerSink, as_alarm
 
 PATIENCE = 30.0
 
@@ -21,9 +23,11 @@ class ViewerFileSink:
     def __init__(self, path: str, graph: Graph, streams: list[str]) -> None:
         self.path = Path(path)
         self.viewer = ViewerSink(Save(self.path))
-        self.viewer.open({s: graph.message_types(s)[0] for s in streams}, graph)
+        self._logs, self._clock = logs_key(graph.namespace), 0
+        self.viewer.open({**{s: graph.message_types(s)[0] for s in streams}, self._logs: Alarm}, graph)
 
     def message(self, stream: str, message: Message, seq: int, incarnation: int) -> None:
+        self._clock = max(self._clock, message.stamp)
         dropped = self.viewer.statistics().dropped
         self.viewer.log(stream, message, wait=PATIENCE)
         if self.viewer.statistics().dropped > dropped:
@@ -37,6 +41,9 @@ class ViewerFileSink:
 
     def diagnostics(self, message: Diagnostics) -> None:
         """Diagnostics of the run are told by the recording and by `dataflow top`."""
+
+    def log(self, line: LogLine) -> None:
+        self.viewer.log(self._logs, as_alarm(line, self._clock), wait=PATIENCE)
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         """A stream that ended stays as it is."""

@@ -5,6 +5,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.facts import machine_facts
 from dataflow.recording.foreign import ForeignDecoder, register_decoder
 from dataflow.recording.info import Description, describe
+from dataflow.recording.logs import LogLine
 from dataflow.recording.reader import Event, RawRecord, Recorded, Recording
 from dataflow.recording.streams import StreamInfo
 from dataflow.recording.text import visible
@@ -15,6 +16,7 @@ __all__ = [
     "DiffReport",
     "Event",
     "ForeignDecoder",
+    "LogLine",
     "RawRecord",
     "Recorded",
     "Recording",

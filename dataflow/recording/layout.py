@@ -31,6 +31,7 @@ class Kind(StrEnum):
     FIRINGS = "firings"
     EVENTS = "events"
     FRAMES = "frames"
+    LOGS = "logs"
 
 
 EVENT_SCHEMA: Final = json.dumps(
@@ -65,6 +66,10 @@ def events_topic(namespace: str) -> str:
 
 def frames_topic(namespace: str) -> str:
     return _internal(namespace, "frames")
+
+
+def logs_topic(namespace: str) -> str:
+    return _internal(namespace, "logs")
 
 
 def _internal(namespace: str, rest: str) -> str:

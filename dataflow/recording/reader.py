@@ -21,6 +21,7 @@ from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
 from dataflow.recording.json_columns import Values
 from dataflow.recording.layout import Kind
+from dataflow.recording.logs import LogLine
 from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 from dataflow.recording.streams import (
     IndexedStream,
@@ -207,6 +208,14 @@ class Recording:
                 yield Event(value["event"], int(value["stamp"]), value["data"])
             except (KeyError, TypeError, ValueError) as error:
                 raise RecordingError(f"{self.path}: an event at {raw.log_time} cannot be read: {error!r}") from error
+
+    def logs(self) -> Iterator[tuple[int, LogLine]]:
+        """(log time, line) of the run's log, in file order: event time, or what was the newest when it was said."""
+        for raw in self._in_file_order([c.id for c in self._channels_of(Kind.LOGS)]):
+            try:
+                yield raw.log_time, LogLine.of_recorded(decode_object(raw.data))
+            except (KeyError, TypeError, ValueError, IndexError) as error:
+                raise RecordingError(f"{self.path}: a line of the log cannot be read: {error!r}") from error
 
     def digests(self, streams: Sequence[str] | None = None) -> Mapping[str, str]:
         """The stream digests of the decoded messages: xxh3-128 over the message digests, in stream order."""

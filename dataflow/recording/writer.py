@@ -29,7 +29,11 @@ from dataflow.recording.layout import (
     events_topic,
     firings_topic,
     frames_topic,
+    logs_topic,
 )
+from dataflow.recording.logs import SCHEMA as LOG_SCHEMA
+from dataflow.recording.logs import SCHEMA_NAME as LOG_SCHEMA_NAME
+from dataflow.recording.logs import LogLine
 from dataflow.recording.packing import Buffer, Compression
 from dataflow.sync.stamps import FOREVER
 
@@ -84,6 +88,7 @@ class RecordingWriter:
         self._firings: dict[str, tuple[int, int]] = {}
         self._untouched: dict[str, tuple[int, int]] = {}
         self._events: tuple[int, int] | None = None
+        self._logs: tuple[int, int] | None = None
         self._newest = 0
         self._frames = FrameTree()
         self._frames_channel: int | None = None
@@ -204,6 +209,18 @@ class RecordingWriter:
             raise RecordingError(f"{self.path}: event {name!r} does not hold JSON values only: {error}") from error
         self._file.add_record(channel, log_time, count % SEQUENCE_SPAN, data)
         self._events = (channel, count + 1)
+
+    def write_log(self, stamp: int, line: LogLine) -> None:
+        """Adds a line of the log. A `stamp` that is no time is logged at the newest time so far."""
+        if self._logs is None:
+            schema = self._schema(SchemaText(LOG_SCHEMA_NAME, "jsonschema", LOG_SCHEMA))
+            topic = logs_topic(self._namespace)
+            self._logs = (self._file.add_channel(topic, "json", schema, {"kind": Kind.LOGS}), 0)
+        channel, count = self._logs
+        log_time = self._log_time(stamp)
+        data = encode_object({TIMESTAMP: timestamp_object(log_time), **line.recorded()})
+        self._file.add_record(channel, log_time, count % SEQUENCE_SPAN, data)
+        self._logs = (channel, count + 1)
 
     def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
         """Adds a metadata record, now or later; of one name and key the latest counts."""

@@ -29,6 +29,7 @@ from dataflow.supervision.events import (
     Tick,
 )
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
+from dataflow.supervision.log_keeper import LogKeeper
 from dataflow.supervision.outcome import report_of
 from dataflow.supervision.part import Part
 from dataflow.supervision.report import RunFailed, Status
@@ -44,6 +45,7 @@ class Core:
     def __init__(self, run: RunState, parts: Sequence[Part], restarts: RestartPolicy) -> None:
         self.run, self._parts, self._restarts = run, tuple(parts), restarts
         self._barrier = Barrier(run)
+        self._logs = LogKeeper(run)
         self._closing: Closing | None = None
         self._stops = 0
         self._interrupted = False
@@ -75,8 +77,12 @@ class Core:
                 raise RunFailed(why, interrupted=interrupted)
             case Said(label, kind, fields):
                 self._said(self.run.processes[label], kind, fields)
-            case Printed(label, line):
+            case Printed(label, line, log):
                 self.run.processes[label].words.append(line)
+                if log is not None:
+                    self._logs.take(log)
+                    if self._closing is not None:
+                        self._logs.hand_on_all()
             case NotReading(label, seconds, _, overflowed):
                 for part in self._parts:
                     part.not_reading(self.run.processes[label], seconds, overflowed=overflowed)
@@ -94,6 +100,7 @@ class Core:
 
     def _tick(self) -> None:
         run = self.run
+        self._logs.hand_on()
         for process in run.processes.values():
             self._see_to_death(process)
         if self._closing is not None:
@@ -209,6 +216,7 @@ class Core:
     def _close(self, failure: RunFailed | None) -> None:
         run = self.run
         self._ended_at = run.steady
+        self._logs.hand_on_all()
         if run.under_way:
             for part in self._parts:
                 part.closing()

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dataflow.recording.logs import LogLine
 from dataflow.records.black_box import Remains
 
 
@@ -51,10 +52,12 @@ class Said:
 
 @dataclass(frozen=True, slots=True)
 class Printed:
-    """A process printed a line."""
+    """A process printed or logged something; `line` is how people are shown it."""
 
     label: str
     line: str
+    log: LogLine | None = None
+    """None for the second and later lines of one call of a logger."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ MOST_DESCRIPTORS = 253
 """As many as one message on a Unix socket carries."""
 MORE, SPAWN = b"+", b"s"
 """A request: descriptors, of which more follow, and the last ones for a process that is to be started."""
-PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main"))
+PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main", "speech"))
 
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -57,9 +57,10 @@ def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited:
         os.dup2(words, 2)
         for other in (words, *inherited):
             os.close(other)
-        sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
         from dataflow.process.main import main
+        from dataflow.process.speech import install
 
+        install()
         code = main(descriptor, handed)
         sys.stdout.flush()
         sys.stderr.flush()

@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 from dataflow.firing.threads import environment
 from dataflow.process.channel import ChannelClosed
+from dataflow.process.speech import heard, shown
 from dataflow.records.black_box import make_black_box, read_black_box
 from dataflow.supervision import commands, events
 from dataflow.supervision.compose import core_of
@@ -26,6 +27,7 @@ from dataflow.supervision.report import RunFailed, RunReport, Status
 from dataflow.supervision.rings import Rings, pairs_of
 from dataflow.supervision.words import Words
 from dataflow.transport import registry, reserve_endpoints
+from dataflow.transport.log_file import LogFile
 
 TICK = 0.05
 NOT_READING_AFTER = 1.0
@@ -83,6 +85,7 @@ class Supervisor:
             stack.enter_context(self._announced)
             self._rings = self._make_rings()
             stack.callback(self._rings.close)
+            self._log_file = stack.enter_context(contextlib.closing(LogFile()))
             self._words = Words(self._on_output)
             stack.callback(self._words.close)
             self._selector = stack.enter_context(selectors.DefaultSelector())
@@ -224,8 +227,14 @@ class Supervisor:
             self._selector.unregister(descriptor)
 
     def _heard(self, label: str, line: str) -> None:
-        self._words.put(label, line)
-        self._feed(events.Printed(label, line))
+        said = heard(line, label, self._processes[label].nodes)
+        self._log_file.add(said)
+        first, *more = shown(said)
+        self._words.put(label, first)
+        self._feed(events.Printed(label, first, said))
+        for each in more:
+            self._words.put(label, each)
+            self._feed(events.Printed(label, each))
 
     def _tick(self) -> None:
         now = time.monotonic()

@@ -5,7 +5,7 @@ A viewer is an ordinary subscriber: `ViewerSink` draws what it is handed and can
 
 from dataflow.view.blueprint import blueprint
 from dataflow.view.canvas import Canvas, visualize, visualizer, visualizers
-from dataflow.view.playback import from_recording
+from dataflow.view.playback import as_alarm, from_recording
 from dataflow.view.process import ViewerError
 from dataflow.view.scene import SceneState, ViewOptions
 from dataflow.view.sink import Connect, Save, Serve, SinkStatistics, Spawn, Target, ViewerSink, parse_target
@@ -22,6 +22,7 @@ __all__ = [
     "ViewOptions",
     "ViewerError",
     "ViewerSink",
+    "as_alarm",
     "blueprint",
     "from_recording",
     "parse_target",

@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import itemgetter
 
 from dataflow.graph.model import Graph
-from dataflow.messages import Message
-from dataflow.recording import Recording
+from dataflow.messages import Alarm, Message
+from dataflow.recording import LogLine, Recorded, Recording
+from dataflow.recording.layout import RECORDING, logs_topic
 from dataflow.view.process import ViewerError
 from dataflow.view.sink import ViewerSink
 
 _PATIENCE = 30.0  # seconds without progress after which a viewer counts as stalled
+
+
+def as_alarm(line: LogLine, clock: int) -> Alarm:
+    """A line of the log as the message that is drawn, at its event time or, where it has none, at `clock`."""
+    return Alarm(stamp=line.stamp or clock, level=line.level, name=line.name, text=line.text)
 
 
 def from_recording(
@@ -26,22 +34,45 @@ def from_recording(
     """Opens `sink` for the recorded `streams` (None: all that have a message type) and logs what they hold.
 
     Static streams come first and whole; of the others, messages with start ≤ stamp ≤ end (ns). `graph` says what is
-    drawn over what, and what is hidden. Waits for the viewer instead of dropping. `progress` is called with each stamp.
-    Returns how many messages were handed over; the sink stays open. Raises `ViewerError` for a viewer that cannot be
-    reached or takes nothing for 30 s, `RecordingError` for an unknown stream and for data that does not decode.
+    drawn over what, and what is hidden. The run's log is shown too where all streams are. Waits for the
+    viewer instead of dropping. `progress` is called with each stamp. Returns how many messages were handed over; the
+    sink stays open. Raises `ViewerError` for a viewer that cannot be reached or takes nothing for 30 s,
+    `RecordingError` for an unknown stream and for data that does not decode.
     """
+    readable = {name: info for name, info in recording.streams.items() if info.message_type is not None}
     types: dict[str, type[Message]] = {
         name: info.message_type
-        for name, info in recording.streams.items()
+        for name, info in readable.items()
         if info.message_type is not None and (streams is None or name in streams)
     }
-    sink.open(types, graph, [name for name in types if recording.streams[name].static])
+    static = [name for name in types if readable[name].static]
+    lines: Sequence[tuple[int, LogLine]] = ()
+    if types.keys() >= readable.keys():
+        lines = [entry for entry in recording.logs() if (start or 0) <= entry[0] and (end is None or entry[0] <= end)]
+    logs = logs_topic(recording.metadata.get(RECORDING, {}).get("namespace", ""))
+    if lines:
+        types[logs] = Alarm
+    sink.open(types, graph, static)
     count = 0
-    for recorded in recording.messages(streams, start, end):
+    for stream, message in _with_lines(recording.messages(streams, start, end), logs, lines):
         dropped = sink.statistics().dropped
-        count += sink.log(recorded.stream, recorded.message, wait=_PATIENCE)
+        count += sink.log(stream, message, wait=_PATIENCE)
         if sink.statistics().dropped > dropped:
             raise ViewerError(f"the viewer took nothing for {_PATIENCE:g} s; {count:,} messages were handed over")
         if progress is not None:
-            progress(recorded.stamp)
+            progress(message.stamp)
     return count
+
+
+def _with_lines(
+    messages: Iterable[Recorded], logs: str, lines: Iterable[tuple[int, LogLine]]
+) -> Iterator[tuple[str, Message]]:
+    """The messages by stream, and each line of the log just before the first message with a later stamp."""
+    waiting = deque(sorted(lines, key=itemgetter(0)))
+    for recorded in messages:
+        while waiting and waiting[0][0] < recorded.stamp:
+            stamp, line = waiting.popleft()
+            yield logs, as_alarm(line, stamp)
+        yield recorded.stream, recorded.message
+    for stamp, line in waiting:
+        yield logs, as_alarm(line, stamp)

@@ -6,16 +6,15 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, Literal
 
-import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.depth.stereo_matching import Gray, MatchingConfig, StereoMatcher
+from operators.depth.stereo_matching import MatchingConfig, StereoMatcher
 from operators.geometry.calibration import check_calibration
 from operators.geometry.stereo import rectified_pair
+from operators.image.preparation import grey_of
 from operators.status import counted_status
 
 
@@ -89,7 +88,7 @@ class StereoDepth(Operator):
         if self._calibration != (left_info, right_info):
             K, baseline = rectified_pair(left_info, right_info)
             self._pixel_metres, self._calibration = float(K[0, 0]) * baseline, (left_info, right_info)
-        matched = self._matcher.match(grey(left.data), grey(right.data))
+        matched = self._matcher.match(grey_of(left.data), grey_of(right.data))
         disparity = matched.disparity - np.float32(self.offset)
         seen = disparity > 0  # false where it is NaN
         z = np.where(seen, np.float32(self._pixel_metres) / np.where(seen, disparity, 1), 0).astype(np.float32)
@@ -121,11 +120,6 @@ class StereoDepth(Operator):
     def _check_range(self) -> None:
         if self.min_range >= self.max_range:
             raise ValueError(f"min_range {self.min_range} m must be below max_range {self.max_range} m")
-
-
-def grey(pixels: NDArray[np.uint8]) -> Gray:
-    """Returns grey values (H, W) of RGB (H, W, 3) or grey pixels."""
-    return pixels if pixels.ndim == 2 else np.asarray(cv2.cvtColor(pixels, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def _status(left: Image, right: Image, counts: Mapping[str, int], blind: bool) -> Diagnostics:

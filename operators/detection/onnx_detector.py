@@ -14,16 +14,16 @@ from operators.detection.coco import COCO_CLASSES
 from operators.detection.decode import LAYOUTS, Candidates, DecoderName
 from operators.detection.fit import Fit, FitMode
 from operators.detection.nms import class_wise_nms
-from operators.inference import ModelError, open_session
+from operators.inference import ModelError, Provider, open_session
 
 if TYPE_CHECKING:
     import onnxruntime
 
 
 class OnnxDetector(Operator):
-    """Finds objects in an image with an ONNX model on one CPU thread, so equal images give equal boxes.
+    """Finds objects in an image with an ONNX model; on the CPU with one thread, so equal images give equal boxes.
 
-    The model takes one (1, 3, H, W) float32 input in [0, 1]; the decoder says what its colours, fit and output mean.
+    The model takes one (1, 3, H, W) float32 input; the decoder says what its colours, range, fit and output mean.
     """
 
     stateless = True
@@ -40,12 +40,13 @@ class OnnxDetector(Operator):
     fit: Literal["default", "stretch", "letterbox"] = Param(
         "default", doc="how the image fills the input; by default as the decoder's family was trained"
     )
+    provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
     input_size: int = Param(640, ge=32, doc="side of the input where the model leaves it open", unit="px")
 
     def setup(self) -> None:
         """Loads the model. Raises FileNotFoundError or ModelError."""
         file = self.use_file(self.model)
-        self._session = open_session(file)
+        self._session = open_session(file, self.provider)
         self._input = self._session.get_inputs()[0].name
         self._size = _input_size(file, self._session, self.input_size)
         self._layout = LAYOUTS[self.decoder]
@@ -55,9 +56,9 @@ class OnnxDetector(Operator):
     def process(self, image: Image) -> Detections2D:
         """Raises ModelError where the model's output is not what the decoder reads."""
         fit = Fit.plan(self._fit, (image.width, image.height), self._size)
-        output = self._session.run(None, {self._input: self._tensor(fit.apply(_three_channels(image.data)))})[0]
+        outputs = self._session.run(None, {self._input: self._tensor(fit.apply(_three_channels(image.data)))})
         try:
-            found = self._layout.decode(output, self._size, self.score_threshold)
+            found = self._layout.decode(outputs, self._size, self.score_threshold)
         except ValueError as error:
             raise ModelError(f"OnnxDetector.decoder={self.decoder!r} does not fit {self.model}: {error}") from None
         self._check_classes(found)
@@ -75,10 +76,12 @@ class OnnxDetector(Operator):
         )
 
     def _tensor(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(1, 3, H, W) in [0, 1] of (H, W, 3) RGB pixels."""
+        """The input (1, 3, H, W), in the decoder's range, of (H, W, 3) RGB pixels."""
         channels = pixels[..., ::-1] if self._layout.bgr else pixels
         tensor = np.ascontiguousarray(channels.transpose(2, 0, 1)[None], np.float32)
-        tensor /= np.float32(255)
+        if self._layout.mean:
+            tensor -= np.float32(self._layout.mean)
+        tensor /= np.float32(self._layout.scale)
         return tensor
 
     def _check_classes(self, found: Candidates) -> None:

@@ -31,7 +31,7 @@ from operators.fusion.error_state import POSITION, Noise
 from operators.fusion.gate import GateConfig
 from operators.fusion.late_filter import FilterConfig, LateFilter, Measurement, Sample
 from operators.fusion.output import diagnostics, odometry_of
-from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, measurements, use_of
+from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, measurements, unheard, use_of
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
@@ -47,10 +47,10 @@ class EkfFusion(Operator):
     corrects it, at the time when it was measured: what comes late, up to `window`, is put in its place and the rest is
     done again.
 
-    Settings of a stream stand under the end of its name (`robot/fix`). A chi-square gate refuses what does not
-    fit; measurements that fit only because the filter knows little wait for a second one that agrees, and refused ones
-    that agree with each other show the filter to be wrong, which makes room for them. Detections of a radar and ranges
-    may be of something else, so the filter never yields to those.
+    Settings of a stream stand under the end of its name (`robot/fix`); the status names those of no stream. A
+    chi-square gate refuses what does not fit; measurements that fit only because the filter knows little wait for a
+    second one that agrees, and refused ones that agree with each other show the filter to be wrong, which makes room
+    for them. Detections of a radar and ranges may be of something else, so the filter never yields to those.
 
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
     rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
@@ -114,6 +114,11 @@ class EkfFusion(Operator):
         self._before: dict[str, Message] = {}
         self._origin, self._sure = self.origin, False
         self._ignored: Counter[str] = Counter()
+        self._heard: set[str] = set()
+        self._gates = {
+            name: GateConfig(share=s.share, agreeing=_NEVER_AGREE if s.use in _WITHOUT_PATIENCE else s.agreeing)
+            for name, s in self.sensors.items()
+        }
         self._body = "" if self.motion == "inertial" else self.base_frame
         self._extrinsics: Transforms | None = None
 
@@ -126,6 +131,7 @@ class EkfFusion(Operator):
     ) -> dict[str, Any] | None:
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
         self._extrinsics = extrinsics
+        self._heard |= {stream.partition("/")[2] for stream in measurements}
         named = {self._name(stream): message for stream, message in measurements.items()}
         felt = False
         for name, message in named.items():
@@ -162,10 +168,15 @@ class EkfFusion(Operator):
             "body": self._body,
             "sure": int(self._sure),
             "ignored": dict(self._ignored),
+            "heard": sorted(self._heard),
+            "strict": sorted(name for name, gate in self._gates.items() if gate.agreeing == _NEVER_AGREE),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
+        self._heard = set(state.get("heard", ()))
+        for name in state.get("strict", ()):
+            self._gates[name] = GateConfig(share=self._settings(name).share, agreeing=_NEVER_AGREE)
         if state["filter"] is not None:
             self._filter = LateFilter.restored(self._config(), state["filter"])
         self._samples = [Sample(int(t), gyro, accel, Noise(*noise)) for t, gyro, accel, *noise in state["samples"]]
@@ -186,6 +197,7 @@ class EkfFusion(Operator):
                 figures[f"{name}, refused"] = health.refused
                 figures[f"{name}, unconfirmed"] = health.unconfirmed
         ignored = self._ignored + (self._filter.ignored if self._filter is not None else Counter())
+        figures |= {f"settings of {name}": f"of no stream{near}" for name, near in self._unheard()}
         return figures | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}
 
     def _name(self, stream: str) -> str:
@@ -209,10 +221,6 @@ class EkfFusion(Operator):
 
     def _config(self) -> FilterConfig:
         inertial = self.motion == "inertial"
-        gates = {}
-        for name, s in self.sensors.items():
-            never = s.use in _WITHOUT_PATIENCE
-            gates[name] = GateConfig(share=s.share, agreeing=_NEVER_AGREE if never else s.agreeing)
         return FilterConfig(
             window=self.window,
             gravity=self.gravity,
@@ -221,7 +229,7 @@ class EkfFusion(Operator):
             unknown=Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
             if inertial
             else Noise(0.0, self.free_acceleration, self.free_turning, 0.0),
-            gates=gates,
+            gates=self._gates,
         )
 
     def _prior(self) -> Prior:
@@ -289,6 +297,9 @@ class EkfFusion(Operator):
     def _measure(self, name: str, message: Message, around: Surroundings) -> None:
         if self._filter is None and self.motion == "constant_velocity":
             self._filter = self._coasting(message.stamp)
+        settings = self._settings(name)
+        if use_of(name, message, settings) in _WITHOUT_PATIENCE:  # whatever says so: the setting or the message's type
+            self._gates[name] = GateConfig(share=settings.share, agreeing=_NEVER_AGREE)
         before = self._before.get(name)
         if isinstance(message, Odometry):
             self._before[name] = message
@@ -296,7 +307,7 @@ class EkfFusion(Operator):
             self._ignored[f"{name}: before the beginning"] += 1
             return
         try:
-            for time, sensor, model, noise in measurements(name, message, before, self._settings(name), around):
+            for time, sensor, model, noise in measurements(name, message, before, settings, around):
                 self._filter.measure(Measurement(time, sensor, model, noise))
         except Unusable as reason:
             self._ignored[f"{name}: {reason}"] += 1
@@ -327,4 +338,8 @@ class EkfFusion(Operator):
             return None
         self._reported = stamp
         ignored = self._ignored + self._filter.ignored
-        return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored)
+        unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
+        return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, unused)
+
+    def _unheard(self) -> list[tuple[str, str]]:
+        return list(unheard(tuple(self.sensors), sorted(self._heard)).items())

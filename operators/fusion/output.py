@@ -40,8 +40,14 @@ def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame
     )
 
 
-def diagnostics(stamp: int, health: Mapping[str, Health], hypotheses: int, ignored: Mapping[str, int]) -> Diagnostics:
-    """Returns a status for the filter and one for every sensor."""
+def diagnostics(
+    stamp: int,
+    health: Mapping[str, Health],
+    hypotheses: int,
+    ignored: Mapping[str, int],
+    warnings: Mapping[str, str],
+) -> Diagnostics:
+    """Returns a status for the filter, one for every sensor, and one for every warning, a text by what it is about."""
     text = "one hypothesis" if hypotheses == 1 else f"{hypotheses} headings in question"
     rows = [("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))]
     for name, h in sorted(health.items()):
@@ -56,6 +62,7 @@ def diagnostics(stamp: int, health: Mapping[str, Health], hypotheses: int, ignor
             level, text = Level.OK, "used"
         counts = {"used": h.used, "made room for": h.widened, "refused": h.refused, "unconfirmed": h.unconfirmed}
         rows.append((name, text, level, counts))
+    rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items())]
     pairs = [(key, str(value), k) for k, row in enumerate(rows) for key, value in row[3].items()]
     return Diagnostics(
         stamp=stamp,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Literal
 
 import numpy as np
@@ -110,6 +111,18 @@ def use_of(name: str, message: Message, settings: SensorSettings) -> str:
         fitting = " or ".join(t.__name__ for t in _FITTING[use])
         raise ValueError(f"{name}: {type(message).__name__} cannot be used as {use!r}, which takes {fitting}")
     return use
+
+
+def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
+    """Returns the settings' names that no stream ends with, each with the nearest stream that has no settings."""
+    taken = [stream for stream in streams for name in names if f"/{stream}".endswith(f"/{name}")]
+    free = [stream for stream in streams if stream not in taken]
+    found = {}
+    for name in names:
+        if not any(f"/{stream}".endswith(f"/{name}") for stream in streams):
+            near = get_close_matches(name, free, 1, 0.5)
+            found[name] = f"; the nearest is {near[0]}" if near else ""
+    return found
 
 
 def measurements(

@@ -7,8 +7,8 @@ import numpy as np
 from dataflow.messages import CameraInfo, DepthImage, Image
 
 
-def check_calibration(port: str, image: DepthImage | Image, info: CameraInfo) -> None:
-    """Raises ValueError unless an image has the size and frame of its calibration, which must be without distortion.
+def check_fit(port: str, image: DepthImage | Image, info: CameraInfo) -> None:
+    """Raises ValueError unless an image has the size and frame of its calibration.
 
     `port` names the input; its calibration is named `<port>_info`.
     """
@@ -18,5 +18,10 @@ def check_calibration(port: str, image: DepthImage | Image, info: CameraInfo) ->
         )
     if image.frame != info.frame:
         raise ValueError(f"{port} is in frame {image.frame!r}, but {port}_info in {info.frame!r}")
+
+
+def check_calibration(port: str, image: DepthImage | Image, info: CameraInfo) -> None:
+    """Raises ValueError unless an image fits its calibration, which must be without distortion."""
+    check_fit(port, image, info)
     if info.distortion is not None and np.any(info.distortion):
         raise ValueError(f"{port}_info has lens distortion ({info.distortion_model}); undistort the images first")

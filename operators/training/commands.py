@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json as jsonlib
-import re
-from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from rich.markup import escape
@@ -16,64 +14,37 @@ from operators.training.console import (
     Data,
     Json,
     SplitSeed,
-    err_console,
     friendly,
     out_console,
-    print_notes,
     score_words,
 )
 from operators.training.evaluation import evaluate
-
-if TYPE_CHECKING:
-    from torch import nn
-
-    from operators.training.backbone import Backbone as Extractor
-    from operators.training.loop import Outcome, Settings, Task
-
-_LONGEST_SIDE, _MULTIPLE = 384, 32
+from operators.training.options import (
+    Backbone,
+    Batch,
+    Bfloat16,
+    Device,
+    Epochs,
+    Every,
+    Frozen,
+    Initial,
+    Overwrite,
+    Rate,
+    Resume,
+    Seed,
+    Size,
+    Strength,
+    Threads,
+    Width,
+    Workers,
+)
+from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data
 
 __all__ = ["evaluate", "train"]
 
 train = typer.Typer(
     name="train", help="Train the project's networks on your own data.", no_args_is_help=True, rich_markup_mode="rich"
 )
-Epochs = Annotated[int, typer.Option(min=1, help="Passes through the training images.")]
-Batch = Annotated[int, typer.Option(min=1, help="Images a step.")]
-Rate = Annotated[float, typer.Option("--learning-rate", min=1e-7, help="Largest learning rate.")]
-Seed = Annotated[int, typer.Option(min=0, help="Decides everything random.")]
-Size = Annotated[
-    str | None,
-    typer.Option(metavar="WxH", help="Input size, multiples of 16. Default: by the images, longest side 384."),
-]
-Width = Annotated[float, typer.Option(min=0.1, max=2.0, help="Width of the backbone, as a factor on its channels.")]
-Backbone = Annotated[
-    Path | None,
-    typer.Option(
-        "--backbone-weights", help="Start from these: torchvision's MobileNetV2 weights, or a checkpoint (.pt)."
-    ),
-]
-Frozen = Annotated[
-    int | None,
-    typer.Option(
-        help="Keep the backbone down to this stride as it is. Default: 4 with given weights, else 0 for none."
-    ),
-]
-Initial = Annotated[
-    Path | None, typer.Option("--from", help="Start from all weights of this checkpoint (.pt) that fit: fine-tuning.")
-]
-Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]
-Strength = Annotated[
-    float, typer.Option("--variation", min=0, max=2, help="Strength of the random changes of training images.")
-]
-Every = Annotated[int, typer.Option(min=1, help="Score after every so many epochs.")]
-Workers = Annotated[int, typer.Option(min=1, help="Threads that prepare images.")]
-Threads = Annotated[int | None, typer.Option(min=1, help="Threads that compute. Default: one a core.")]
-Device = Annotated[str | None, typer.Option(help="cpu, cuda, cuda:1 ... Default: a GPU where there is one.")]
-Bfloat16 = Annotated[
-    bool,
-    typer.Option(help="Compute convolutions in bfloat16: twice as fast on processors that have it, slower on others."),
-]
 
 
 @train.command("detector")
@@ -109,7 +80,7 @@ def train_detector(
     and a checkpoint (.pt) to resume from.
     """
     with friendly():
-        _free(out, resume, overwrite)
+        keep_earlier(out, resume, overwrite)
         from operators.detection.custom.dataset import read_detection_data
         from operators.detection.custom.training import DetectorTask
         from operators.training.augmentation import Variation
@@ -119,20 +90,20 @@ def train_detector(
         read = read if classes is None else read.only([name.strip() for name in classes.split(",") if name.strip()])
         task = DetectorTask(
             read,
-            _size(size, [image.file for image in read.training[:20]]),
+            input_size(size, [image.file for image in read.training[:20]]),
             seed=seed,
             width=width,
             variation=Variation(flip=0.5 if flip else 0.0).times(variation),
             backbone=backbone_weights,
         )
-        _prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
-        _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
+        prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
+        tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
-        outcome = _run(task, settings, out, resume, json)
-    _finish(outcome, "operators.detection:CustomDetector", json)
+        outcome = run_task(task, settings, out, resume, json)
+    report(outcome, "operators.detection:CustomDetector", json)
 
 
 @train.command("segmenter")
@@ -161,7 +132,7 @@ def train_segmenter(
 ) -> None:
     """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt."""
     with friendly():
-        _free(out, resume, overwrite)
+        keep_earlier(out, resume, overwrite)
         from operators.segmentation.dataset import read_segmentation_data
         from operators.segmentation.training import SegmenterTask
         from operators.training.augmentation import Variation
@@ -170,20 +141,74 @@ def train_segmenter(
         read = read_segmentation_data(data, seed)
         task = SegmenterTask(
             read,
-            _size(size, [image.image for image in read.training[:20]]),
+            input_size(size, [image.image for image in read.training[:20]]),
             seed=seed,
             width=width,
             variation=Variation(flip=0.5 if flip else 0.0).times(variation),
             backbone=backbone_weights,
         )
-        _prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
-        _tell(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
+        prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
+        tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
-        outcome = _run(task, settings, out, resume, json)
-    _finish(outcome, "operators.segmentation:Segmenter", json)
+        outcome = run_task(task, settings, out, resume, json)
+    report(outcome, "operators.segmentation:Segmenter", json)
+
+
+@train.command("classifier")
+def train_classifier(
+    data: Data,
+    epochs: Epochs = 40,
+    out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("classifier.onnx"),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    size: Annotated[str, typer.Option(metavar="WxH", help="Input size, multiples of 32.")] = "96x96",
+    residual: Annotated[bool, typer.Option(help="Carry what comes into each block around it.")] = False,
+    batch: Batch = 32,
+    learning_rate: Rate = 1e-3,
+    seed: Seed = 0,
+    initial: Initial = None,
+    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    variation: Strength = 1.0,
+    evaluate_every: Every = 1,
+    workers: Workers = 2,
+    threads: Threads = None,
+    device: Device = None,
+    bfloat16: Bfloat16 = False,
+    json: Json = False,
+) -> None:
+    """Train a recognition network on a folder of images sorted by class (DATA/cat/*.jpg, DATA/dog/*.jpg ...).
+
+    Four convolution blocks and two linear layers, for any number of classes. The operators
+    `operators.recognition:ImageClassifier` and `FeatureExtractor` take the file as `weights`.
+    """
+    with friendly():
+        keep_earlier(out, resume, overwrite)
+        from operators.recognition.dataset import read_classification_data
+        from operators.recognition.training import ClassifierTask
+        from operators.training.augmentation import Variation
+        from operators.training.backbone import start_from
+        from operators.training.loop import Settings
+
+        read = read_classification_data(data, seed)
+        task = ClassifierTask(
+            read,
+            input_size(size, ()),
+            seed=seed,
+            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
+            architecture="residual" if residual else "plain",
+        )
+        if initial is not None:
+            start_from(task.network, initial)
+        tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
+            device=device, bfloat16=bfloat16,
+        )  # fmt: skip
+        outcome = run_task(task, settings, out, resume, json)
+    report(outcome, "operators.recognition:ImageClassifier", json)
 
 
 @train.command("pair")
@@ -215,7 +240,7 @@ def train_pair(
     """
     with friendly():
         file = out / "pair.onnx"
-        _free(file, resume, overwrite)
+        keep_earlier(file, resume, overwrite)
         from operators.detection.custom.dataset import read_detection_data
         from operators.segmentation.dataset import read_segmentation_data
         from operators.training.augmentation import Variation
@@ -226,19 +251,19 @@ def train_pair(
         task = PairTask(
             boxes,
             masks,
-            _size(size, [image.file for image in boxes.training[:20]]),
+            input_size(size, [image.file for image in boxes.training[:20]]),
             seed=seed,
             width=width,
             variation=Variation(flip=0.5 if flip else 0.0).times(variation),
         )
-        _prepare(task.network, task.backbone, None, 0, initial)
-        _tell(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)
+        prepare(task.network, task.backbone, None, 0, initial)
+        tell_data(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
-        outcome = _run(task, settings, file, resume, json)
-    _finish(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json)
+        outcome = run_task(task, settings, file, resume, json)
+    report(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json)
 
 
 @train.command("quantize")
@@ -270,85 +295,3 @@ def quantize(
         kilobytes, said = f"{Path(file).stat().st_size / 1000:.0f}", score_words(scores, ("ap50", "ap", "miou"))
         table.add_row(escape(file), kilobytes, said, f"{scores['ms']:.1f}")
     out_console.print(table)
-
-
-def _run(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -> Outcome:
-    from operators.training.loop import train as run
-    from operators.training.progress import TrainingBar
-
-    if quiet:
-        return run(task, settings, out, resume=resume)
-    with TrainingBar(err_console) as bar:
-        return run(task, settings, out, resume=resume, progress=bar)
-
-
-def _prepare(
-    network: nn.Module, backbone: Extractor, weights: Path | None, frozen_stride: int | None, initial: Path | None
-) -> None:
-    from operators.training.backbone import start_from
-
-    if initial is not None:
-        start_from(network, initial)
-    given = weights is not None or initial is not None
-    backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
-
-
-def _tell(
-    notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
-) -> None:
-    print_notes(notes, quiet)
-    if quiet:
-        return
-    named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
-    counts = f"{training} images to train on, {validation} to score on"
-    told = f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}"
-    err_console.print(told, highlight=False, markup=False, soft_wrap=True)
-
-
-def _finish(outcome: Outcome, operator: str, json: bool) -> None:
-    if json:
-        typer.echo(
-            jsonlib.dumps(
-                {
-                    "weights": str(outcome.file),
-                    "checkpoint": str(outcome.checkpoint),
-                    "scores": outcome.best,
-                    "epoch": outcome.best_epoch,
-                    "epochs": len(outcome.history),
-                    "seconds": round(outcome.seconds, 1),
-                    "history": outcome.history,
-                }
-            )
-        )
-        return
-    scores = score_words(outcome.best, [name for name in outcome.best if name != "score"])
-    file = escape(str(outcome.file))
-    out_console.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
-    out_console.print(f"use it: `use: {operator}` with `params: {{weights: {file}}}`", highlight=False, soft_wrap=True)
-
-
-def _size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
-    """The input size: as given, or the images' median proportions with the longest side 384."""
-    if text is not None:
-        match = re.fullmatch(r"(\d+)x(\d+)", text)
-        if match is None:
-            raise ValueError(f"--size {text!r} should be WIDTHxHEIGHT in pixels, such as 320x240")
-        return int(match[1]), int(match[2])
-    import cv2
-    import numpy as np
-
-    shapes = [found.shape for found in (cv2.imread(str(file)) for file in files) if found is not None]
-    ratio = float(np.median([width / height for height, width, _ in shapes])) if shapes else 1.0
-    extents = (min(1.0, ratio) * _LONGEST_SIDE, min(1.0, 1 / ratio) * _LONGEST_SIDE)
-    width, height = (max(_MULTIPLE, round(extent / _MULTIPLE) * _MULTIPLE) for extent in extents)
-    return width, height
-
-
-def _free(out: Path, resume: bool, overwrite: bool) -> None:
-    """Keeps an earlier training from being lost."""
-    if out.suffix != ".onnx":
-        raise ValueError(f"--out {str(out)!r} should end in .onnx")
-    checkpoint = out.with_suffix(".pt")
-    there = [str(file) for file in (out, checkpoint) if file.exists()]
-    if there and not (resume or overwrite):
-        raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")

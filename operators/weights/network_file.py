@@ -53,7 +53,7 @@ class Network:
 def open_network(file: Path, kind: str) -> Network:
     """Opens a network for one CPU thread, so that equal images give equal outputs on any load and core count.
 
-    Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`).
+    Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`, `classifier`).
     """
     session = open_session(file)
     facts = _facts(file, session)

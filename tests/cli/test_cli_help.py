@@ -96,7 +96,7 @@ def test_help_shows_no_type_beside_flags_and_no_completion(dataflow, words: list
 
     assert "--help" in told
     assert "bool" not in told
-    assert "completion" not in told
+    assert "-completion" not in told
 
 
 def test_options_by_their_former_names_work_and_say_so(dataflow, small: Path) -> None:

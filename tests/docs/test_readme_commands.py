@@ -78,6 +78,14 @@ def test_there_are_the_commands_that_people_begin_with(quoted: list[Quoted]) -> 
     }
 
 
+def test_the_table_of_commands_has_every_command() -> None:
+    project = tomllib.loads((REPOSITORY / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    text = (REPOSITORY / "README.md").read_text(encoding="utf-8")
+    listed = re.findall(r"^\| `dataflow (\S+?)[` ]", text, re.MULTILINE)
+    command: Any = typer.main.get_command(app)
+    assert sorted(listed) == sorted({*command.commands, *project["entry-points"]["dataflow.commands"]})
+
+
 def test_every_file_is_in_the_project_or_was_made_by_an_earlier_command(quoted: list[Quoted]) -> None:
     made = {"FastestDet.onnx"}  # the reader's own, with a link to where it is
     for command in quoted:

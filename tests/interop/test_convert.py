@@ -289,7 +289,7 @@ def test_kitti_folder_is_read_back(tmp_path: Path) -> None:
     source = KittiOdometry(path=str(tmp_path / "out"), first_stamp=START)
     source.setup()
 
-    assert [s["left"].data.shape for s in source.stream()] == [(12, 16, 3)] * 4
+    assert [s["left"].data.shape for s in source.stream()] == [(12, 16)] * 4  # image_0 is grey
 
 
 def test_euroc_folder_has_readings_images_and_truth(tmp_path: Path) -> None:

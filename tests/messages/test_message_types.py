@@ -27,7 +27,7 @@ def test_the_families_cover_what_a_robot_needs() -> None:
         Image CompressedImage DepthImage CompressedDepth CameraInfo PointCloud Imu MagneticField LaserScan RadarScan
         NavSatFix Pose Transforms Odometry Twist WheelTicks JointState Detections2D Boxes3D SegmentationMap Tracks
         FeatureVector SceneGraph Activity Diagnostics LandmarkSightings Path OccupancyGrid Mesh Planes Clusters
-        ParticleSet Number Text Switch Alarm"""
+        Classification ParticleSet Number Text Switch Alarm"""
     assert {cls.SCHEMA for cls in TYPES} == set(wanted.split())
     assert {cls.SCHEMA for cls in TYPES} <= set(dataflow.messages.__all__)
 

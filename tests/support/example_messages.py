@@ -294,6 +294,13 @@ def _activity(values: Values, rng: Rng) -> None:
         values["probabilities"] = rng.random(shape).astype(np.float32)
 
 
+def _classification(values: Values, rng: Rng) -> None:
+    _classes(values, rng)
+    if values["probabilities"] is not None:
+        shape = (len(values["class_ids"]), len(values["class_names"]))
+        values["probabilities"] = rng.random(shape).astype(np.float32)
+
+
 def _feature_vector(values: Values, rng: Rng) -> None:
     values["labels"] = _words(len(values["vectors"]), rng)
 
@@ -334,6 +341,7 @@ def _diagnostics(values: Values, rng: Rng) -> None:
 _REPAIRS: dict[str, Callable[[Values, Rng], None]] = {
     "Activity": _activity,
     "Boxes3D": _classes,
+    "Classification": _classification,
     "CameraInfo": _camera_info,
     "Clusters": _clusters,
     "CompressedDepth": _compressed_depth,

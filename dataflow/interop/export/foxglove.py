@@ -34,7 +34,7 @@ _ENTITY = "boxes"
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """How messages of a type that has no schema of its own are drawn by one of Foxglove's."""
+    """Drawing of a message type that has no schema of its own, by one of Foxglove's."""
 
     proto: type[Any]
     draw: Callable[[Any], Any]

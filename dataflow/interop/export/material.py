@@ -1,4 +1,4 @@
-"""What is exported: the streams of a recording or the topics of a bag, and those that nobody here can read."""
+"""Material of an export: the streams of a recording or the topics of a bag, and those that nobody here can read."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ class Ros2Writer:
 
     def close(self) -> None:
         """Finishes the file and writes metadata.yaml."""
-        self._writer.finish()
+        self._writer.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
         (self.folder / "metadata.yaml").write_text(self._metadata(), encoding="utf-8")
 

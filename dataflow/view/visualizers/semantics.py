@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import rerun as rr
 
-from dataflow.messages import Activity, FeatureVector, SceneGraph
+from dataflow.messages import Activity, Classification, FeatureVector, SceneGraph
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
 from dataflow.view.visualizers.clouds import finite_rows
@@ -81,6 +81,17 @@ def activity(canvas: Canvas, message: Activity) -> None:
                 + (f", object #{target}" if target is not None else "")
                 + (f", goal: {goal}" if goal else "")
             )
+
+
+@visualizer(Classification, "status", "log")
+def classification(canvas: Canvas, message: Classification) -> None:
+    """A lane of classes over time for the image or for each object, and a line of text whenever a class changes."""
+    ids = [None] * len(message.class_ids) if message.ids is None else message.ids.tolist()
+    for identity, name, score in zip(ids, message.labels(), message.scores.tolist(), strict=True):
+        subject = "image" if identity is None else f"object {identity}"
+        if canvas.scene.changed(canvas.entity, f"class {subject}", name):
+            canvas.log(f"status/{rr.escape_entity_path_part(subject)}", rr.StateChange(state=name))
+            canvas.text(f"{subject}: {name} {score:.2f}")
 
 
 @visualizer(FeatureVector, "tensor")

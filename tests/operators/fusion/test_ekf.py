@@ -10,6 +10,7 @@ from made_motion import Motion
 from scipy.spatial.transform import Rotation
 
 from dataflow.messages import (
+    Diagnostics,
     Imu,
     LandmarkSightings,
     MagneticField,
@@ -210,9 +211,10 @@ def test_odometry_without_velocity_counts_by_its_steps() -> None:
     assert np.linalg.norm(estimated[:3, 3] - true[:3, 3]) < 0.15
 
 
-def test_radar_gives_the_velocity_and_what_moves_is_refused() -> None:
+@pytest.mark.parametrize("settings", [{"use": "doppler", "sigma": 0.03}, {"sigma": 0.03}], ids=["doppler", "auto"])
+def test_radar_gives_the_velocity_and_what_moves_is_refused(settings: dict[str, Any]) -> None:
     robot = Robot()
-    sensors = {"robot/radar": {"use": "doppler", "sigma": 0.03}}
+    sensors = {"robot/radar": settings}
     operator, played = fused({"robot/imu": robot.imu, "robot/radar": robot.scans()}, start="origin", sensors=sensors)
     figures = operator.summary()
     assert figures["robot/radar, refused"] >= 0.8 * len(robot.scans()) - 8
@@ -360,6 +362,21 @@ def test_a_sensor_that_cannot_be_used_is_named(message: Message, settings: dict[
         operator.process({"ns/robot/imu": imu}, Context(imu.stamp), extrinsics())
     with pytest.raises(ValueError, match=words):
         operator.process({"ns/robot/x": message}, Context(message.stamp), extrinsics())
+
+
+def test_settings_of_no_stream_are_reported_with_the_nearest_stream() -> None:
+    robot = Robot(3.0)
+    sensors = {"robot/pos": {"sigma": 0.1}, "robot/fx": {"sigma": 0.1}}
+    operator = EkfFusion(sensors=sensors, origin=ORIGIN, **HEADING)
+    streams = {"robot/imu": robot.imu, "robot/fix": robot.fixes(), "robot/pos": robot.poses(Pose)}
+    given: dict[str, Any] = {"measurements": streams, "extrinsics": [extrinsics()]}
+    played = play(operator, given, static=["extrinsics"])
+    status = played["status"][-1]
+    assert isinstance(status, Diagnostics)
+    texts = dict(zip(status.names, status.messages, strict=True))
+    assert texts["settings of robot/fx"] == "no stream so far has this name; the nearest is measurements/robot/fix"
+    assert "settings of robot/pos" not in texts
+    assert operator.summary()["settings of robot/fx"] == "of no stream; the nearest is measurements/robot/fix"
 
 
 def test_settings_are_checked() -> None:

@@ -168,6 +168,7 @@ class Simulation:
             (f"{supervision}.supervisor", "selectors"): machine.Selectors(system),
             (f"{supervision}.supervisor", "Nursery"): lambda environment: Nursery(system, self._named, self._born),
             (f"{supervision}.supervisor", "Words"): _Shown,
+            (f"{supervision}.supervisor", "LogFile"): _NoLog,
             (f"{supervision}.supervisor", "registry"): SimpleNamespace(register=self._released),
             (f"{supervision}.supervisor", "reserve_endpoints"): lambda number: _reserved(endpoints, number),
             (f"{supervision}.supervisor", "environment"): _nothing,
@@ -235,6 +236,16 @@ class _Words:
 
     def fileno(self) -> int:
         raise OSError("no file")
+
+
+class _NoLog:
+    """Stands for the log that tools follow: nobody does."""
+
+    def add(self, line: object) -> None:
+        """Keeps nothing."""
+
+    def close(self) -> None:
+        """Has nothing to remove."""
 
 
 class _Shown:

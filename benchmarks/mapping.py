@@ -1,0 +1,291 @@
+"""Scores the occupancy grid and the surface map against the simulator's truth, world by world.
+
+python benchmarks/mapping.py occupancy
+python benchmarks/mapping.py surface
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from typing import Any
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import numpy as np  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+from scipy.ndimage import binary_dilation  # noqa: E402
+from scipy.spatial import cKDTree  # noqa: E402
+
+from dataflow.messages import CameraInfo, DepthImage, Mesh, Message, OccupancyGrid, Odometry, PointCloud, Pose  # noqa: E402
+from dataflow.messages import Transforms as TransformSet  # noqa: E402
+from dataflow.messages.geometry import invert, transform_points  # noqa: E402
+from operators.cloud.back_projection import Rays, beside_edge, within_range  # noqa: E402
+from operators.mapping import OccupancyMapper, TsdfMap  # noqa: E402
+from operators.mapping.placing import placed  # noqa: E402
+from operators.sources import SimulatedRobot  # noqa: E402
+from operators.sources.simulator.native import open3d  # noqa: E402
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+WORLDS = ("office", "corridor", "table_top", "yard")
+BAND = (0.05, 1.5)
+
+
+def robot(world: str, seed: int, seconds: int, **more: Any) -> SimulatedRobot:
+    """A robot on a tour among movers, with depth camera and LiDAR at 4 Hz unless `more` says otherwise."""
+    truth_of: dict[str, Any] = {"poses": 4.0, "boxes": False, "relations": 0.0, "activities": 0.0}
+    params: dict[str, Any] = {
+        "color_camera": {"rate": 0.0},
+        "depth_camera": {"rate": 4.0},
+        "lidar": {"rate": 4.0, "motion": True},
+        "truth": truth_of | more.pop("truth", {}),
+    }
+    source = SimulatedRobot(world=world, seed=seed, duration=f"{seconds}s", route="tour", **(params | more))
+    source.setup()
+    return source
+
+
+def depth_cloud(depth: DepthImage, info: CameraInfo) -> PointCloud:
+    rays = Rays.through(info.K, (info.width, info.height), 3)
+    usable = within_range(depth.data, 3, 0.3, 6.0) & ~beside_edge(depth.data, 3, 0.05)
+    return PointCloud(stamp=depth.stamp, frame=depth.frame, points=rays.back_project(depth.data, usable))
+
+
+class Scored:
+    """One mapper on one sensor, with the true cells that its points fell into."""
+
+    def __init__(self, truth: OccupancyGrid, **params: Any) -> None:
+        self.mapper = OccupancyMapper(period=1_000_000, **params)
+        self.mapper.setup()
+        self.truth, self.far = truth, params["far"]
+        self.touched = np.zeros(truth.cells.shape, np.bool_)
+        self.milliseconds: list[float] = []
+        self.stamp = 0
+
+    def add(self, cloud: PointCloud, pose: Pose | Odometry, extrinsics: TransformSet) -> None:
+        begin = time.process_time()
+        self.mapper.process(cloud, pose, extrinsics)
+        self.milliseconds.append(1e3 * (time.process_time() - begin))
+        self.stamp = cloud.stamp
+        seen = placed(cloud, pose, extrinsics)
+        assert seen is not None
+        p = seen.points[np.linalg.norm(seen.points - seen.origin, axis=1) <= self.far]
+        p = p[(p[:, 2] >= BAND[0]) & (p[:, 2] < BAND[1])]
+        cell = np.floor((p[:, :2] - self.truth.position[:2]) / self.truth.resolution).astype(int)
+        cell = cell[(cell >= 0).all(axis=1) & (cell < self.truth.cells.shape[::-1]).all(axis=1)]
+        self.touched[cell[:, 1], cell[:, 0]] = True
+
+    def row(self) -> list[float]:
+        """IoU of free, of taken, of taken to within a cell; precision and recall of the last, known share, ms.
+
+        Scored are the cells that the map knows or a point fell into. Taken cells that no point fell into (the inside
+        of furniture) are left out of taken, and count as wrong where the map calls them free.
+        """
+        found = _on_grid(self.mapper.process(*_last(self))["map"], self.truth)
+        taken, free = found > 50, (found >= 0) & (found <= 50)
+        true_taken, true_free = self.truth.cells == 100, self.truth.cells == 0
+        seen_taken = true_taken & self.touched
+        known = (found >= 0) | self.touched
+        near_true, near_found = (binary_dilation(m, np.ones((3, 3))) for m in (true_taken, taken))
+        right, false, missed = (taken & near_true).sum(), (taken & ~near_true).sum(), (seen_taken & ~near_found).sum()
+        strict_right = taken & true_taken
+        return [
+            _iou(free, true_free & known),
+            float(strict_right.sum() / (taken | seen_taken).sum()),
+            float(right / (right + false + missed)),
+            float(right / max(1, right + false)),
+            float(1 - missed / max(1, seen_taken.sum())),
+            float((known & (self.truth.cells >= 0)).sum() / (self.truth.cells >= 0).sum()),
+            float(np.median(self.milliseconds)),
+        ]
+
+
+def _last(scored: Scored) -> tuple[PointCloud, Pose]:
+    """Returns an empty cloud that makes the mapper give its map."""
+    scored.mapper.period = 1
+    frame = scored.truth.frame
+    nothing = PointCloud(stamp=scored.stamp, frame="none", points=np.zeros((0, 3), np.float32))
+    return nothing, Pose(stamp=scored.stamp, frame=frame, position=[0, 0, 0], orientation=[0, 0, 0, 1])
+
+
+def _iou(a: Mask, b: Mask) -> float:
+    return float((a & b).sum() / max(1, (a | b).sum()))
+
+
+def _on_grid(found: Message, truth: OccupancyGrid) -> NDArray[np.int16]:
+    """Returns the cells of a map on the grid of the true one; -1 where it does not reach."""
+    assert isinstance(found, OccupancyGrid)
+    row, column = (int(n) for n in np.rint((found.position[1::-1] - truth.position[1::-1]) / truth.resolution))
+    out = np.full(truth.cells.shape, -1, np.int16)
+    rows, columns = (
+        slice(max(0, at), min(size, at + own))
+        for at, size, own in zip((row, column), truth.cells.shape, found.cells.shape, strict=True)
+    )
+    out[rows, columns] = found.cells[rows.start - row : rows.stop - row, columns.start - column : columns.stop - column]
+    return out
+
+
+def occupancy(worlds: list[str], seeds: list[int], seconds: int) -> None:
+    columns = ("world", "sensor", "IoU free", "IoU taken, exact", "to a cell", "precision", "recall", "known", "CPU ms")
+    print("| " + " | ".join(columns) + " |")
+    print("| --- " * 9 + "|")
+    rows: dict[str, list[list[float]]] = {"lidar": [], "depth": []}
+    for world in worlds:
+        for seed in seeds:
+            source = robot(world, seed, seconds, truth={"occupancy": True, "band": BAND})
+            static = source.static_outputs()
+            truth, info, extrinsics = static["occupancy"], static["depth_info"], static["extrinsics"]
+            assert isinstance(truth, OccupancyGrid)
+            assert isinstance(info, CameraInfo)
+            assert isinstance(extrinsics, TransformSet)
+            scored = {"lidar": Scored(truth, far=8.0), "depth": Scored(truth, far=5.0)}
+            for messages in source.stream():
+                depth, points = messages.get("depth"), messages.get("points")
+                base, camera = messages.get("true_base"), messages.get("ground_truth")
+                if isinstance(points, PointCloud) and isinstance(base, Odometry):
+                    scored["lidar"].add(points, base, extrinsics)
+                if isinstance(depth, DepthImage) and isinstance(camera, Pose):
+                    scored["depth"].add(depth_cloud(depth, info), camera, extrinsics)
+            for name, one in scored.items():
+                rows[name].append(one.row())
+                print(f"| {world} {seed} | {name} | " + _cells(rows[name][-1]), flush=True)
+    for name, found in rows.items():
+        print(f"| mean | {name} | " + _cells(np.mean(found, axis=0).tolist()))
+        print(f"| worst | {name} | " + _cells([*np.min(found, axis=0)[:-1], np.max(found, axis=0)[-1]]))
+
+
+def _cells(values: list[float]) -> str:
+    return " | ".join(f"{v:.3f}" for v in values[:-1]) + f" | {values[-1]:.0f} |"
+
+
+class Ours:
+    """TsdfMap, and the CPU milliseconds of each image and of the mesh."""
+
+    def __init__(self, info: CameraInfo) -> None:
+        self.operator, self.info = TsdfMap(period=1_000_000), info
+        self.operator.setup()
+
+    def add(self, depth: DepthImage, pose: Pose) -> None:
+        self.operator.process(depth, pose, self.info)
+
+    def mesh(self, stamp: int, frame: str) -> tuple[Array, NDArray[Any]]:
+        self.operator.period = 1
+        nothing = DepthImage(
+            stamp=stamp, frame=self.info.frame, data=np.zeros((self.info.height, self.info.width), np.float32)
+        )
+        pose = Pose(stamp=stamp, frame=frame, position=[0, 0, 0], orientation=[0, 0, 0, 1])
+        mesh = self.operator.process(nothing, pose, self.info)["mesh"]
+        assert isinstance(mesh, Mesh)
+        return mesh.vertices.astype(np.float64), mesh.triangles
+
+
+class Open3d:
+    """Open3D's ScalableTSDFVolume with the same voxels, truncation and range."""
+
+    def __init__(self, info: CameraInfo) -> None:
+        self.o3d = open3d()
+        volume = self.o3d.pipelines.integration
+        self.volume = volume.ScalableTSDFVolume(0.03, 0.09, volume.TSDFVolumeColorType.NoColor)
+        K = info.K
+        self.camera = self.o3d.camera.PinholeCameraIntrinsic(
+            info.width, info.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+        )
+
+    def add(self, depth: DepthImage, pose: Pose) -> None:
+        grey = self.o3d.geometry.Image(np.zeros(depth.data.shape, np.float32))
+        z = np.where(depth.data <= 4.0, depth.data, 0).astype(np.float32)
+        both = self.o3d.geometry.RGBDImage.create_from_color_and_depth(
+            grey, self.o3d.geometry.Image(z), 1.0, 4.0, convert_rgb_to_intensity=False
+        )
+        self.volume.integrate(both, self.camera, invert(pose.matrix()))
+
+    def mesh(self, stamp: int, frame: str) -> tuple[Array, NDArray[Any]]:
+        mesh = self.volume.extract_triangle_mesh()
+        return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+
+
+def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float, rng: np.random.Generator) -> Array:
+    """Points (N, 3) drawn evenly from the surface."""
+    corners = vertices[triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
+    chosen = rng.choice(len(corners), int(area.sum() * per_square_metre), p=area / area.sum())
+    root, second = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
+    weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)
+    return np.einsum("nk,nkd->nd", weights, corners[chosen])
+
+
+def near(points: Array, others: Array, distance: float) -> Mask:
+    return np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0])
+
+
+def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
+    """Precision is over the mesh; recall over the true surface within 2 cm of noise-free returns nearer than 4 m."""
+    print("| world | map | F(5 cm) | precision | recall | mean distance, cm | CPU ms an image | mesh, s |")
+    print("| --- " * 8 + "|")
+    rows: dict[str, list[list[float]]] = {"ours": [], "Open3D": []}
+    for world in worlds:
+        for seed in seeds:
+            source = robot(world, seed, seconds, truth={"mesh": True}, lidar={"rate": 0.0})
+            exact = {"rate": 4.0, "noise": 0.0, "quantum": 0.0002, "edge_holes": 0.0, "specks": 0.0}
+            clean = robot(world, seed, seconds, lidar={"rate": 0.0}, depth_camera=exact)
+            static = source.static_outputs()
+            true, info = static["mesh"], static["depth_info"]
+            assert isinstance(true, Mesh)
+            assert isinstance(info, CameraInfo)
+            maps: dict[str, Ours | Open3d] = {"ours": Ours(info), "Open3D": Open3d(info)}
+            spent: dict[str, list[float]] = {name: [] for name in maps}
+            returns = []
+            for measured, sharp in zip(source.stream(), clean.stream(), strict=True):
+                depth, pose, ideal = measured["depth"], measured["ground_truth"], sharp["depth"]
+                assert isinstance(depth, DepthImage)
+                assert isinstance(pose, Pose)
+                assert isinstance(ideal, DepthImage)
+                for name, one in maps.items():
+                    begin = time.process_time()
+                    one.add(depth, pose)
+                    spent[name].append(1e3 * (time.process_time() - begin))
+                seen = depth_cloud(ideal, info).points.astype(np.float64)
+                returns.append(transform_points(pose.matrix(), seen[seen[:, 2] < 4.0]))
+            rng = np.random.default_rng(0)
+            still = on_surface(true.vertices.astype(np.float64), true.triangles, 4000, rng)
+            due = still[rng.random(len(still)) < 0.2]
+            due = due[near(due, np.concatenate(returns), 0.02)]
+            tree = cKDTree(still)
+            for name, one in maps.items():
+                begin = time.process_time()
+                vertices, triangles = one.mesh(depth.stamp, pose.frame)
+                took = time.process_time() - begin
+                found = on_surface(vertices, triangles, 1000, rng)
+                off = tree.query(found, distance_upper_bound=0.3)[0]
+                precision, recall = float((off < 0.05).mean()), float(near(due, found, 0.05).mean())
+                score = 2 * precision * recall / (precision + recall)
+                mean = 100 * float(np.minimum(off, 0.3).mean())
+                rows[name].append([score, precision, recall, mean, float(np.median(spent[name])), took])
+                print(f"| {world} {seed} | {name} | " + _figures(rows[name][-1]), flush=True)
+    for name, values in rows.items():
+        print(f"| mean | {name} | " + _figures(np.mean(values, axis=0).tolist()))
+        worst = [*np.min(values, axis=0)[:3], *np.max(values, axis=0)[3:]]
+        print(f"| worst | {name} | " + _figures(worst))
+
+
+def _figures(values: list[float]) -> str:
+    return (
+        f"{values[0]:.3f} | {values[1]:.3f} | {values[2]:.3f} | {values[3]:.2f} | {values[4]:.0f} | {values[5]:.1f} |"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["occupancy", "surface"])
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[21, 22])
+    parser.add_argument("--seconds", type=int, default=30)
+    arguments = parser.parse_args()
+    {"occupancy": occupancy, "surface": surface}[arguments.what](arguments.worlds, arguments.seeds, arguments.seconds)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+"""What the shipped networks and a depth camera make of simulated worlds, with the truth: input of other benchmarks.
+
+Each world is driven through once, at 640x480; what was sensed is kept in a folder, since networks are slow.
+"""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dataflow.messages import (
+    Activity,
+    Boxes3D,
+    CameraInfo,
+    Detections2D,
+    Odometry,
+    PointCloud,
+    Pose,
+    SceneGraph,
+    SegmentationMap,
+    Transforms,
+)
+from operators.cloud import CloudBuilder
+from operators.detection import CustomDetector
+from operators.segmentation import Segmenter
+from operators.sources.simulated_robot import SimulatedRobot
+
+KINDS = ("office", "table_top", "corridor")
+RATE, SECONDS = 4.0, 50
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One image: what was sensed, then what is true."""
+
+    detections: Detections2D
+    segmentation: SegmentationMap
+    cloud: PointCloud
+    camera: Pose
+    base: Odometry
+    objects: Detections2D
+    boxes: Boxes3D
+    masks: SegmentationMap
+    scene: SceneGraph
+    activities: Activity
+
+
+@dataclass(frozen=True)
+class World:
+    name: str
+    image_info: CameraInfo
+    extrinsics: Transforms
+    frames: list[Frame]
+
+
+def sense(kind: str, seed: int) -> World:
+    robot = SimulatedRobot(
+        world=kind,
+        seed=seed,
+        people=3,
+        route="tour",
+        duration=f"{SECONDS}s",
+        color_camera={"rate": RATE, "width": 640, "height": 480},
+        depth_camera={"rate": RATE},
+        truth={"poses": RATE, "relations": RATE, "activities": RATE, "masks": True, "min_pixels": 50},
+    )
+    builder, detector, segmenter = (
+        CloudBuilder(stride=3, max_range=6.0),
+        CustomDetector(score_threshold=0.1),
+        Segmenter(),
+    )
+    for operator in (robot, builder, detector, segmenter):
+        operator.setup()
+    static: dict[str, Any] = dict(robot.static_outputs())
+    frames = []
+    for messages in robot.stream():
+        m: dict[str, Any] = dict(messages)
+        cloud = builder.process(
+            m["depth"], m["image"], static["depth_info"], static["image_info"], static["extrinsics"]
+        )
+        frames.append(
+            Frame(
+                detections=detector.process(m["image"]),
+                segmentation=segmenter.process(m["image"]),
+                cloud=cloud,
+                camera=m["ground_truth"],
+                base=m["true_base"],
+                **{n: m[n] for n in ("objects", "boxes", "masks", "scene", "activities")},
+            )
+        )
+    robot.close()
+    return World(f"{kind} {seed}", static["image_info"], static["extrinsics"], frames)
+
+
+def sensed(seeds: range, folder: Path) -> Iterator[World]:
+    """Yields a world of each seed, the kinds in turn; those that the folder has are read from it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for seed in seeds:
+        kind = KINDS[seed % len(KINDS)]
+        file = folder / f"{kind}_{seed}.pickle"
+        if not file.is_file():
+            partial = file.with_suffix(".partial")
+            partial.write_bytes(pickle.dumps(sense(kind, seed)))
+            partial.replace(file)
+        yield pickle.loads(file.read_bytes())

@@ -1,0 +1,74 @@
+"""The material of a look: anything that has streams with timestamps and messages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from dataflow.messages import Message
+from dataflow.recording import Recording
+from dataflow.recording.layout import RECORDING, Kind
+
+Stamps = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class StreamFacts:
+    """`type` is the message type's name, or the file's own where no message type is known for it (`readable`)."""
+
+    type: str
+    static: bool
+    count: int
+    readable: bool
+
+
+class Material(Protocol):
+    """A recording of any kind. Streams are given by name, in the order they are to be reported in."""
+
+    @property
+    def namespace(self) -> str: ...
+
+    @property
+    def streams(self) -> Mapping[str, StreamFacts]: ...
+
+    def stamps(self, stream: str) -> Stamps:
+        """The timestamps (ns) of a stream in the order in which it was written."""
+        ...
+
+    def messages(self, stream: str) -> Iterator[Message]:
+        """The messages of a readable stream, in that order."""
+        ...
+
+
+class RecordedMaterial:
+    """An open recording as material; the runtime's own streams are left out."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self.namespace = recording.metadata.get(RECORDING, {}).get("namespace", "")
+        self.streams: Mapping[str, StreamFacts] = {
+            name: StreamFacts(
+                info.schema if info.message_type is None else info.message_type.SCHEMA,
+                info.static,
+                info.count,
+                info.message_type is not None,
+            )
+            for name, info in recording.streams.items()
+            if "/@/" not in f"/{name}"
+        }
+
+    def stamps(self, stream: str) -> Stamps:
+        """Our own recordings: from the index. Others: of the messages, else the log times."""
+        info = self._recording.streams[stream]
+        if info.metadata.get("kind") == Kind.STREAM:
+            return np.fromiter(self._recording.stamps(stream), np.int64)
+        if info.message_type is not None:
+            return np.array([message.stamp for message in self.messages(stream)], np.int64)
+        return np.array([record.log_time for record in self._recording.raw([stream])], np.int64)
+
+    def messages(self, stream: str) -> Iterator[Message]:
+        return (recorded.message for recorded in self._recording.messages([stream]))

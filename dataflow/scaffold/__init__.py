@@ -1,0 +1,1 @@
+"""Beginnings of operators, graphs and projects, as files whose tests pass."""

@@ -1,0 +1,93 @@
+"""Lists the files of a beginning, by path."""
+
+from __future__ import annotations
+
+import keyword
+import re
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Literal
+
+from dataflow.scaffold import templates
+
+Kind = Literal["operator", "timer", "source"]
+KINDS: tuple[Kind, ...] = ("operator", "timer", "source")
+_OPERATORS = {
+    "operator": (templates.OPERATOR, templates.OPERATOR_TEST),
+    "timer": (templates.TIMER, templates.TIMER_TEST),
+    "source": (templates.SOURCE, templates.SOURCE_TEST),
+}
+
+
+class NameFault(ValueError):
+    """A name that a module, a class or a graph cannot have: says why."""
+
+
+def snake(name: str) -> str:
+    """`NearestObstacle`, `nearest-obstacle` → `nearest_obstacle`. Raises `NameFault`."""
+    parts = re.sub(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])", "_", name)
+    found = re.sub(r"[-\s.]+", "_", parts).lower()
+    if not found.isidentifier() or not found.isascii():
+        raise NameFault(f"{name!r} cannot be a name in Python: write letters, digits and '_', a letter first")
+    if keyword.iskeyword(found) or found in sys.stdlib_module_names or found in ("dataflow", "operators", "tests"):
+        raise NameFault(f"{name!r} is taken: Python has {found!r} already; choose another name")
+    return found
+
+
+def camel(name: str) -> str:
+    """`nearest_obstacle` → `NearestObstacle`."""
+    return "".join(part[:1].upper() + part[1:] for part in snake(name).split("_") if part)
+
+
+def operator_files(name: str, kind: Kind = "operator", package: str = "") -> Mapping[Path, str]:
+    """An operator's module and its test. `package`: the package that the module is put into."""
+    module = snake(name)
+    code, test = _OPERATORS[kind]
+    words = {
+        "Class": camel(name),
+        "Title": camel(name),
+        "module": f"{package}.{module}" if package else module,
+    }
+    return {Path(f"{module}.py"): code.substitute(words), Path(f"test_{module}.py"): test.substitute(words)}
+
+
+def graph_files(name: str) -> Mapping[Path, str]:
+    """A graph file."""
+    stem = snake(name)
+    words = {"Title": stem.replace("_", " "), "name": stem, "file": f"{stem}.yaml"}
+    about = "a camera and the clouds of what it sees."
+    text = templates.GRAPH.substitute(words, about=about, more=templates.GRAPH_CLOUD)
+    return {Path(f"{stem}.yaml"): _trimmed(text)}
+
+
+def project_files(name: str) -> Mapping[Path, str]:
+    """A project: a package with an operator, a graph, tests, and what installs them."""
+    package = snake(name)
+    words = {
+        "name": name,
+        "package": package,
+        "distribution": package.replace("_", "-"),
+        "module": f"{package}.brightness",
+        "Class": "Brightness",
+        "Title": package.replace("_", " "),
+        "node": "brightness",
+    }
+    operator = operator_files("brightness", package=package)
+    node = templates.GRAPH_OPERATOR.substitute(words)
+    about = "how bright the camera's images are."
+    graph = templates.GRAPH.substitute(words | {"name": package}, file=f"graphs/{package}.yaml", about=about, more=node)
+    return {
+        Path("README.md"): templates.README.substitute(words),
+        Path("pyproject.toml"): templates.PROJECT.substitute(words),
+        Path(".gitignore"): templates.GITIGNORE,
+        Path(package, "__init__.py"): templates.PACKAGE.substitute(words),
+        Path(package, "brightness.py"): operator[Path("brightness.py")],
+        Path("graphs", f"{package}.yaml"): _trimmed(graph),
+        Path("tests", "test_brightness.py"): operator[Path("test_brightness.py")],
+        Path("tests", "test_graphs.py"): templates.GRAPH_TEST.substitute(words),
+    }
+
+
+def _trimmed(text: str) -> str:
+    return text.rstrip("\n") + "\n"

@@ -1,0 +1,307 @@
+"""The files as texts: `$name` and the like are filled in by `dataflow.scaffold.files`."""
+
+from __future__ import annotations
+
+from string import Template
+
+OPERATOR = Template('''\
+"""$Title: an operator."""
+
+from __future__ import annotations
+
+from dataflow.messages import Image, Number
+from dataflow.operator import In, Operator, Out, Param
+
+
+class $Class(Operator):
+    """Measures how bright an image is."""
+
+    image: In[Image] = In(doc="what the camera sees")
+    brightness: Out[Number] = Out(doc="mean of all pixels, 0 to 1")
+
+    scale: float = Param(1.0, gt=0, live=True, doc="factor on the result")
+
+    def setup(self) -> None:
+        """Loads what takes long, once, before the first message."""
+        self.darkest = 1.0
+
+    def process(self, image: Image) -> Number:
+        """Called for each image, in the order of their timestamps. Returns a message, or None for nothing."""
+        value = self.scale * float(image.data.mean()) / 255
+        if value < self.darkest:
+            self.darkest = value
+            self.log.info("darkest so far: %.3f", value)
+        return Number(stamp=image.stamp, value=value)
+
+    def summary(self) -> dict[str, float]:
+        """What `dataflow run` prints at the end."""
+        return {"darkest": self.darkest}
+''')
+
+OPERATOR_TEST = Template('''\
+"""$Title measures what it says."""
+
+import numpy as np
+import pytest
+
+from dataflow.messages import Image
+from dataflow.testing import play
+from $module import $Class
+
+
+def image(stamp: int, value: int) -> Image:
+    return Image(stamp=stamp, frame="camera", data=np.full((4, 6), value, np.uint8))
+
+
+def test_a_white_image_is_as_bright_as_can_be() -> None:
+    played = play($Class(), {"image": [image(1, 255), image(2, 0)]})
+    assert [number.value for number in played["brightness"]] == [1.0, 0.0]
+    assert [number.stamp for number in played["brightness"]] == [1, 2]
+
+
+def test_the_scale_is_a_factor_and_above_zero() -> None:
+    (number,) = play($Class(scale=0.5), {"image": [image(1, 255)]})["brightness"]
+    assert number.value == pytest.approx(0.5)
+    with pytest.raises(ValueError, match="scale"):
+        $Class(scale=0)
+''')
+
+TIMER = Template('''\
+"""$Title: an operator that works by the clock of its messages."""
+
+from __future__ import annotations
+
+from dataflow.messages import Image, Number
+from dataflow.operator import Batch, Context, Operator, Out
+
+
+class $Class(Operator, every="500ms"):
+    """Counts the images of each half second. Ticks follow the timestamps, so a replay gives the same counts."""
+
+    image: Batch[Image] = Batch(doc="all images since the last tick")
+    rate: Out[Number] = Out(doc="images a second")
+
+    def process(self, image: tuple[Image, ...], context: Context) -> Number:
+        """Called at each tick, also when no image came."""
+        return Number(stamp=context.stamp, value=len(image) / 0.5, unit="Hz")
+''')
+
+TIMER_TEST = Template('''\
+"""$Title counts by timestamps."""
+
+import numpy as np
+
+from dataflow.messages import Image
+from dataflow.testing import play
+from $module import $Class
+
+SECOND = 1_000_000_000
+
+
+def test_images_are_counted_tick_by_tick() -> None:
+    images = [Image(stamp=k * SECOND // 10, frame="c", data=np.zeros((2, 2), np.uint8)) for k in range(1, 16)]
+    played = play($Class(), {"image": images})
+    assert [number.stamp / SECOND for number in played["rate"]] == [0.5, 1.0, 1.5]
+    assert [number.value for number in played["rate"]] == [10.0, 10.0, 10.0]
+''')
+
+SOURCE = Template('''\
+"""$Title: a source, which reads a device."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+from dataflow.messages import Number
+from dataflow.operator import Out, Param, Source
+
+
+class Device:
+    """Stands in for the driver of a device: replace it by yours."""
+
+    def read(self) -> float:
+        """Waits for the next reading."""
+        time.sleep(0.1)
+        return 21.5
+
+    def close(self) -> None:
+        """Lets go of the device."""
+
+
+class $Class(Source):
+    """Readings of a thermometer, as they come."""
+
+    live = True  # it does not wait for anybody: `dataflow run --live` reads it on a thread of its own
+
+    temperature: Out[Number] = Out(doc="degrees Celsius")
+
+    count: int = Param(0, ge=0, doc="readings after which it ends; 0: never")
+
+    def setup(self) -> None:
+        """Opens the device. An error here is reported with this operator's name."""
+        self.device = Device()
+
+    def stream(self) -> Iterator[dict[str, Number]]:
+        """Yields what was read at one moment. Timestamps strictly increase; take the device's own where it has them."""
+        done = 0
+        while not self.count or done < self.count:
+            value = self.device.read()
+            yield {"temperature": Number(stamp=time.time_ns(), value=value, unit="°C")}
+            done += 1
+
+    def close(self) -> None:
+        """Called at the end, also after an error."""
+        self.device.close()
+''')
+
+SOURCE_TEST = Template('''\
+"""$Title hands on what its device reads."""
+
+import $module
+from dataflow.testing import play
+from $module import $Class
+
+
+class FakeDevice:
+    def __init__(self) -> None:
+        self.left = [20.0, 20.5]
+        self.closed = False
+
+    def read(self) -> float:
+        return self.left.pop(0)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+def test_every_reading_is_a_message(monkeypatch) -> None:
+    device = FakeDevice()
+    monkeypatch.setattr($module, "Device", lambda: device)
+    played = play($Class(count=2))
+    assert [number.value for number in played["temperature"]] == [20.0, 20.5]
+    stamps = [number.stamp for number in played["temperature"]]
+    assert stamps[0] < stamps[1]
+    assert device.closed
+''')
+
+GRAPH = Template("""\
+# $Title: $about
+#
+#   dataflow check $file
+#   dataflow run $file --view spawn
+#   dataflow run $file --record out/run.mcap
+graph: $name
+namespace: robot1
+
+params:
+  frames: 60
+
+operators:
+  camera:  # a synthetic one; dataflow operators lists what there is
+    use: operators.sources:SyntheticRgbd
+    params: {frames: "$${frames}", rate: 30, width: 160, height: 120}
+$more
+""")
+
+GRAPH_OPERATOR = Template("""\
+
+  $node:
+    use: $module:$Class
+    inputs: {image: camera/image}
+""")
+
+GRAPH_CLOUD = """\
+
+  cloud:
+    use: operators.cloud:CloudBuilder
+    inputs:
+      depth: camera/depth
+      image: camera/image
+      depth_info: camera/depth_info
+      image_info: camera/image_info
+    params: {stride: 4}
+"""
+
+PROJECT = Template("""\
+[build-system]
+requires = ["setuptools>=77"]
+build-backend = "setuptools.build_meta"
+
+[project]
+name = "$distribution"
+version = "0.1.0"
+description = "Operators and graphs of $name"
+requires-python = ">=3.11"
+dependencies = ["robot-dataflow"]
+
+[project.optional-dependencies]
+dev = ["pytest>=8"]
+
+# so that `dataflow operators` lists yours
+[project.entry-points."dataflow.operators"]
+$package = "$package"
+
+[tool.setuptools.packages.find]
+include = ["$package*"]
+
+[tool.pytest.ini_options]
+testpaths = ["tests"]
+pythonpath = ["."]
+""")
+
+PACKAGE = Template('''\
+"""Operators of $name."""
+
+from $package.brightness import Brightness
+
+__all__ = ["Brightness"]
+''')
+
+GRAPH_TEST = Template('''\
+"""The graphs are sound, and run the same twice."""
+
+from pathlib import Path
+
+import pytest
+
+import dataflow
+from dataflow.graph import load_graph
+
+GRAPHS = Path(__file__).parent.parent / "graphs"
+
+
+@pytest.mark.parametrize("file", sorted(GRAPHS.glob("*.yaml")), ids=lambda file: file.stem)
+def test_a_graph_is_sound(file: Path) -> None:
+    load_graph(file)  # raises with line and column
+
+
+def test_a_recorded_run_is_repeated_bit_for_bit(tmp_path: Path) -> None:
+    recording = tmp_path / "run.mcap"
+    dataflow.run(GRAPHS / "$package.yaml", record=recording, settings={"frames": 10})
+    assert len(dataflow.open(recording)["brightness/brightness"]) == 10
+    assert dataflow.verify(recording).identical
+''')
+
+README = Template("""\
+# $name
+
+    python3 -m venv .venv && . .venv/bin/activate
+    pip install -e ".[dev]"
+    pytest
+    dataflow run graphs/$package.yaml --record out/run.mcap --view out/run.rrd
+    dataflow verify out/run.mcap
+
+| | |
+| --- | --- |
+| `$package/` | operators: `dataflow new operator NAME --to $package` begins another |
+| `graphs/` | which operators run, and how they are wired: `dataflow new graph NAME --to graphs` |
+| `tests/` | tests of both |
+""")
+
+GITIGNORE = """\
+.venv/
+__pycache__/
+*.egg-info/
+/out/
+"""

@@ -1,0 +1,84 @@
+"""Object detection with torchvision's networks by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dataflow.messages import Detections2D, Image
+from dataflow.operator import In, Operator, Out, Param
+from operators.torch_models import DEFAULT, Runner, load, tensor_of, wanted_classes
+
+if TYPE_CHECKING:
+    from torch import nn
+
+
+class TorchvisionDetector(Operator):
+    """Finds objects with a network of torchvision's zoo: Faster R-CNN, SSD, RetinaNet, FCOS and others by name.
+
+    Class names and ids come from the weights themselves. On a CPU with one thread equal images give equal boxes; on a
+    GPU they do as far as the card's libraries do. Where the GPU's memory does not suffice, an image is worked on by the
+    CPU, which is counted and logged once. Methods: Ren et al. 2015 (Faster R-CNN), Liu et al. 2016 (SSD), Lin et al.
+    2017 (RetinaNet), as implemented by torchvision (BSD-3-Clause).
+    """
+
+    stateless = True
+
+    image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
+    detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score")
+
+    model: str = Param("fasterrcnn_resnet50_fpn_v2", doc="a detection model of torchvision")
+    weights: str = Param(DEFAULT, doc="torchvision's weights by name (COCO_V1), from its cache; nothing is downloaded")
+    checkpoint: str | None = Param(None, doc="weights of your own in place of them: a file of torch.save")
+    device: str = Param("cpu", doc="cpu, cuda, cuda:1 or mps")
+    half: bool = Param(False, doc="compute in half precision; on a GPU alone")
+    classes: tuple[str, ...] = Param((), doc="only these classes, by name; none means all")
+    score_threshold: float = Param(0.5, ge=0, le=1, live=True, doc="boxes below are dropped")
+    nms_iou: float | None = Param(
+        None, ge=0, le=1, doc="overlap above which the weaker box of a class is dropped; none means the model's own"
+    )
+    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+
+    def setup(self) -> None:
+        """Loads the model. Raises FileNotFoundError, or ModelError for missing weights, devices or classes."""
+        file = None if self.checkpoint is None else self.use_file(self.checkpoint)
+        loaded = load("detection", self.model, self.weights, file, self.device)
+        self._names = loaded.classes
+        self._wanted = wanted_classes(self._names, self.classes, "TorchvisionDetector.classes")
+        self._run = Runner(loaded.model, loaded.device, half=self.half)
+        _limit(loaded.model, self.score_threshold, self.nms_iou)
+
+    def process(self, image: Image) -> Detections2D:
+        found = self._run(tensor_of(image), lambda model, tensor: model([tensor])[0])
+        boxes, scores, labels = (found[key].float().cpu().numpy() for key in ("boxes", "scores", "labels"))
+        labels = labels.astype(np.int32)
+        keep = (scores >= self.score_threshold) & self._wanted[labels]
+        keep &= (boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])
+        order = np.flatnonzero(keep)[np.argsort(-scores[keep], kind="stable")][: self.max_detections]
+        return Detections2D(
+            stamp=image.stamp,
+            frame=image.frame,
+            width=image.width,
+            height=image.height,
+            class_names=self._names,
+            boxes=boxes[order].astype(np.float32),
+            scores=np.clip(scores[order], 0, 1).astype(np.float32),
+            class_ids=labels[order],
+        )
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        """Counts the images for which the GPU's memory did not suffice."""
+        return self._run.summary()
+
+
+def _limit(model: nn.Module, score: float, nms_iou: float | None) -> None:
+    """Makes a model give all boxes down to `score`, and sets the overlap of its suppression where one is given.
+
+    torchvision keeps both on the model (SSD, RetinaNet, FCOS) or on its heads (the R-CNNs).
+    """
+    part = getattr(model, "roi_heads", model)
+    part.score_thresh = min(float(part.score_thresh), score)  # type: ignore[arg-type]
+    if nms_iou is not None:
+        part.nms_thresh = nms_iou

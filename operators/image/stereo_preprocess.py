@@ -1,0 +1,164 @@
+"""Stereo pairs made ready for what comes after: rectified, with the calibrations that result."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dataflow.messages import CameraInfo, Diagnostics, Image, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.geometry.calibration import check_fit
+from operators.geometry.extrinsics import transform_between
+from operators.geometry.lens import check_model
+from operators.geometry.se3 import Matrix
+from operators.image.preparation import Preparation, Tone, grey_of
+from operators.image.rectification import projection, rectify
+from operators.image.view import Window
+from operators.status import counted_status
+
+Calibration = tuple[CameraInfo, CameraInfo, Transforms | None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Pair:
+    """Both images' preparations, what they have in common, and where the rectified cameras look."""
+
+    left: Preparation
+    right: Preparation
+    baseline: float
+    frames: Transforms
+
+
+class StereoPreprocess(Operator):
+    """Rectifies a stereo pair, so that rows of the two images correspond; crops, scales and normalises both alike.
+
+    Where both calibrations hold P, those say how, with R where they turn; else the pair is rectified by `extrinsics`.
+    Pixels that need not be sampled again pass bit for bit. Where the rectified cameras look elsewhere than the raw ones
+    their frames have names of their own; `frames` tells how they are turned.
+
+    Method: Bouguet's, as in Bradski and Kaehler, "Learning OpenCV", 2008.
+    """
+
+    left: In[Image] = In(doc="raw left image, grey or colour")
+    right: In[Image] = In(doc="raw right image of the same stamp")
+    left_info: Sampled[CameraInfo] = Sampled(doc="calibration of the left camera")
+    right_info: Sampled[CameraInfo] = Sampled(doc="calibration of the right camera")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the two cameras; needed where the calibrations hold no P"
+    )
+    prepared_left: Out[Image] = Out(doc="left image, rectified")
+    prepared_right: Out[Image] = Out(doc="right image, rectified")
+    prepared_left_info: Out[CameraInfo] = Out(doc="calibration of the left one, with each image")
+    prepared_right_info: Out[CameraInfo] = Out(doc="calibration of the right one; P holds the baseline")
+    frames: Out[Transforms] = Out(doc="the rectified cameras in the raw ones, with each pair")
+    status: Out[Diagnostics] = Out(doc="the baseline; pixels that show nothing; a warning where half do not")
+
+    keep: float = Param(
+        0.0, ge=0, le=1, doc="0 shows no pixel without image, 1 every pixel of the raw images; unless P says"
+    )
+    crop: tuple[int, int, int, int] | None = Param(
+        None, doc="x, y, width and height of the part that is kept of both", unit="px"
+    )
+    width: int | None = Param(None, ge=1, doc="columns in the end; as the height asks if none", unit="px")
+    height: int | None = Param(None, ge=1, doc="rows in the end; as the width asks if none", unit="px")
+    grey: bool = Param(False, doc="grey instead of colour")
+    normalize: Tone = Param("none", doc="how brightness is made even: stretched, equalised, or equalised in parts")
+    suffix: str = Param("_rectified", min_length=1, doc="added to the frames' names")
+
+    _made: tuple[Calibration, _Pair] | None = None
+
+    def setup(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def process(
+        self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo,
+        extrinsics: Transforms | None = None,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Raises ValueError where an image does not fit its calibration, or the two cannot be rectified."""
+        check_fit("left", left, left_info)
+        check_fit("right", right, right_info)
+        given = (left_info, right_info, extrinsics)
+        if self._made is None or self._made[0] != given:
+            self._made = (given, self._pair(*given))
+        pair = self._made[1]
+        messages: dict[str, Any] = {"frames": pair.frames.replace(stamp=left.stamp)}
+        for name, image, preparation in (("left", left, pair.left), ("right", right, pair.right)):
+            pixels = preparation.apply(grey_of(image.data) if self.grey else image.data)
+            info = preparation.info.replace(stamp=left.stamp)
+            messages[f"prepared_{name}"] = Image(stamp=left.stamp, frame=info.frame, data=pixels)
+            messages[f"prepared_{name}_info"] = info
+        counts = {
+            "pixels": pair.left.info.width * pair.left.info.height,
+            "left without image": pair.left.empty,
+            "right without image": pair.right.empty,
+        }
+        self._counts.update({"pairs": 1, "pixels without image": pair.left.empty + pair.right.empty})
+        return messages | {"status": _status(left.stamp, pair.baseline, counts)}
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return dict(self._counts)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._counts = Counter({key: int(count) for key, count in state.items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return dict(self._counts)
+
+    def _pair(self, left: CameraInfo, right: CameraInfo, extrinsics: Transforms | None) -> _Pair:
+        check_model("left", left)
+        check_model("right", right)
+        if (left.width, left.height) != (right.width, right.height):
+            raise ValueError(
+                f"left has {left.width}x{left.height} pixels, but right {right.width}x{right.height}: a pair that is "
+                f"rectified must have one size"
+            )
+        if left.P is not None and right.P is not None:
+            turns, projections = (_rotation(left), _rotation(right)), (left.P, right.P)
+        elif extrinsics is None:
+            raise ValueError("left_info and right_info hold no P to rectify by, and there are no extrinsics")
+        else:
+            T_left_right = transform_between(extrinsics, right.frame, left.frame)
+            found = rectify(left, right, T_left_right, self.keep)
+            turns = (found.R_left, found.R_right)
+            projections = (projection(found.K, 0.0), projection(found.K, found.baseline))
+        window = Window.of((left.width, left.height), self.crop, self.width, self.height)
+        prepared = [
+            Preparation(info, _ideal(info, P, self.suffix), window, R=R, tone=self.normalize)
+            for info, R, P in zip((left, right), turns, projections, strict=True)
+        ]
+        baseline = float((projections[0][0, 3] - projections[1][0, 3]) / projections[1][0, 0])
+        return _Pair(prepared[0], prepared[1], baseline, _turned((left, right), turns, self.suffix))
+
+
+def _rotation(info: CameraInfo) -> Matrix:
+    return np.eye(3) if info.R is None else info.R
+
+
+def _ideal(info: CameraInfo, P: Matrix, suffix: str) -> CameraInfo:
+    return info.replace(
+        frame=info.frame + suffix, distortion_model="none", distortion=None, K=P[:, :3], R=None, P=P
+    )  # fmt: skip
+
+
+def _turned(infos: tuple[CameraInfo, CameraInfo], turns: tuple[Matrix, Matrix], suffix: str) -> Transforms:
+    """The rectified frames in the raw ones: R maps the other way."""
+    return Transforms(
+        stamp=infos[0].stamp,
+        frames=tuple(info.frame for info in infos),
+        child_frames=tuple(info.frame + suffix for info in infos),
+        translations=np.zeros((2, 3)),
+        rotations=np.stack([matrix_to_quaternion(R.T) for R in turns]),
+    )
+
+
+def _status(stamp: int, baseline: float, counts: Mapping[str, int]) -> Diagnostics:
+    text, level = f"baseline {baseline:.4f} m", Level.OK
+    if max(counts["left without image"], counts["right without image"]) * 2 > counts["pixels"]:
+        text, level = f"{text}; most pixels of an image show nothing", Level.WARN
+    return counted_status("stereo_preprocess", stamp, text, level, counts)

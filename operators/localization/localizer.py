@@ -1,0 +1,271 @@
+"""Localisation by particles in a known map as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import (
+    Boxes3D,
+    Diagnostics,
+    Imu,
+    LandmarkSightings,
+    LaserScan,
+    Message,
+    NavSatFix,
+    OccupancyGrid,
+    Odometry,
+    ParticleSet,
+    PointCloud,
+    Pose,
+    Transforms,
+)
+from dataflow.messages.geometry import invert
+from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
+from operators.geometry.extrinsics import transform_between
+from operators.localization.dead_reckoning import DeadReckoning, vertical_rate
+from operators.localization.likelihood_field import LikelihoodField
+from operators.localization.map_file import read_map
+from operators.localization.monte_carlo import CloudConfig
+from operators.localization.motion import DriveNoise
+from operators.localization.output import Estimate, flat, planar, status_of
+from operators.localization.reading import MODALITIES, Surroundings, Unusable, observation
+from operators.localization.vote import Vote
+
+Array = NDArray[np.float64]
+
+
+class ParticleFilterLocalizer(Operator, merge=True):
+    """Finds and follows a robot in a known map by particles (x, y, yaw), from several sensors at once.
+
+    Odometry, with a gyroscope for its turns, moves the particles. They are weighed by lidar scans against the map's
+    likelihood field, by landmarks (with or without identities) and classified objects against maps of these, and by
+    positions. Without a first pose they begin where the first observation puts them. When observations fit worse than
+    they used to, samples that would explain them are injected, so a robot that was carried away is found again. Their
+    number follows the spread of the cloud (KLD sampling); it is drawn anew by systematic resampling.
+
+    A sensor whose innovations are larger than its noise explains, while another sensor's are not, counts less, and the
+    status says so. Beside the fused cloud every modality has a cloud of its own, with the same motion.
+
+    Poses come while the robot is localised: most of the weight lies in one place and observations fit there. Sensors
+    are taken at their own stamps, between the odometry messages around them.
+
+    Methods: Thrun, Burgard and Fox, "Probabilistic Robotics", 2005, chapter 8 (augmented Monte Carlo localisation);
+    Fox, "Adapting the sample size in particle filters through KLD-sampling", 2003.
+    """
+
+    odometry: In[Odometry] = In(doc="planar motion: increments between messages count, the pose itself does not")
+    measurements: In[PointCloud | LaserScan | LandmarkSightings | Boxes3D | Pose | NavSatFix | Imu] = In(
+        many=True,
+        doc="lidar, landmarks seen, objects seen, positions in the map frame; and an inertial sensor, which gives the "
+        "turns in place of the odometry",
+    )
+    extrinsics: Sampled[Transforms] = Sampled(required=False, doc="where the sensors are on the robot")
+    map: Sampled[OccupancyGrid] = Sampled(required=False, doc="the map for lidar; see also map_file")
+    landmark_map: Sampled[LandmarkSightings] = Sampled(required=False, doc="where the landmarks are")
+    object_map: Sampled[Boxes3D] = Sampled(required=False, doc="where objects that stand still are")
+    pose: Out[Odometry] = Out(doc="the base in the map with covariance, at every odometry message while localised")
+    correction: Out[Transforms] = Out(doc="the odometry frame in the map frame (REP 105), with every pose")
+    particles: Out[ParticleSet] = Out(doc="the fused cloud")
+    lidar_pose: Out[Odometry] = Out(doc="what lidar alone says, while its cloud is in one place")
+    landmark_pose: Out[Odometry] = Out(doc="what landmarks and objects alone say")
+    position_pose: Out[Odometry] = Out(doc="what positions alone say")
+    status: Out[Diagnostics] = Out(doc="localised, searching or lost, and what each sensor counts; every second")
+
+    map_frame: str = Param("world", min_length=1, doc="frame of the maps and of the pose")
+    base_frame: str = Param("base_link", min_length=1, doc="frame that is posed, on the floor")
+    map_file: str | None = Param(None, doc="saved map (YAML and image, as ROS's map_server has them), if no stream")
+    start: tuple[float, float, float] | None = Param(None, doc="first x, y, yaw (m, rad); looked for if none")
+    start_sigma: tuple[float, float] = Param((0.3, 0.2), doc="standard deviations of the first pose, m and rad")
+    min_particles: int = Param(200, ge=20, doc="particles at least")
+    max_particles: int = Param(1000, ge=50, doc="particles at most; so many wherever the robot is looked for")
+    modality_particles: int = Param(300, ge=0, doc="particles of each modality's own cloud; 0 for no such clouds")
+    kld_error: float = Param(0.05, gt=0, lt=1, doc="error of the distribution that sets the number of particles")
+    points: int = Param(60, ge=8, doc="points of a scan that are looked up")
+    worth: float = Param(15.0, gt=0, doc="independent ones among them")
+    hit_sigma: float = Param(0.08, gt=0, doc="standard deviation of a point from its taken cell", unit="m")
+    stray: float = Param(0.15, gt=0, lt=1, doc="share of points that are of nothing in the map")
+    band: tuple[float, float] = Param((0.1, 1.4), doc="heights between which points count, m")
+    own: float = Param(0.4, ge=0, doc="points nearer than this are the robot itself", unit="m")
+    object_sigma: float = Param(0.15, gt=0, doc="standard deviation of objects without covariance", unit="m")
+    origin: tuple[float, float, float] | None = Param(
+        None, doc="latitude, longitude, altitude of the map's origin, x east; for satellite fixes"
+    )
+    noise: DriveNoise = Param(DriveNoise(), doc="what the odometry is worth")
+    cloud_every: Duration = Param("200ms", doc="time between two messages of the cloud")
+
+    def setup(self) -> None:
+        """Reads the saved map. Raises ValueError for parameters that contradict each other or a file that is no map."""
+        if self.min_particles > self.max_particles:
+            raise ValueError(f"min_particles {self.min_particles} is above max_particles {self.max_particles}")
+        self._grid: OccupancyGrid | None = None
+        self._field: LikelihoodField | None = None
+        if self.map_file is not None:
+            path = self.use_file(self.map_file)
+            self._take_map(read_map(Path(path), self.map_frame))
+        self._begin()
+
+    def _begin(self) -> None:
+        config = CloudConfig(least=self.min_particles, most=self.max_particles, error=self.kld_error)
+        self._fused = Vote(config)
+        own = CloudConfig(least=self.modality_particles, most=self.modality_particles)
+        self._votes = {m: Vote(own) for m in sorted(set(MODALITIES.values()))} if self.modality_particles else {}
+        self._reckoning = DeadReckoning(self.noise)
+        self._pending: list[tuple[int, str, Message]] = []
+        self._ignored: Counter[str] = Counter()
+        self._states: Counter[str] = Counter()
+        self._reported = self._shown = -1
+        self._word = ""
+
+    def process(
+        self,
+        odometry: Odometry | None,
+        measurements: Mapping[str, Message],
+        extrinsics: Transforms | None = None,
+        map: OccupancyGrid | None = None,
+        landmark_map: LandmarkSightings | None = None,
+        object_map: Boxes3D | None = None,
+    ) -> dict[str, Any] | None:
+        """Raises ValueError for maps or measurements of another frame, and for sensors without place or covariance."""
+        if map is not None and map is not self._grid:
+            self._take_map(map)
+        for name, message in sorted(measurements.items()):
+            if isinstance(message, Imu):
+                T = transform_between(extrinsics, message.frame, self.base_frame)
+                self._reckoning.feel(message.stamp, vertical_rate(message, T))
+            else:
+                self._pending.append((message.stamp, name.partition("/")[2], message))
+        if odometry is None:
+            return None
+        around = Surroundings(
+            self.base_frame,
+            self.map_frame,
+            extrinsics,
+            self._field,
+            landmark_map,
+            object_map,
+            self.origin,
+            self.band,
+            self.points,
+            self.worth,
+            self.own,
+            self.object_sigma,
+        )
+        self._advance(odometry, around)
+        return self._outputs(odometry)
+
+    def on_reset(self, input: str) -> None:
+        """The clock of a stream began anew: the robot is looked for again."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any] | None:
+        if self._pending:  # messages wait for the next odometry: their time comes then
+            return None
+        return {
+            "fused": self._fused.snapshot(),
+            "votes": {name: vote.snapshot() for name, vote in self._votes.items()},
+            "reckoning": self._reckoning.snapshot(),
+            "ignored": dict(self._ignored),
+            "states": dict(self._states),
+            "stamps": [self._reported, self._shown],
+            "word": self._word,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._fused.restore(state["fused"])
+        for name, vote in self._votes.items():
+            vote.restore(state["votes"][name])
+        self._reckoning.restore(state["reckoning"])
+        self._ignored, self._states = Counter(state["ignored"]), Counter(state["states"])
+        self._reported, self._shown = (int(stamp) for stamp in state["stamps"])
+        self._word = state["word"]
+
+    def summary(self) -> Mapping[str, float | int | str]:
+        figures: dict[str, float | int | str] = {f"poses {word}": n for word, n in sorted(self._states.items())}
+        figures["particles injected"] = self._fused.injected
+        figures["turns on which wheels and gyroscope disagree"] = self._reckoning.disagreements
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(self._ignored.items())}
+
+    def _take_map(self, grid: OccupancyGrid) -> None:
+        if grid.frame != self.map_frame:
+            raise ValueError(f"the map is in {grid.frame!r}, but the robot is looked for in {self.map_frame!r}")
+        self._grid, self._field = grid, LikelihoodField(grid, self.hit_sigma, self.stray)
+
+    def _advance(self, odometry: Odometry, around: Surroundings) -> None:
+        """Moves to an odometry message, with the measurements on the way."""
+        if self.start is not None and not self._fused.begun:
+            for vote in (self._fused, *self._votes.values()):
+                vote.begin_at(np.array(self.start), self.start_sigma, self.rng)
+        due, self._pending = self._pending, []
+        stepped = self._reckoning.step(odometry)
+        done = 0.0
+        for stamp, name, message in due:
+            if stepped is not None:
+                begin, step, covariance = stepped
+                share = min(1.0, max(done, (stamp - begin) / (odometry.stamp - begin)))
+                self._move(step, covariance, share - done)
+                done = share
+            self._observe(stamp, name, message, around)
+        if stepped is not None:
+            self._move(stepped[1], stepped[2], 1.0 - done)
+
+    def _move(self, step: Array, covariance: Array, share: float) -> None:
+        if share > 0:
+            for vote in (self._fused, *self._votes.values()):
+                vote.move(step * share, covariance * share, self.rng)
+
+    def _observe(self, stamp: int, name: str, message: Message, around: Surroundings) -> None:
+        try:
+            seen = observation(name, message, around)
+        except Unusable as reason:
+            self._ignored[f"{name}: {reason}"] += 1
+            return
+        self._fused.hear(name, stamp, seen, self.rng)
+        if self._votes:
+            self._votes[MODALITIES[type(message)]].hear(name, stamp, seen, self.rng)
+
+    def _outputs(self, odometry: Odometry) -> dict[str, Any]:
+        stamp = odometry.stamp
+        fused = self._fused.estimate()
+        self._states[fused.word] += 1
+        result: dict[str, Any] = {}
+        if fused.word == "localised":
+            result["pose"] = self._odometry(fused, odometry)
+            result["correction"] = Transforms.from_matrix(
+                planar(fused.mean) @ invert(flat(odometry)),
+                stamp=stamp,
+                frame=self.map_frame,
+                child_frame=odometry.frame,
+            )
+        for modality, port in (("lidar", "lidar_pose"), ("landmarks", "landmark_pose"), ("positions", "position_pose")):
+            if modality in self._votes:
+                own = self._votes[modality].estimate()
+                if own.word == "localised":
+                    result[port] = self._odometry(own, odometry)
+        if self._fused.begun and (self._shown < 0 or stamp - self._shown >= self.cloud_every):
+            self._shown = stamp
+            poses, weights = self._fused.cloud()
+            result["particles"] = ParticleSet(stamp=stamp, frame=self.map_frame, poses=poses, weights=weights)
+        if self._reported < 0 or stamp - self._reported >= 10**9 or fused.word != self._word:
+            self._reported, self._word = stamp, fused.word
+            result["status"] = status_of(stamp, fused, self._fused, self._votes, self._ignored)
+        return result
+
+    def _odometry(self, estimate: Estimate, odometry: Odometry) -> Odometry:
+        covariance = np.diag([0.0, 0.0, 1e-9, 1e-9, 1e-9, 0.0])
+        covariance[np.ix_([0, 1, 5], [0, 1, 5])] = estimate.covariance
+        return Odometry.from_matrix(
+            planar(estimate.mean),
+            stamp=odometry.stamp,
+            frame=self.map_frame,
+            child_frame=self.base_frame,
+            linear=odometry.linear,
+            angular=odometry.angular,
+            pose_covariance=covariance,
+        )

@@ -1,0 +1,214 @@
+"""Interprets the messages of sensors as observations of the robot's pose in the plane."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import (
+    Boxes3D,
+    LandmarkSightings,
+    LaserScan,
+    Message,
+    NavSatFix,
+    Odometry,
+    PointCloud,
+    Pose,
+    Transforms,
+)
+from dataflow.messages.geometry import transform_points, yaw_of
+from operators.geometry.extrinsics import transform_between
+from operators.geometry.geodesy import east_north_up
+from operators.localization.likelihood_field import LikelihoodField
+from operators.localization.observations import Observation, Placed, Scan, Sightings
+
+Array = NDArray[np.float64]
+
+
+class Unusable(Exception):
+    """A message that is ignored: says why."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Holds what messages are related to: the robot, the map and what is known of its landmarks and objects.
+
+    `band`: heights (m) between which points count; `points`: how many; `worth`: how many of them are independent;
+    `own`: what is nearer (m) is the robot itself; `object_sigma`: of boxes without covariance, metres.
+    """
+
+    base_frame: str
+    map_frame: str
+    extrinsics: Transforms | None = None
+    field: LikelihoodField | None = None
+    landmarks: LandmarkSightings | None = None
+    objects: Boxes3D | None = None
+    origin: tuple[float, float, float] | None = None
+    band: tuple[float, float] = (0.1, 1.4)
+    points: int = 60
+    worth: float = 15.0
+    own: float = 0.4
+    object_sigma: float = 0.15
+
+
+MODALITIES: dict[type[Message], str] = {
+    PointCloud: "lidar",
+    LaserScan: "lidar",
+    LandmarkSightings: "landmarks",
+    Boxes3D: "landmarks",
+    Pose: "positions",
+    Odometry: "positions",
+    NavSatFix: "positions",
+}
+
+
+def observation(name: str, message: Message, around: Surroundings) -> Observation:
+    """Returns what a message says about the pose.
+
+    Raises Unusable for a message without use, ValueError for one that does not belong to this map or robot.
+    """
+    if isinstance(message, PointCloud | LaserScan):
+        return _scan(message, around)
+    if isinstance(message, LandmarkSightings):
+        return _landmarks(name, message, around)
+    if isinstance(message, Boxes3D):
+        return _objects(message, around)
+    if isinstance(message, NavSatFix):
+        return _fix(name, message, around)
+    assert isinstance(message, Pose | Odometry)
+    return _placed(name, message, around)
+
+
+def _scan(message: PointCloud | LaserScan, around: Surroundings) -> Scan:
+    """Points of the band, spread evenly over the directions in which there are any."""
+    if around.field is None:
+        raise Unusable("no map")
+    points = message.points if isinstance(message, PointCloud) else message.points()
+    points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    T = transform_between(around.extrinsics, message.frame, around.base_frame)
+    points = transform_points(T, points)
+    far = np.hypot(points[:, 0], points[:, 1])
+    low, high = around.band
+    points = points[(points[:, 2] >= low) & (points[:, 2] <= high) & (far >= around.own)]
+    if len(points) < 8:
+        raise Unusable("fewer than 8 points in the band")
+    ordered = points[np.argsort(np.arctan2(points[:, 1], points[:, 0]), kind="stable"), :2]
+    chosen = np.linspace(0, len(ordered) - 1, min(around.points, len(ordered))).astype(int)
+    return Scan(around.field, ordered[chosen], around.worth)
+
+
+def _landmarks(name: str, sightings: LandmarkSightings, around: Surroundings) -> Sightings:
+    if around.landmarks is None or around.landmarks.positions is None:
+        raise Unusable("no map of landmarks")
+    _same_frame(name, "the map of landmarks", around.landmarks.frame, around.map_frame)
+    if sightings.covariances is None:
+        raise ValueError(f"{name}: sightings have no covariances: how well a landmark was seen must be known")
+    seen, spread = cartesian(sightings)
+    everywhere = np.asarray(around.landmarks.positions[:, :2])
+    known = {i: everywhere[k : k + 1] for k, i in enumerate(around.landmarks.ids.tolist())}
+    places = [known.get(i) if i >= 0 else everywhere for i in sightings.ids.tolist()]
+    return _sightings(seen, spread, places, sightings.frame, around)
+
+
+def _objects(boxes: Boxes3D, around: Surroundings) -> Sightings:
+    if around.objects is None:
+        raise Unusable("no map of objects")
+    _same_frame("objects", "their map", around.objects.frame, around.map_frame)
+    by_class: dict[str, Array] = {}
+    labels = around.objects.labels()
+    for label in set(labels):
+        chosen = [k for k, other in enumerate(labels) if other == label]
+        by_class[label] = np.asarray(around.objects.centers[chosen, :2])
+    spread = boxes.covariances
+    if spread is None:
+        spread = np.tile(np.eye(3) * around.object_sigma**2, (boxes.count, 1, 1))
+    return _sightings(boxes.centers, spread, [by_class.get(label) for label in boxes.labels()], boxes.frame, around)
+
+
+def _sightings(seen: Array, spread: Array, places: list[Array | None], frame: str, around: Surroundings) -> Sightings:
+    """Sightings in the plane of the robot, of what is usable and in the map."""
+    T = transform_between(around.extrinsics, frame, around.base_frame)
+    flat = transform_points(T, seen)[:, :2]
+    spread = (T[:3, :3] @ spread @ T[:3, :3].T)[:, :2, :2]
+    usable = np.asarray(np.isfinite(flat).all(axis=1) & np.isfinite(spread).all(axis=(1, 2)))
+    usable &= np.linalg.eigvalsh(np.where(usable[:, None, None], spread, 0.0))[:, 0] > 0
+    chosen = [k for k, there in enumerate(places) if there is not None and len(there) and usable[k]]
+    if not chosen:
+        raise Unusable("nothing of it is in the map")
+    return Sightings(flat[chosen], spread[chosen], tuple(places[k] for k in chosen))  # type: ignore[misc]
+
+
+def cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
+    """Returns points (N, 3) in the sensor's frame and their covariances (N, 3, 3).
+
+    Planar sightings have the height 0 and a variance of 1 m² along it. Raises ValueError for bearings or ranges alone.
+    """
+    N = sightings.count
+    assert sightings.covariances is not None
+    C = np.zeros((N, 3, 3))
+    if sightings.positions is not None:
+        flat = sightings.positions
+        size = flat.shape[1]
+        C[:, 2, 2] = 1.0
+        C[:, :size, :size] = sightings.covariances[:, :size, :size]
+        return np.column_stack([flat, np.zeros((N, 3 - size))]), C
+    if sightings.ranges is None or sightings.bearings is None:
+        raise ValueError("sightings need positions, or ranges and bearings: one of the two does not say where it is")
+    r, b = sightings.ranges, sightings.bearings
+    e = np.zeros(N) if sightings.elevations is None else sightings.elevations
+    polar = np.zeros((N, 3, 3))
+    polar[:, 2, 2] = np.maximum(1e-4, 1.0 / np.maximum(r, 0.1) ** 2) if sightings.elevations is None else 0.0
+    size = sightings.covariances.shape[1]
+    polar[:, :size, :size] = sightings.covariances
+    cb, sb, ce, se = np.cos(b), np.sin(b), np.cos(e), np.sin(e)
+    J = np.stack(
+        [
+            np.stack([ce * cb, -r * ce * sb, -r * se * cb], axis=1),
+            np.stack([ce * sb, r * ce * cb, -r * se * sb], axis=1),
+            np.stack([se, np.zeros(N), r * ce], axis=1),
+        ],
+        axis=1,
+    )
+    return np.column_stack([r * ce * cb, r * ce * sb, r * se]), J @ polar @ J.transpose(0, 2, 1)
+
+
+def _placed(name: str, message: Pose | Odometry, around: Surroundings) -> Placed:
+    _same_frame(name, "its frame", message.frame, around.map_frame)
+    given = message.covariance if isinstance(message, Pose) else message.pose_covariance
+    if given is None:
+        raise ValueError(f"{name}: its messages have no covariance: how good the positions are must be known")
+    if not (np.isfinite(message.position).all() and np.isfinite(message.orientation).all()):
+        raise Unusable("not finite")
+    T = transform_between(around.extrinsics, message.child_frame or around.base_frame, around.base_frame)
+    heading = None
+    if math.isfinite(given[5, 5]) and given[5, 5] < 1.0:
+        turn = math.atan2(T[1, 0], T[0, 0])
+        heading = (float(yaw_of(message.orientation)) - turn, float(given[5, 5]))
+    return _place(message.position[:2], given[:2, :2], T, heading)
+
+
+def _fix(name: str, fix: NavSatFix, around: Surroundings) -> Placed:
+    if fix.status == "no_fix" or not (math.isfinite(fix.latitude) and math.isfinite(fix.longitude)):
+        raise Unusable("no fix")
+    if around.origin is None:
+        raise ValueError(f"{name}: satellite fixes need `origin`: latitude, longitude, altitude of the map's origin")
+    if fix.covariance is None:
+        raise ValueError(f"{name}: its fixes have no covariance: how good they are must be known")
+    altitude = fix.altitude if math.isfinite(fix.altitude) else around.origin[2]
+    place = east_north_up(fix.latitude, fix.longitude, altitude, around.origin)
+    T = transform_between(around.extrinsics, fix.frame, around.base_frame)
+    return _place(place[:2], fix.covariance[:2, :2], T, None)
+
+
+def _place(place: Array, covariance: Array, T: Array, heading: tuple[float, float] | None) -> Placed:
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] <= 0:
+        raise Unusable("covariance not positive")
+    return Placed(place, covariance, T[:2, 3], heading)
+
+
+def _same_frame(name: str, what: str, found: str, frame: str) -> None:
+    if found != frame:
+        raise ValueError(f"{name}: {what} is {found!r}, but the robot is looked for in {frame!r}")

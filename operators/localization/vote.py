@@ -1,0 +1,92 @@
+"""A cloud with what its sensors count: the fused estimate, or that of one modality."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.localization.monte_carlo import CloudConfig, MonteCarlo
+from operators.localization.observations import Observation
+from operators.localization.output import Estimate
+from operators.localization.says import Says
+
+Array = NDArray[np.float64]
+_WIDE, _TURNED, _MOST = 0.3, 0.15, 0.6
+"""Localised: spread in m and rad below the first two, and more than the last of the weight in one place."""
+
+
+class Vote:
+    """A cloud that begins where the first observation puts it, and heeds sensors by their innovations."""
+
+    def __init__(self, config: CloudConfig) -> None:
+        self._config = config
+        self._cloud: MonteCarlo | None = None
+        self.says = Says()
+        self.stamp = -1
+
+    @property
+    def begun(self) -> bool:
+        return self._cloud is not None
+
+    @property
+    def injected(self) -> int:
+        return 0 if self._cloud is None else self._cloud.injected
+
+    def begin_at(self, pose: Array, sigma: tuple[float, float], rng: np.random.Generator) -> None:
+        """Begins about a pose (3,); `sigma` in m and rad."""
+        spread = np.array([sigma[0], sigma[0], sigma[1]])
+        self._cloud = MonteCarlo(self._config, pose + spread * rng.standard_normal((self._config.most, 3)))
+
+    def move(self, step: Array, covariance: Array, rng: np.random.Generator) -> None:
+        if self._cloud is not None:
+            self._cloud.move(step, covariance, rng)
+
+    def hear(self, sensor: str, stamp: int, observation: Observation, rng: np.random.Generator) -> None:
+        """Takes an observation (its time in ns); one that says too little to begin with is passed over."""
+        self.stamp = stamp
+        if self._cloud is None:
+            self._cloud = MonteCarlo(self._config, observation.propose(self._config.most, rng))
+            return
+        mean, covariance, share = self._cloud.estimate()
+        says = self.says.counts(stamp)
+        if share > _MOST / 2:
+            says[sensor] = self.says.hear(sensor, stamp, observation.misfit(mean, covariance))
+        self._cloud.weigh(sensor, observation, rng, says)
+
+    def estimate(self) -> Estimate:
+        """Returns where the robot is, and whether that is to be believed."""
+        if self._cloud is None:
+            return Estimate("waiting", np.zeros(3), np.eye(3) * 1e6, 0.0)
+        mean, covariance, share = self._cloud.estimate()
+        doubt = self._cloud.doubt(self.says.counts(self.stamp))
+        narrow = float(np.trace(covariance[:2, :2])) < _WIDE**2 and covariance[2, 2] < _TURNED**2
+        if doubt > 0.25:
+            return Estimate("lost", mean, covariance, share)
+        return Estimate("localised" if narrow and share > _MOST else "searching", mean, covariance, share)
+
+    def cloud(self) -> tuple[Array, Array]:
+        """Returns poses (N, 3) and weights (N,)."""
+        assert self._cloud is not None
+        return self._cloud.poses, self._cloud.weights
+
+    def figures(self) -> dict[str, str]:
+        """Returns size and effective size of the cloud, as text."""
+        if self._cloud is None:
+            return {}
+        return {"particles": str(len(self._cloud.poses)), "effective": f"{self._cloud.effective:.0f}"}
+
+    def fits(self) -> dict[str, float]:
+        """Returns how well each sensor fits lately, [0, 1]."""
+        return {} if self._cloud is None else {sensor: fit.fast for sensor, fit in self._cloud.fits.items()}
+
+    def snapshot(self) -> dict[str, Any]:
+        cloud = None if self._cloud is None else self._cloud.snapshot()
+        return {"cloud": cloud, "says": self.says.snapshot(), "stamp": self.stamp}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._cloud = None if state["cloud"] is None else MonteCarlo.restored(self._config, state["cloud"])
+        self.says.restore(state["says"])
+        self.stamp = int(state["stamp"])

@@ -1,0 +1,164 @@
+"""The surface of what stands still, from depth images."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dataflow.messages import (
+    CameraInfo,
+    DepthImage,
+    Diagnostics,
+    Image,
+    Mesh,
+    Message,
+    Odometry,
+    PointCloud,
+    Pose,
+    Transforms,
+)
+from dataflow.messages.diagnostics import Level
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.geometry.calibration import check_calibration
+from operators.mapping.placing import sensor_pose
+from operators.mapping.surface_nets import extract
+from operators.mapping.tsdf import DistanceField, FieldSettings
+from operators.status import counted_status
+
+
+class TsdfMap(Operator):
+    """Integrates depth images and their poses into a truncated signed distance field; gives its surface as a mesh.
+
+    Each voxel near a surface holds its mean distance from it, weighted by the inverse square of the depth; what the
+    camera looks through is carved away. The map has the frame of the poses and does not follow later corrections of
+    them. Images must be free of lens distortion.
+
+    Method: Curless and Levoy, "A volumetric method for building complex models from range images", 1996; the mesh by
+    Gibson, "Constrained elastic surface nets", 1998.
+    """
+
+    depth: In[DepthImage] = In(doc="depth, metres; 0 and NaN are no return")
+    pose: In[Pose | Odometry] = In(doc="the camera or its robot, at the depth's stamp")
+    depth_info: Sampled[CameraInfo] = Sampled(doc="calibration of the depth camera")
+    image: Sampled[Image] = Sampled(
+        required=False, doc="colours of the same pixels; used where it has the depth's stamp"
+    )
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the camera's frame and that of the pose, where they differ"
+    )
+    mesh: Out[Mesh] = Out(doc="the surface so far, with normals and, where images came, colours")
+    cloud: Out[PointCloud] = Out(doc="the vertices of the mesh")
+    status: Out[Diagnostics] = Out(doc="voxels told of, and blocks; a warning for an image that tells nothing")
+
+    voxel: float = Param(0.03, gt=0.002, doc="side of a voxel", unit="m")
+    truncation: float = Param(3.0, ge=1, doc="voxels before and behind a surface that are told of")
+    near: float = Param(0.3, ge=0, doc="nearer depths are left out", unit="m")
+    far: float = Param(4.0, gt=0, doc="farther depths are left out", unit="m")
+    min_weight: float = Param(
+        0.05, ge=0, live=True, doc="a voxel that weighs less has no surface; an image at 1 m adds 1, at 2 m a quarter"
+    )
+    most_weight: float = Param(20.0, gt=0, doc="most that a voxel remembers: less follows changes faster")
+    period: int = Param(50, ge=1, live=True, doc="mesh and cloud come with every so many images")
+    most_blocks: int = Param(200_000, ge=1, doc="blocks of 512 voxels; a larger map ends the run")
+
+    def setup(self) -> None:
+        """Raises ValueError for a range that holds no depth."""
+        if self.near >= self.far:
+            raise ValueError(f"near {self.near} m must be below far {self.far} m")
+        self._begin()
+
+    def _begin(self) -> None:
+        settings = FieldSettings(
+            voxel=self.voxel,
+            truncation=self.truncation * self.voxel,
+            near=self.near,
+            far=self.far,
+            most_weight=self.most_weight,
+            most_blocks=self.most_blocks,
+        )
+        self._field = DistanceField(settings)
+        self._counts: Counter[str] = Counter()
+        self._frame = ""
+        self._colored = False
+
+    def process(
+        self,
+        depth: DepthImage,
+        pose: Pose | Odometry,
+        depth_info: CameraInfo,
+        image: Image | None = None,
+        extrinsics: Transforms | None = None,
+    ) -> dict[str, Message]:
+        """Raises ValueError where depth, image and calibration do not fit, no transform relates camera and pose, the
+        poses' frame changes, or the map would have more than `most_blocks`."""
+        check_calibration("depth", depth, depth_info)
+        if self._frame and pose.frame != self._frame:
+            raise ValueError(f"the map is in frame {self._frame!r}, but the pose in {pose.frame!r}")
+        self._frame = pose.frame
+        placed = sensor_pose(depth.frame, pose, extrinsics)
+        told = 0
+        if placed is not None:
+            told = self._field.integrate(depth.data, self._colors(depth, image), depth_info.K, placed[0])
+        reason = ""
+        if placed is None:
+            reason = "the pose is not finite"
+        elif not told:
+            reason = "no depth is usable"
+        self._counts.update({"images": 1, "images left out": bool(reason)})
+        counts = {"voxels": told, "blocks": len(self._field)}
+        level = Level.WARN if reason else Level.OK
+        text = reason or f"{told} voxels"
+        messages: dict[str, Message] = {"status": counted_status("tsdf_map", depth.stamp, text, level, counts)}
+        if self._counts["images"] % self.period == 0:
+            messages |= self._surface(depth.stamp)
+        return messages
+
+    def on_reset(self, input: str) -> None:
+        """Begins a new map: the clock of a stream began anew."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "field": self._field.snapshot(),
+            "counts": dict(self._counts),
+            "frame": self._frame,
+            "colored": self._colored,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._field.restore(state["field"])
+        self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
+        self._frame, self._colored = str(state["frame"]), bool(state["colored"])
+
+    def summary(self) -> Mapping[str, int]:
+        return dict(self._counts) | {"blocks": len(self._field)}
+
+    def _colors(self, depth: DepthImage, image: Image | None) -> np.ndarray[Any, np.dtype[np.uint8]] | None:
+        if image is None or image.stamp != depth.stamp:
+            return None
+        if (image.width, image.height) != (depth.width, depth.height):
+            raise ValueError(
+                f"image has {image.width}x{image.height} pixels, depth {depth.width}x{depth.height}: "
+                f"colours must be registered to the depth"
+            )
+        self._colored = True
+        return image.data if image.data.ndim == 3 else np.repeat(image.data[..., None], 3, axis=2)
+
+    def _surface(self, stamp: int) -> dict[str, Message]:
+        surface = extract(self._field, self.voxel, self.min_weight)
+        colors = surface.colors if self._colored else None
+        mesh = Mesh(
+            stamp=stamp,
+            frame=self._frame,
+            vertices=surface.vertices,
+            triangles=surface.triangles,
+            normals=surface.normals,
+            colors=colors,
+        )
+        cloud = PointCloud(
+            stamp=stamp, frame=self._frame, points=surface.vertices, normals=surface.normals, colors=colors
+        )
+        return {"mesh": mesh, "cloud": cloud}

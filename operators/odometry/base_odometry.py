@@ -1,0 +1,53 @@
+"""Odometry of a sensor as odometry of the robot that carries it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dataflow.messages import Odometry, Transforms
+from dataflow.messages.geometry import invert
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.geometry.extrinsics import transform_between
+
+
+class BaseOdometry(Operator):
+    """Puts a camera's odometry on the robot: the pose of its base in the frame in which the base began.
+
+    A camera's own odometry begins at its optical frame, tilted as it is mounted. With the extrinsics this gives a frame
+    whose z is up where the robot stood level at first, and whose origin is on the floor.
+    """
+
+    stateless = True
+
+    sensor: In[Odometry] = In(doc="pose of a sensor in the frame where that sensor began")
+    extrinsics: Sampled[Transforms] = Sampled(doc="holds the transform between the sensor's frame and the base's")
+    odometry: Out[Odometry] = Out(doc="the base in `frame`, with covariance where the sensor's has one")
+
+    base_frame: str = Param("base_link", min_length=1, doc="frame of the robot's base")
+    frame: str = Param("odom_base", min_length=1, doc="name of the frame in which the base began")
+
+    def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry:
+        """Raises ValueError where the extrinsics do not hold the sensor on the base."""
+        T_base_sensor = transform_between(extrinsics, sensor.child_frame, self.base_frame)
+        T = T_base_sensor @ sensor.matrix() @ invert(T_base_sensor)
+        return Odometry.from_matrix(
+            T,
+            stamp=sensor.stamp,
+            frame=self.frame,
+            child_frame=self.base_frame,
+            pose_covariance=_carried(sensor, T_base_sensor, T),
+        )
+
+
+def _carried(sensor: Odometry, T_base_sensor: np.ndarray, T: np.ndarray) -> np.ndarray | None:
+    """Returns the covariance about fixed axes of the base's pose; the lever arm turns rotation into translation."""
+    if sensor.pose_covariance is None:
+        return None
+    R = T_base_sensor[:3, :3]
+    arm = T[:3, 3] - (T_base_sensor @ sensor.matrix())[:3, 3]  # from the sensor to the base
+    x, y, z = arm
+    A = np.zeros((6, 6))
+    A[:3, :3] = A[3:, 3:] = R
+    A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    C = A @ sensor.pose_covariance @ A.T
+    return np.asarray((C + C.T) / 2)

@@ -1,0 +1,149 @@
+"""Voxels of one object in the world: where it was seen, how often, and where it was seen through."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Keys = NDArray[np.int64]
+
+_HALF = 1 << 20
+_WEIGHTS = np.array([1 << 42, 1 << 21, 1], np.int64)
+
+
+def keys_of(points: Array, side: float) -> Keys:
+    """Returns the voxel (N,) of each point (N, 3), for places within 2**20 voxels of the origin."""
+    cell = np.clip(np.floor(points / side), -_HALF, _HALF - 1).astype(np.int64)
+    return np.asarray((cell + _HALF) @ _WEIGHTS)
+
+
+class Cells:
+    """A set of voxels with the mean of the points in each, and counts of views.
+
+    `hits` are the views in which it was the object's, `other` those in which the object was seen and this surface too,
+    as something else, `free` those that saw through it.
+    """
+
+    def __init__(self, side: float) -> None:
+        self.side = side
+        self._keys: Keys = np.zeros(0, np.int64)
+        self.points: Array = np.zeros((0, 3))
+        self.hits: Array = np.zeros(0)
+        self.free: Array = np.zeros(0)
+        self.other: Array = np.zeros(0)
+        self._tree: cKDTree | None = None
+
+    @classmethod
+    def of(cls, points: Array, side: float) -> Cells:
+        """Returns the voxels of one view's points (N, 3)."""
+        made = cls(side)
+        keys = keys_of(points, side)
+        made._keys, of, counts = np.unique(keys, return_inverse=True, return_counts=True)
+        sums = np.stack([np.bincount(of, column, len(counts)) for column in points.T], axis=1)
+        made.points = np.asarray(sums / counts[:, None])
+        made.hits, made.free, made.other = np.ones(len(counts)), np.zeros(len(counts)), np.zeros(len(counts))
+        return made
+
+    def __len__(self) -> int:
+        return len(self._keys)
+
+    def add(self, other: Cells) -> None:
+        """Takes in the voxels of another view, or of another object that is the same."""
+        keys, of = np.unique(np.concatenate([self._keys, other._keys]), return_inverse=True)
+        hits = np.concatenate([self.hits, other.hits])
+        weighted = np.concatenate([self.points, other.points]) * hits[:, None]
+        self.hits = np.asarray(np.bincount(of, hits, len(keys)))
+        sums = np.stack([np.bincount(of, column, len(keys)) for column in weighted.T], axis=1)
+        self.points = sums / np.maximum(self.hits, 1e-9)[:, None]
+        # a voxel that is seen again was not free after all
+        self.free = np.maximum(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)), 0.0)
+        self.other = np.bincount(of, np.concatenate([self.other, other.other]), len(keys))
+        self._keys, self._tree = keys, None
+
+    def carve(self, free: NDArray[np.bool_]) -> None:
+        """Counts the voxels that a view saw through, and drops those that were seen through too often."""
+        self.free = self.free + free
+        gone = (self.free >= 3) & (self.free > 0.5 * self.hits)
+        if gone.any():
+            self._keys, self.points = self._keys[~gone], self.points[~gone]
+            self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
+            self._tree = None
+
+    def doubt(self, confirmed: NDArray[np.bool_], points: Array) -> None:
+        """Counts the confirmed voxels that are not near the points (N, 3) which the object showed in the same view."""
+        if len(points) and confirmed.any():
+            apart, _ = cKDTree(points).query(self.points, distance_upper_bound=1.5 * self.side)
+            self.other = self.other + (confirmed & ~np.isfinite(apart))
+
+    def sure(self) -> Array:
+        """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""
+        if not len(self):
+            return self.points
+        least = 0.25 * float(np.percentile(self.hits, 75))
+        kept = (self.hits >= least) & (self.hits > self.free) & (self.hits >= self.other)
+        return self.points[kept] if kept.any() else self.points
+
+    @property
+    def middle(self) -> Array:
+        """Mean (3,) of the voxels."""
+        return np.asarray(self.points.mean(axis=0))
+
+    def near(self, points: Array, distance: float) -> float:
+        """Returns the share of points (N, 3), of 100 of many, that lie within a distance of a voxel's mean."""
+        if not len(self) or not len(points):
+            return 0.0
+        if self._tree is None:
+            self._tree = cKDTree(self.points)
+        apart, _ = self._tree.query(points[:: -(-len(points) // 100)], distance_upper_bound=distance)
+        return float(np.isfinite(apart).mean())
+
+    def touches(self, other: Cells, distance: float) -> bool:
+        """Tells whether the axis-parallel bounds of two sets come so near."""
+        if not len(self) or not len(other):
+            return False
+        low = np.maximum(self.points.min(axis=0), other.points.min(axis=0))
+        high = np.minimum(self.points.max(axis=0), other.points.max(axis=0))
+        return bool((low - high <= distance).all())
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free, "other": self.other}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        self._keys = np.array(state["keys"], np.int64)
+        self.points = np.array(state["points"], np.float64).reshape(-1, 3)
+        self.hits, self.free = np.array(state["hits"], np.float64), np.array(state["free"], np.float64)
+        self.other = np.array(state["other"], np.float64)
+        self._tree = None
+
+
+def standing_box(points: Array) -> tuple[Array, Array, float]:
+    """Returns centre (3,), full size (3,) and heading of the upright box of least area around points (N, 3), N ≥ 1."""
+    (x, y), (width, depth), angle = cv2.minAreaRect((points[:, :2] - points[0, :2]).astype(np.float32))
+    low, high = float(points[:, 2].min()), float(points[:, 2].max())
+    center = np.array([x + points[0, 0], y + points[0, 1], (low + high) / 2])
+    return center, np.array([width, depth, high - low]), float(np.radians(angle))
+
+
+def completed(box: tuple[Array, Array, float], view: Array, usual: tuple[float, float]) -> tuple[Array, Array, float]:
+    """Returns a box that is as deep as usual where only its near side was seen.
+
+    `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. `usual` are the
+    shorter and longer side of such objects: the side across the view tells which of the two lies along it. The box
+    grows away from the viewer, less where views differ.
+    """
+    center, size, yaw = box[0].copy(), box[1].copy(), box[2]
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    along = axes @ view
+    deep = int(np.argmax(np.abs(along)))
+    across = float(size[1 - deep])
+    short, long = usual
+    target = long if across < np.sqrt(short * long) else short
+    lack = max(0.0, target - float(size[deep])) * min(1.0, abs(float(along[deep])) * 1.2)
+    size[deep] += lack
+    center[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
+    return center, size, yaw

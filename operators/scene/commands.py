@@ -1,0 +1,103 @@
+"""`dataflow scene`: the scene graph of a recording, in words, as JSON, or asked for something."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from dataflow.messages import SceneGraph
+from dataflow.recording import Recording, RecordingError
+from operators.scene.query import QueryError, as_json, ask
+
+scene = typer.Typer(name="scene", add_completion=False)
+
+
+@scene.command()
+def show(
+    recording: Annotated[Path, typer.Argument(help="A recording with a scene graph.", show_default=False)],
+    at: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=0, help="So long after its first message. Default: its end.")
+    ] = None,
+    query: Annotated[
+        str | None, typer.Option(help="Whatever fits, such as 'mug on table near person'; 'not' denies a relation.")
+    ] = None,
+    stream: Annotated[str | None, typer.Option(help="The stream of the graph, where there are several.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="Print nodes, relations and matches as JSON.")] = False,
+) -> None:
+    """Show the scene graph of a recording at a time, or what in it a question asks for.
+
+    A question names a class and conditions on it: `mug on table near person` is a mug that is on a table and near a
+    person. A class may be `anything` or have a number, as in `on table 3`. Exit code 1 where nothing fits.
+    """
+    try:
+        graph, since = _graph(recording, stream, at)
+        matches = None if query is None else ask(graph, query)
+    except (QueryError, RecordingError, ValueError, FileNotFoundError) as error:
+        Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
+        raise typer.Exit(2) from None
+    names = graph.names()
+    if json:
+        content = as_json(graph)
+        if matches is not None:
+            content["query"] = query
+            content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
+        typer.echo(jsonlib.dumps(content))
+    elif matches is None:
+        _show(graph, since)
+    else:
+        out = Console()
+        for m in matches:
+            place = ", ".join(f"{v:.2f}" for v in graph.positions[m.node])
+            reasons = "; ".join(
+                f"{p.replace('_', ' ')} {names[o] if s == m.node else names[s]}" for s, p, o in m.because
+            )
+            out.print(f"{names[m.node]} at ({place}) m, score {m.score:.2f}" + (f": {reasons}" if reasons else ""))
+        if not matches:
+            out.print(f"nothing at {since:.1f} s is {query}", highlight=False)
+    if matches is not None and not matches:
+        raise typer.Exit(1)
+
+
+def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph, float]:
+    """Returns the newest graph at a time and how long after the recording's first message it is, in seconds."""
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    with Recording(path) as recording:
+        known = [n for n, info in recording.streams.items() if info.message_type is SceneGraph]
+        wanted = [n for n in known if stream is None or n == stream or n.endswith(f"/{stream}")]
+        built = [n for n in wanted if n.endswith("/graph")] or wanted
+        if len(built) != 1:
+            there = ", ".join(known) or "none"
+            raise ValueError(f"{path} has no single scene graph to show; give --stream one of: {there}")
+        first = min(i.first for i in recording.streams.values() if i.first is not None and not i.static)
+        end = None if at is None else first + round(at * 1e9)
+        graph = None
+        for record in recording.messages(built, end=end):
+            graph = record.message
+        if not isinstance(graph, SceneGraph):
+            raise ValueError(f"{built[0]} has no graph up to {at} s")
+        return graph, (graph.stamp - first) * 1e-9
+
+
+def _show(graph: SceneGraph, since: float) -> None:
+    out, names = Console(), graph.names()
+    scores = graph.relation_scores
+    table = Table(title=f"{graph.count} nodes at {since:.1f} s in {graph.frame}", title_justify="left")
+    for column in ("node", "score", "position, m", "size, m", "relations"):
+        table.add_column(column)
+    for k in range(graph.count):
+        held = [
+            f"{p.replace('_', ' ')} {names[o]}" + ("" if scores is None else f" {scores[j]:.2f}")
+            for j, (s, p, o) in enumerate(graph.relations())
+            if s == k and p not in ("near", "left_of", "in_front_of")
+        ]
+        place, size = (", ".join(f"{v:.2f}" for v in row) for row in (graph.positions[k], graph.sizes[k]))
+        score = "" if graph.scores is None else f"{graph.scores[k]:.2f}"
+        table.add_row(names[k], score, place, size, "; ".join(held))
+    out.print(table)

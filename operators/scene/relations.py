@@ -1,0 +1,295 @@
+"""Relations of upright boxes in space, each with a score in [0, 1].
+
+`supports`, `right_of` and `behind` are the inverses of `on`, `left_of` and `in_front_of`, and not stored twice.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Relation = tuple[int, str, int]
+"""Subject, predicate, object: ids of nodes."""
+
+INVERSES = {"supports": "on", "right_of": "left_of", "behind": "in_front_of"}
+PREDICATES = (
+    "on",
+    "in",
+    "under",
+    "above",
+    "near",
+    "left_of",
+    "in_front_of",
+    "part_of",
+    "sitting_on",
+    "holding",
+    "facing",
+    "approaching",
+    "reaching_for",
+    "heads_for",
+)
+FLOOR, ROBOT, ROOM = 0, -1, -2
+"""Ids of nodes that are not objects."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A node: centre (3,), full size (3,) and heading of its upright box, and its velocity (3,), m/s."""
+
+    id: int
+    label: str
+    center: Array
+    size: Array
+    yaw: float
+    velocity: Array
+    agent: bool = False
+
+    @property
+    def bottom(self) -> float:
+        return float(self.center[2] - self.size[2] / 2)
+
+    @property
+    def top(self) -> float:
+        return float(self.center[2] + self.size[2] / 2)
+
+    def corners(self) -> Array:
+        """Returns the four corners (4, 2) of the footprint, counter-clockwise."""
+        return self._corners
+
+    @cached_property
+    def _corners(self) -> Array:
+        c, s = np.cos(self.yaw), np.sin(self.yaw)
+        half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * self.size[:2] / 2
+        return np.asarray(half @ np.array([[c, s], [-s, c]]) + self.center[:2])
+
+
+@dataclass(frozen=True)
+class RelationRules:
+    """Lengths in metres, speeds in m/s."""
+
+    touch: float = 0.08
+    near: float = 0.5
+    side: float = 0.15
+    above: float = 1.0
+    hand: float = 0.35
+    small: float = 0.4
+    closing: float = 0.2
+    containers: tuple[str, ...] = ("shelf", "bin", "box")
+    seats: tuple[str, ...] = ("chair",)
+
+
+def footprint_share(first: Body, second: Body) -> float:
+    """Returns the share of the first footprint's area that lies on the second."""
+    a, b = first.corners().astype(np.float32), second.corners().astype(np.float32)
+    area = float(first.size[0] * first.size[1])
+    shared, _ = cv2.intersectConvexConvex(a, b)
+    if area < 1e-6:
+        inside = cv2.pointPolygonTest(b, (float(first.center[0]), float(first.center[1])), False) >= 0
+        return float(inside)
+    return float(min(shared / area, 1.0))
+
+
+def gap(first: Body, second: Body) -> float:
+    """Returns the distance between two boxes, 0 where they touch."""
+    vertical = max(0.0, first.bottom - second.top, second.bottom - first.top)
+    a, b = first.corners().astype(np.float32), second.corners().astype(np.float32)
+    if cv2.intersectConvexConvex(a, b)[0] > 0:
+        return vertical
+    level = min(
+        *(abs(float(cv2.pointPolygonTest(b, (float(x), float(y)), True))) for x, y in a),
+        *(abs(float(cv2.pointPolygonTest(a, (float(x), float(y)), True))) for x, y in b),
+    )
+    return float(np.hypot(level, vertical))
+
+
+def relations_of(bodies: Sequence[Body], T_world_robot: Array | None, rules: RelationRules) -> dict[Relation, float]:
+    """Returns the relations that hold now between nodes, floor and robot among them, with their scores."""
+    found: dict[Relation, float] = {}
+    things = [b for b in bodies if b.id not in (FLOOR, ROOM, ROBOT)]
+    floor = next((b for b in bodies if b.id == FLOOR), None)
+    held: set[int] = set()
+    pairs = _close_pairs(things, 1.5 + rules.above)
+    for person in things:
+        if person.agent:
+            held |= _contact(found, person, [b for b in pairs[person.id] if not b.agent], things, rules)
+    for body in things:
+        if body.id not in held and not any(s == body.id and p == "sitting_on" for s, p, _ in found):
+            _placed(found, body, pairs[body.id], floor, rules)
+    for first in things:
+        for second in pairs[first.id]:
+            _stacked(found, first, second, rules)
+            if first.id < second.id:
+                _beside(found, first, second, T_world_robot, rules)
+            if first.agent:
+                _moving(found, first, second, rules)
+    if any(b.id == ROOM for b in bodies):
+        found |= {(b.id, "part_of", ROOM): 1.0 for b in bodies if b.id == FLOOR}
+    return found
+
+
+def _close_pairs(things: Sequence[Body], reach: float) -> dict[int, list[Body]]:
+    """Returns the other things whose spheres come within a reach of each thing's."""
+    centers = np.array([b.center for b in things]).reshape(-1, 3)
+    radii = np.array([float(np.linalg.norm(b.size)) / 2 for b in things])
+    close: dict[int, list[Body]] = {}
+    for k, body in enumerate(things):
+        apart = np.linalg.norm(centers - centers[k], axis=1) - radii - radii[k]
+        close[body.id] = [things[j] for j in np.flatnonzero(apart <= reach).tolist() if j != k]
+    return close
+
+
+def _placed(
+    found: dict[Relation, float], body: Body, others: Sequence[Body], floor: Body | None, rules: RelationRules
+) -> None:
+    """Finds what a thing is in, or else what it stands or lies on: one thing at most."""
+    best: tuple[float, str, int] = (0.0, "", 0)
+    volume = float(np.prod(body.size))
+    for other in others:
+        if other.agent:
+            continue
+        share = footprint_share(body, other)
+        if other.label in rules.containers and float(np.prod(other.size)) > 1.5 * volume and share > 0.3:
+            inside = min(body.top, other.top) - max(body.bottom, other.bottom)
+            deep = inside / max(float(body.size[2]), 1e-3)
+            if deep > 0.5 and body.center[2] < other.top - 0.02:
+                best = max(best, (0.5 * min(1.0, share / 0.6) + 0.5 * min(1.0, deep), "in", other.id))
+                continue
+        off = abs(body.bottom - other.top)
+        if share > 0.3 and off <= 2 * rules.touch and body.center[2] > other.top:
+            best = max(best, (min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)), "on", other.id))
+    height = body.bottom if floor is None else body.bottom - floor.top
+    if best[0] < 0.5 and floor is not None and height <= 0.3:
+        best = max(best, (1 - max(0.0, height) / 0.6, "on", FLOOR))
+    if best[0] > 0:
+        found[body.id, best[1], best[2]] = best[0]
+
+
+def _stacked(found: dict[Relation, float], first: Body, second: Body, rules: RelationRules) -> None:
+    """Finds above and under of things that do not touch."""
+    between = first.bottom - second.top
+    if rules.touch < between <= rules.above and footprint_share(first, second) > 0.5:
+        found[first.id, "above", second.id] = 1 - 0.5 * between / rules.above
+    if second.top > first.top and second.bottom < first.bottom + 0.1 and not second.agent:
+        share = footprint_share(first, second)  # it stands beneath a table: within its box
+        if share > 0.4 and second.label not in rules.containers and first.top < second.top - rules.touch:
+            found[first.id, "under", second.id] = share
+
+
+def _beside(
+    found: dict[Relation, float], first: Body, second: Body, T_world_robot: Array | None, rules: RelationRules
+) -> None:
+    """Finds near, and of things near each other which is left of or in front of the other for the robot."""
+    apart = gap(first, second)
+    if apart > 1.2 * rules.near:
+        return
+    found[first.id, "near", second.id] = float(np.clip(1 - 0.5 * apart / rules.near, 0, 1))
+    if T_world_robot is None or apart > rules.near:
+        return
+    offset = first.center - second.center
+    y, x = float(offset @ T_world_robot[:3, 1]), float(offset @ T_world_robot[:3, 0])
+    larger, smaller = max(abs(x), abs(y)), min(abs(x), abs(y))
+    if larger < rules.side:
+        return
+    score = min(1.0, 0.5 + 0.5 * (larger - smaller) / larger + 0.25 * min(1.0, larger / rules.side - 1))
+    if abs(y) >= abs(x):
+        a, b = (first.id, second.id) if y > 0 else (second.id, first.id)
+        found[a, "left_of", b] = score
+    else:
+        a, b = (first.id, second.id) if x < 0 else (second.id, first.id)
+        found[a, "in_front_of", b] = score
+
+
+def _contact(
+    found: dict[Relation, float], person: Body, others: Sequence[Body], things: Sequence[Body], rules: RelationRules
+) -> set[int]:
+    """Finds what an agent sits on and what it holds; returns the ids of what is held."""
+    held = set()
+    for other in others:
+        if other.label in rules.seats and person.label == "person":
+            away = float(np.hypot(*(person.center - other.center)[:2]))
+            low = person.top - other.bottom < 1.5
+            if away < 0.45 and low:
+                found[person.id, "sitting_on", other.id] = 1 - away
+        elif float(other.size.max()) <= rules.small and person.label == "person":
+            supported = any(
+                abs(other.bottom - b.top) < rules.touch and footprint_share(other, b) > 0.3
+                for b in things
+                if not b.agent and b.id != other.id
+            )
+            lifted = 0.5 < other.center[2] - person.bottom < float(person.size[2]) + 0.1
+            if not supported and lifted and gap(person, other) < rules.hand / 2:
+                found[person.id, "holding", other.id] = 1 - gap(person, other) / rules.hand
+                held.add(other.id)
+    return held
+
+
+def _moving(found: dict[Relation, float], agent: Body, other: Body, rules: RelationRules) -> None:
+    """Finds facing and approaching of an agent that moves: it faces the way it goes."""
+    speed = float(np.hypot(*agent.velocity[:2]))
+    way = (other.center - agent.center)[:2]
+    distance = float(np.hypot(*way))
+    if speed < rules.closing or distance < 0.1:
+        return
+    cosine = float(agent.velocity[:2] @ way) / (speed * distance)
+    if cosine > 0.85:
+        found[agent.id, "facing", other.id] = cosine
+    closing = cosine * speed - float(other.velocity[:2] @ way) / distance
+    if cosine > 0.9 and closing > rules.closing and distance < 3:
+        found[agent.id, "approaching", other.id] = cosine * min(1.0, closing / 0.4)
+
+
+class Hysteresis:
+    """Smooths scores over time: a relation begins where its mean reaches `begin` and ends where it falls to `end`."""
+
+    def __init__(self, begin: float, end: float, seconds: float) -> None:
+        self._begin, self._end, self._seconds = begin, end, seconds
+        self._means: dict[Relation, float] = {}
+        self._held: dict[Relation, None] = {}
+        self._stamp: int | None = None
+
+    def update(
+        self, stamp: int, now: dict[Relation, float]
+    ) -> tuple[dict[Relation, float], list[Relation], list[Relation]]:
+        """Returns what holds, with its mean score, what begins, and what ends."""
+        share = 1.0
+        if self._stamp is not None:
+            share = 1 - float(np.exp(-(stamp - self._stamp) * 1e-9 / self._seconds))
+        self._stamp = stamp
+        for relation in sorted({*self._means, *now}):
+            before, value = self._means.get(relation, 0.0), now.get(relation, 0.0)
+            self._means[relation] = before + share * (value - before)
+        began = [r for r in sorted(now) if r not in self._held and self._means[r] >= self._begin]
+        ended = [r for r in self._held if self._means[r] <= self._end]
+        for relation in began:
+            self._held[relation] = None
+        for relation in ended:
+            del self._held[relation]
+        self._means = {r: m for r, m in self._means.items() if m > 0.02}
+        return {r: min(self._means[r], 1.0) for r in sorted(self._held)}, began, ended
+
+    def forget(self, ids: set[int]) -> None:
+        """Drops the relations of nodes that are no more."""
+        self._means = {r: m for r, m in self._means.items() if not {r[0], r[2]} & ids}
+        self._held = {r: None for r in self._held if not {r[0], r[2]} & ids}
+
+    def snapshot(self) -> dict[str, object]:
+        return {
+            "means": [[*r, m] for r, m in self._means.items()],
+            "held": [list(r) for r in self._held],
+            "stamp": self._stamp,
+        }
+
+    def restore(self, state: dict[str, object]) -> None:
+        means, held, stamp = state["means"], state["held"], state["stamp"]
+        assert isinstance(means, list)
+        assert isinstance(held, list)
+        assert stamp is None or isinstance(stamp, int)
+        self._means = {(int(s), str(p), int(o)): float(m) for s, p, o, m in means}
+        self._held = {(int(s), str(p), int(o)): None for s, p, o in held}
+        self._stamp = stamp

@@ -1,0 +1,199 @@
+"""The map of objects as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Boxes3D, Clusters, Diagnostics, Odometry, PointCloud, Pose, SceneGraph, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import quaternion_from_yaw, transform_points
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.filtering import finite
+from operators.geometry.extrinsics import transform_between
+from operators.scene.class_sizes import CLASS_SIZES
+from operators.scene.object_map import MapObject, MapSettings, ObjectMap, Observation
+from operators.scene.range_view import RangeView
+from operators.status import counted_status
+
+
+class SemanticMap(Operator):
+    """Accumulates objects in the world over time, each with class, oriented box, existence and when it was last seen.
+
+    What a view shows is joined to the map by place, class and colour; two entries that come to share their place are
+    one. Each view also says where nothing is: an object whose place is empty goes, and one of its class, size and
+    colour that appears elsewhere takes its id, moved and not doubled. Classes that move by themselves are followed
+    instead, and forgotten after a while out of sight. Everything else is kept while it is out of sight.
+
+    Method: after Hughes et al., "Hydra: a real-time spatial perception system", 2022, and Gu et al., "ConceptGraphs",
+    2024, with free space from the views themselves.
+    """
+
+    boxes: In[Boxes3D] = In(doc="objects of one view, as ObjectLifter gives them")
+    clusters: In[Clusters] = In(doc="the object of every point of the cloud, in the order of the boxes")
+    cloud: In[PointCloud] = In(doc="the whole view: what is behind an empty place says that it is empty")
+    pose: Sampled[Pose | Odometry] = Sampled(
+        doc="the cloud's sensor or its robot in the frame of the map, whose z is up"
+    )
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
+    )
+    objects: Out[Boxes3D] = Out(doc="the objects that are surely there, in the map's frame; scores are probabilities")
+    nodes: Out[SceneGraph] = Out(doc="the same objects as nodes without relations, with when each was last seen")
+    status: Out[Diagnostics] = Out(doc="objects by what became of them; a warning for a view without points")
+
+    voxel: float = Param(0.03, gt=0.005, le=0.2, doc="side of the voxels that objects consist of", unit="m")
+    overlap: float = Param(0.25, gt=0, le=1, doc="share of a view's points that are near those of the object it is of")
+    confirm: float = Param(2.0, gt=0, doc="evidence from which an object is given, in log odds")
+    views: int = Param(3, ge=1, doc="and views from which it was seen")
+    missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
+    movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
+    mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
+    move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
+    max_range: float = Param(6.0, gt=0, doc="farther points are not used", unit="m")
+
+    def setup(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._map: ObjectMap | None = None
+        self._classes: tuple[str, ...] = ()
+        self._frame = ""
+
+    def process(
+        self,
+        boxes: Boxes3D,
+        clusters: Clusters,
+        cloud: PointCloud,
+        pose: Pose | Odometry,
+        extrinsics: Transforms | None = None,
+    ) -> dict[str, Any]:
+        """Raises ValueError where boxes, clusters and cloud do not belong together or the pose's frame changes."""
+        if clusters.count != boxes.count or len(clusters.labels) != cloud.count:
+            raise ValueError(
+                f"{boxes.count} boxes, {clusters.count} clusters and labels for {len(clusters.labels)} of "
+                f"{cloud.count} points do not belong together"
+            )
+        known = self._opened(boxes, pose)
+        sensor = pose.child_frame or cloud.frame
+        T = pose.matrix() @ transform_between(extrinsics, cloud.frame, sensor)
+        usable = np.flatnonzero(finite(cloud.points))
+        points = cloud.points[usable].astype(np.float64)
+        near = np.linalg.norm(points, axis=1) <= self.max_range
+        usable, points = usable[near], points[near]
+        labels, world = clusters.labels[usable], transform_points(T, points)
+        seen = [self._observation(boxes, cloud, usable[labels == k], world[labels == k], k) for k in range(boxes.count)]
+        known.update(cloud.stamp, [each for each in seen if each is not None], RangeView(points, T, 0.012))
+        objects = known.confirmed()
+        counts = {
+            "objects": len(objects),
+            "tentative": len(known.objects) - len(objects),
+            "seen now": sum(o.seen == cloud.stamp for o in objects),
+            "moved": known.moved,
+            "points": len(points),
+        }
+        self._counts["views"] += 1
+        self._counts["views without points"] += not len(points)
+        self._counts["objects"], self._counts["moved"] = len(objects), known.moved
+        return {
+            "objects": self._boxes(cloud.stamp, objects),
+            "nodes": self._nodes(cloud.stamp, objects),
+            "status": _status(cloud.stamp, counts),
+        }
+
+    def on_reset(self, input: str) -> None:
+        """The clock behind an input began anew: so does the map."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {
+            "map": None if self._map is None else self._map.snapshot(),
+            "classes": list(self._classes),
+            "frame": self._frame,
+            "counts": dict(self._counts),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._frame, self._classes = state["frame"], tuple(state["classes"])
+        if state["map"] is not None:
+            self._map = self._made()
+            self._map.restore(state["map"])
+        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return dict(self._counts)
+
+    def _opened(self, boxes: Boxes3D, pose: Pose | Odometry) -> ObjectMap:
+        if self._map is None:
+            self._classes, self._frame = boxes.class_names, pose.frame
+            self._map = self._made()
+        if pose.frame != self._frame:
+            raise ValueError(f"the pose is in {pose.frame!r}, the map in {self._frame!r}")
+        if boxes.class_names != self._classes:
+            raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self._classes}")
+        return self._map
+
+    def _made(self) -> ObjectMap:
+        settings = MapSettings(
+            voxel=self.voxel,
+            overlap=self.overlap,
+            confirm=self.confirm,
+            views=self.views,
+            missed=self.missed,
+            mover_memory=self.mover_memory,
+            move_memory=self.move_memory,
+        )
+        movers = [k for k, name in enumerate(self._classes) if name in self.movers]
+        usual = {k: CLASS_SIZES[name] for k, name in enumerate(self._classes) if name in CLASS_SIZES}
+        return ObjectMap(max(len(self._classes), 1), movers, settings, usual)
+
+    def _observation(
+        self, boxes: Boxes3D, cloud: PointCloud, rows: NDArray[np.intp], world: NDArray[np.float64], k: int
+    ) -> Observation | None:
+        if len(rows) < 3:
+            return None
+        color = None if cloud.colors is None else cloud.colors[rows].mean(axis=0) / 255.0
+        return Observation(world, int(boxes.class_ids[k]) if self._classes else 0, float(boxes.scores[k]), color)
+
+    def _boxes(self, stamp: int, objects: list[MapObject]) -> Boxes3D:
+        return Boxes3D(
+            stamp=stamp,
+            frame=self._frame,
+            class_names=self._classes,
+            centers=np.array([o.center for o in objects]).reshape(-1, 3),
+            sizes=np.array([o.size for o in objects]).reshape(-1, 3),
+            orientations=quaternion_from_yaw(np.array([o.yaw for o in objects])).reshape(-1, 4),
+            scores=np.array([o.score for o in objects], np.float32),
+            class_ids=np.array([o.class_id for o in objects], np.int32),
+            ids=np.array([o.id for o in objects], np.int64),
+            velocities=np.array([o.velocity for o in objects]).reshape(-1, 3),
+            point_counts=np.array([len(o.cells) for o in objects], np.int64),
+        )
+
+    def _nodes(self, stamp: int, objects: list[MapObject]) -> SceneGraph:
+        return SceneGraph(
+            stamp=stamp,
+            frame=self._frame,
+            class_names=self._classes,
+            ids=np.array([o.id for o in objects], np.int64),
+            class_ids=np.array([o.class_id for o in objects], np.int32),
+            positions=np.array([o.center for o in objects]).reshape(-1, 3),
+            sizes=np.array([o.size for o in objects]).reshape(-1, 3),
+            orientations=quaternion_from_yaw(np.array([o.yaw for o in objects])).reshape(-1, 4),
+            scores=np.array([o.score for o in objects], np.float32),
+            last_seen=np.array([o.seen for o in objects], np.int64),
+            subjects=np.zeros(0, np.int32),
+            objects=np.zeros(0, np.int32),
+        )
+
+
+def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
+    text = f"{counts['objects']} objects, {counts['seen now']} in view, {counts['moved']} moved so far"
+    level = Level.OK if counts["points"] else Level.WARN
+    return counted_status("semantic_map", stamp, text if counts["points"] else "the view has no points", level, counts)

@@ -1,0 +1,214 @@
+"""Tracking of image boxes: two-stage association, births, deaths, identities."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import TrackState
+from operators.tracking.assignment import assign, overlap
+from operators.tracking.box_filter import BoxFilter, BoxNoise
+
+Array = NDArray[np.float64]
+_MOST = 4.0  # evidence is bounded, so that a long life does not hide a present absence
+
+
+@dataclass(frozen=True)
+class BoxTrackerSettings:
+    """Parameters of the association and of the lives of tracks.
+
+    `strong` parts detections into those that may begin a track and those that only continue one; `birth` is the least
+    score that begins one. Overlaps are least IoUs of each stage; `reach` grows boxes by this share of their size in the
+    last stage. Evidence is the sum of the log odds of a track's detections; it falls by `fade` a second unseen.
+    """
+
+    strong: float = 0.5
+    birth: float = 0.55
+    strong_overlap: float = 0.4
+    weak_overlap: float = 0.35
+    reach: float = 0.3
+    reach_overlap: float = 0.2
+    confirm: float = 0.8
+    fade: float = 20.0
+    memory: float = 2.0
+    appearance: float = 0.3
+    noise: BoxNoise = field(default_factory=BoxNoise)
+
+
+@dataclass
+class BoxTrack:
+    """One object that is followed. Times in nanoseconds; `evidence` in log odds."""
+
+    id: int
+    filter: BoxFilter
+    class_id: int
+    evidence: float
+    born: int
+    seen: int
+    state: TrackState
+    hits: int = 1
+    feature: Array | None = None
+
+    @property
+    def score(self) -> float:
+        """Probability that the object is there, from its evidence."""
+        return 1 / (1 + math.exp(-self.evidence))
+
+
+class BoxTracker:
+    """Follows boxes through an image stream.
+
+    Strong detections are matched with all tracks by the overlap with predicted boxes and, where there are feature
+    vectors, their cosine. Confirmed tracks that are left are matched with strong detections that are left, by the
+    overlap of enlarged boxes (Yang et al., "Hard to track objects with irregular motions", 2023), then with weak ones
+    (Zhang et al., "ByteTrack", 2022). Boxes of different classes never match.
+    """
+
+    def __init__(self, settings: BoxTrackerSettings) -> None:
+        self._settings = settings
+        self.tracks: list[BoxTrack] = []
+        self._next = 1
+        self._stamp: int | None = None
+
+    def update(
+        self,
+        stamp: int,
+        boxes: Array,
+        scores: Array,
+        class_ids: NDArray[np.int32],
+        size: tuple[int, int],
+        features: Array | None = None,
+    ) -> list[BoxTrack]:
+        """Takes the detections of one image: boxes (N, 4), scores and classes (N,), unit vectors (N, D).
+
+        Returns the tracks, with those that end now, in the order of their ids.
+        """
+        s = self._settings
+        seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
+        self._stamp = stamp
+        for track in self.tracks:
+            track.filter.predict(seconds)
+        free = set(range(len(self.tracks)))
+        strong = [k for k in range(len(boxes)) if scores[k] >= s.strong]
+        weak = [k for k in range(len(boxes)) if scores[k] < s.strong]
+        taken: dict[int, int] = {}
+        self._match(taken, free, strong, boxes, class_ids, s.strong_overlap, 0.0, features)
+        known = {i for i in free if self.tracks[i].state != TrackState.TENTATIVE}
+        left = [k for k in strong if k not in taken.values()]
+        self._match(taken, known, left, boxes, class_ids, s.reach_overlap, s.reach, features)
+        self._match(taken, known, weak, boxes, class_ids, s.weak_overlap, 0.0, None)
+        for i, k in taken.items():
+            self._see(self.tracks[i], stamp, boxes[k], float(scores[k]), None if features is None else features[k])
+        for i, track in enumerate(self.tracks):
+            if i not in taken:
+                self._miss(track, stamp, seconds, size)
+        matched = set(taken.values())
+        for k in strong:
+            if k not in matched and scores[k] >= s.birth:
+                feature = None if features is None else features[k]
+                self._begin(stamp, boxes[k], float(scores[k]), int(class_ids[k]), feature)
+        result = list(self.tracks)
+        self.tracks = [t for t in result if t.state != TrackState.ENDED]
+        return result
+
+    def forget(self) -> None:
+        """Drops all tracks; their ids are not used again."""
+        self.tracks, self._stamp = [], None
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return {"next": self._next, "stamp": self._stamp, "tracks": [_packed(track) for track in self.tracks]}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._next, self._stamp = int(state["next"]), state["stamp"]
+        self.tracks = [_unpacked(each, self._settings.noise) for each in state["tracks"]]
+
+    def _match(
+        self,
+        taken: dict[int, int],
+        free: set[int],
+        detections: list[int],
+        boxes: Array,
+        class_ids: NDArray[np.int32],
+        least: float,
+        grow: float,
+        features: Array | None,
+    ) -> None:
+        """Matches free tracks with detections; moves what fits from `free` to `taken`."""
+        rows = sorted(free)
+        if not rows or not detections:
+            return
+        tracks = [self.tracks[i] for i in rows]
+        found = boxes[detections]
+        close = overlap(_grown(np.array([t.filter.box for t in tracks]), grow), _grown(found, grow))
+        same = np.array([t.class_id for t in tracks])[:, None] == class_ids[detections][None, :]
+        value = close
+        if features is not None and self._settings.appearance > 0:
+            alike = np.array([[_cosine(t.feature, features[k]) for k in detections] for t in tracks])
+            value = (1 - self._settings.appearance) * close + self._settings.appearance * alike
+        for a, b in assign(value, (close >= least) & same):
+            taken[rows[a]] = detections[b]
+            free.discard(rows[a])
+
+    def _see(self, track: BoxTrack, stamp: int, box: Array, score: float, feature: Array | None) -> None:
+        track.filter.update(box, score)
+        track.evidence = min(max(track.evidence, 0.0) + _log_odds(score), _MOST)
+        track.seen, track.hits = stamp, track.hits + 1
+        if track.state != TrackState.TENTATIVE or track.evidence >= self._settings.confirm:
+            track.state = TrackState.CONFIRMED
+        if feature is not None:
+            mixed = feature if track.feature is None else 0.9 * track.feature + 0.1 * feature
+            track.feature = mixed / max(float(np.linalg.norm(mixed)), 1e-12)
+
+    def _miss(self, track: BoxTrack, stamp: int, seconds: float, size: tuple[int, int]) -> None:
+        track.evidence -= self._settings.fade * seconds
+        track.filter.hold_size()
+        unseen = (stamp - track.seen) * 1e-9
+        if track.state == TrackState.TENTATIVE:
+            ended = track.evidence < -1
+        else:
+            track.state = TrackState.COASTING
+            x, y = track.filter.mean[:2, 0]
+            ended = unseen > self._settings.memory or not (0 <= x <= size[0] and 0 <= y <= size[1])
+        if ended:
+            track.state = TrackState.ENDED
+
+    def _begin(self, stamp: int, box: Array, score: float, class_id: int, feature: Array | None) -> None:
+        evidence = _log_odds(score)
+        state = TrackState.CONFIRMED if evidence >= self._settings.confirm else TrackState.TENTATIVE
+        filter = BoxFilter(box, score, self._settings.noise)
+        self.tracks.append(BoxTrack(self._next, filter, class_id, evidence, stamp, stamp, state, feature=feature))
+        self._next += 1
+
+
+def _log_odds(score: float) -> float:
+    """Evidence of one detection; even a weak one that fits a track speaks for it."""
+    bounded = min(max(score, 0.02), 0.95)
+    return max(math.log(bounded / (1 - bounded)), 0.1)
+
+
+def _grown(boxes: Array, share: float) -> Array:
+    size = boxes[:, 2:] - boxes[:, :2]
+    return np.concatenate([boxes[:, :2] - share * size, boxes[:, 2:] + share * size], axis=1)
+
+
+def _cosine(known: Array | None, feature: Array) -> float:
+    """Likeness in [0, 1]; a half where the track has no vector yet."""
+    return 0.5 if known is None else (1 + float(known @ feature)) / 2
+
+
+def _packed(track: BoxTrack) -> dict[str, Any]:
+    plain = {key: getattr(track, key) for key in ("id", "class_id", "evidence", "born", "seen", "hits", "feature")}
+    return plain | {"state": int(track.state), "filter": track.filter.snapshot()}
+
+
+def _unpacked(state: Mapping[str, Any], noise: BoxNoise) -> BoxTrack:
+    filter = BoxFilter(np.array([0.0, 0, 1, 1]), 1.0, noise)
+    filter.restore(state["filter"])
+    plain = {key: state[key] for key in ("id", "class_id", "evidence", "born", "seen", "hits")}
+    feature = None if state["feature"] is None else np.array(state["feature"])
+    return BoxTrack(**plain, state=TrackState(state["state"]), filter=filter, feature=feature)

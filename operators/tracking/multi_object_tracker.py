@@ -1,0 +1,166 @@
+"""Tracking of objects in the image as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, TrackState
+from dataflow.messages.diagnostics import Level
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.status import counted_status
+from operators.tracking.box_filter import BoxNoise
+from operators.tracking.box_tracker import BoxTrack, BoxTracker, BoxTrackerSettings
+
+Array = NDArray[np.float64]
+
+
+class MultiObjectTracker(Operator):
+    """Follows objects in the image: Kalman boxes, two-stage association, identities that outlast a short occlusion.
+
+    A track is tentative until its detections make it probable, confirmed while it is matched, coasting on its predicted
+    box while it is not, and listed once as ended. Its score is the probability that the object is there and visible.
+    Boxes match only within their class. Detections may have any score: give the weak ones too.
+
+    Method: Zhang et al., "ByteTrack: multi-object tracking by associating every detection box", 2022.
+    """
+
+    detections: In[Detections2D] = In(doc="boxes of one camera, weak ones included")
+    features: Sampled[FeatureVector] = Sampled(
+        required=False, doc="one vector for each detection, in their order and with their stamp; others are not used"
+    )
+    tracks: Out[Tracks] = Out(doc="tentative, confirmed, coasting and just ended tracks, by rising id")
+    status: Out[Diagnostics] = Out(doc="tracks by state; a warning where boxes are unusable or the image size changes")
+
+    strong: float = Param(0.5, ge=0, le=1, doc="weaker detections continue confirmed tracks and do nothing else")
+    birth: float = Param(0.55, ge=0, le=1, doc="least score of a detection that begins a track")
+    confirm: float = Param(0.8, ge=0, doc="evidence that confirms a track, the sum of its detections' log odds")
+    memory: float = Param(2.0, gt=0, doc="a track ends that was not matched for so long", unit="s")
+    strong_overlap: float = Param(0.4, gt=0, le=1, doc="least IoU of a strong detection with a track's predicted box")
+    weak_overlap: float = Param(0.35, gt=0, le=1, doc="least IoU of a weak one")
+    appearance: float = Param(0.3, ge=0, le=1, doc="weight of the likeness of vectors beside that of boxes")
+    position_noise: float = Param(0.03, gt=0, doc="standard deviation of a box's middle, share of its height")
+    acceleration: float = Param(4.0, gt=0, doc="standard deviation of its acceleration", unit="heights/s²")
+
+    def setup(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._begin()
+
+    def _begin(self) -> None:
+        noise = BoxNoise(position=self.position_noise, acceleration=self.acceleration)
+        self._tracker = BoxTracker(
+            BoxTrackerSettings(
+                strong=self.strong,
+                birth=self.birth,
+                confirm=self.confirm,
+                memory=self.memory,
+                strong_overlap=self.strong_overlap,
+                weak_overlap=self.weak_overlap,
+                appearance=self.appearance,
+                noise=noise,
+            )
+        )
+        self._view: tuple[str, int, int] | None = None
+        self._classes: list[str] = []
+
+    def process(self, detections: Detections2D, features: FeatureVector | None = None) -> dict[str, Any]:
+        """Raises ValueError where boxes of another camera arrive."""
+        view = (detections.frame, detections.width, detections.height)
+        resized = self._view is not None and view[1:] != self._view[1:]
+        if self._view is not None and view[0] != self._view[0]:
+            raise ValueError(f"detections are of camera {view[0]}, those before were of {self._view[0]}")
+        if resized:
+            self._counts["image sizes changed"] += 1
+            self._tracker.forget()
+        self._view = view
+        boxes = detections.boxes.astype(np.float64)
+        usable = np.isfinite(boxes).all(axis=1) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+        rows = np.flatnonzero(usable)
+        tracks = self._tracker.update(
+            detections.stamp,
+            boxes[rows],
+            detections.scores[rows].astype(np.float64),
+            self._class_ids(detections)[rows],
+            view[1:],
+            self._vectors(detections, features, rows),
+        )
+        counts = Counter(t.state.name.lower() for t in tracks)
+        counts["unusable boxes"] = detections.count - len(rows)
+        self._counts.update({"images": 1, "detections": detections.count, "unusable boxes": counts["unusable boxes"]})
+        self._counts["tracks ended"] += counts["ended"]
+        return {"tracks": self._message(detections, tracks), "status": _status(detections.stamp, counts, resized)}
+
+    def on_reset(self, input: str) -> None:
+        """The clock behind an input began anew: tracks of the time before mean nothing now."""
+        self._tracker.forget()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        view = None if self._view is None else list(self._view)
+        return {
+            "tracker": self._tracker.snapshot(),
+            "view": view,
+            "classes": self._classes,
+            "counts": dict(self._counts),
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._tracker.restore(state["tracker"])
+        self._view = None if state["view"] is None else (state["view"][0], int(state["view"][1]), int(state["view"][2]))
+        self._classes = list(state["classes"])
+        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        return dict(self._counts)
+
+    def _class_ids(self, detections: Detections2D) -> NDArray[np.int32]:
+        """Returns ids (N,) in the tracker's own list of classes, which grows with the names that arrive."""
+        if not detections.class_names:
+            return detections.class_ids
+        for name in detections.class_names:
+            if name not in self._classes:
+                self._classes.append(name)
+        own = np.array([self._classes.index(name) for name in detections.class_names], np.int32)
+        return own[detections.class_ids]
+
+    def _vectors(
+        self, detections: Detections2D, features: FeatureVector | None, rows: NDArray[np.intp]
+    ) -> Array | None:
+        if features is None or features.stamp != detections.stamp or len(features.vectors) != detections.count:
+            self._counts["features not used"] += features is not None
+            return None
+        vectors = features.vectors[rows].astype(np.float64)
+        return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-12))
+
+    def _message(self, detections: Detections2D, tracks: list[BoxTrack]) -> Tracks:
+        now = detections.stamp
+        return Tracks(
+            stamp=now,
+            frame=detections.frame,
+            width=detections.width,
+            height=detections.height,
+            class_names=tuple(self._classes),
+            ids=np.array([t.id for t in tracks], np.int64),
+            states=np.array([t.state for t in tracks], np.uint8),
+            scores=np.array([t.score for t in tracks], np.float32),
+            class_ids=np.array([t.class_id for t in tracks], np.int32),
+            ages=np.array([(now - t.born) * 1e-9 for t in tracks], np.float32),
+            unseen=np.array([(now - t.seen) * 1e-9 for t in tracks], np.float32),
+            boxes=np.array([t.filter.box for t in tracks], np.float32).reshape(-1, 4),
+        )
+
+
+def _status(stamp: int, counts: Mapping[str, int], resized: bool) -> Diagnostics:
+    shown = {s.name.lower(): counts.get(s.name.lower(), 0) for s in TrackState}
+    text = ", ".join(f"{n} {name}" for name, n in shown.items())
+    unusable = counts.get("unusable boxes", 0)
+    if resized:
+        text = "the image size changed: all tracks begin anew"
+    elif unusable:
+        text += f"; {unusable} boxes without extent"
+    level = Level.WARN if resized or unusable else Level.OK
+    return counted_status("multi_object_tracker", stamp, text, level, shown | {"unusable boxes": unusable})

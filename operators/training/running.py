@@ -1,0 +1,108 @@
+"""Shared steps of the training commands: input sizes, earlier files, the run with its progress bar, the report."""
+
+from __future__ import annotations
+
+import json as jsonlib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+from rich.markup import escape
+
+from operators.training.console import err_console, out_console, print_notes, score_words
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from operators.training.backbone import Backbone as Extractor
+    from operators.training.loop import Outcome, Settings, Task
+
+_LONGEST_SIDE, _MULTIPLE = 384, 32
+
+
+def run_task(task: Task, settings: Settings, out: Path, resume: bool, quiet: bool) -> Outcome:
+    """Trains with a progress bar, or without one where output is for programs."""
+    from operators.training.loop import train
+    from operators.training.progress import TrainingBar
+
+    if quiet:
+        return train(task, settings, out, resume=resume)
+    with TrainingBar(err_console) as bar:
+        return train(task, settings, out, resume=resume, progress=bar)
+
+
+def prepare(
+    network: nn.Module, backbone: Extractor, weights: Path | None, frozen_stride: int | None, initial: Path | None
+) -> None:
+    """Gives a network its first weights and freezes the part of the backbone that came with them."""
+    from operators.training.backbone import start_from
+
+    if initial is not None:
+        start_from(network, initial)
+    given = weights is not None or initial is not None
+    backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
+
+
+def tell_data(
+    notes: Sequence[str], training: int, validation: int, classes: Sequence[str], size: tuple[int, int], quiet: bool
+) -> None:
+    """Tells what was read, before the first epoch."""
+    print_notes(notes, quiet)
+    if quiet:
+        return
+    named = ", ".join(classes[:12]) + (" ..." if len(classes) > 12 else "")
+    counts = f"{training} images to train on, {validation} to score on"
+    told = f"{counts}; {len(classes)} classes: {named}; input {size[0]}x{size[1]}"
+    err_console.print(told, highlight=False, markup=False, soft_wrap=True)
+
+
+def report(outcome: Outcome, operator: str, json: bool) -> None:
+    """Prints the score, the file and the operator that takes it; or one JSON object."""
+    if json:
+        typer.echo(
+            jsonlib.dumps(
+                {
+                    "weights": str(outcome.file),
+                    "checkpoint": str(outcome.checkpoint),
+                    "scores": outcome.best,
+                    "epoch": outcome.best_epoch,
+                    "epochs": len(outcome.history),
+                    "seconds": round(outcome.seconds, 1),
+                    "history": outcome.history,
+                }
+            )
+        )
+        return
+    scores = score_words(outcome.best, [name for name in outcome.best if name != "score"])
+    file = escape(str(outcome.file))
+    out_console.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
+    out_console.print(f"use it: `use: {operator}` with `params: {{weights: {file}}}`", highlight=False, soft_wrap=True)
+
+
+def input_size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
+    """The input size: as given, or the images' median proportions with the longest side 384."""
+    if text is not None:
+        match = re.fullmatch(r"(\d+)x(\d+)", text)
+        if match is None:
+            raise ValueError(f"--size {text!r} should be WIDTHxHEIGHT in pixels, such as 320x240")
+        return int(match[1]), int(match[2])
+    import cv2
+    import numpy as np
+
+    shapes = [found.shape for found in (cv2.imread(str(file)) for file in files) if found is not None]
+    ratio = float(np.median([width / height for height, width, _ in shapes])) if shapes else 1.0
+    extents = (min(1.0, ratio) * _LONGEST_SIDE, min(1.0, 1 / ratio) * _LONGEST_SIDE)
+    width, height = (max(_MULTIPLE, round(extent / _MULTIPLE) * _MULTIPLE) for extent in extents)
+    return width, height
+
+
+def keep_earlier(out: Path, resume: bool, overwrite: bool) -> None:
+    """Keeps an earlier training from being lost."""
+    if out.suffix != ".onnx":
+        raise ValueError(f"--out {str(out)!r} should end in .onnx")
+    checkpoint = out.with_suffix(".pt")
+    there = [str(file) for file in (out, checkpoint) if file.exists()]
+    if there and not (resume or overwrite):
+        raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")

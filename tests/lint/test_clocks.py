@@ -1,0 +1,90 @@
+"""Clocks that are off or drift are found with sign and size, in what a simulated robot records."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lint_material import MadeMaterial, simulated
+
+from dataflow.lint.clocks import clock_difference
+from dataflow.lint.contract import Contract
+from dataflow.lint.look import Report, lint
+from dataflow.lint.turning import Turning
+
+
+def turning(times: np.ndarray, rate, offset: float = 0.0, drift: float = 0.0) -> Turning:
+    """A stream that sees the mean of `rate` over its intervals, with timestamps late by offset + drift · time."""
+    true = (times - offset) / (1 + drift)
+    fine = np.linspace(true[0], true[-1], 20_000)
+    turned = np.concatenate([[0.0], np.cumsum(np.diff(fine) * (rate(fine[1:]) + rate(fine[:-1])) / 2)])
+    at = np.interp(true, fine, turned)
+    return Turning(0, times[:-1], times[1:], np.diff(at) / np.diff(times))
+
+
+def swaying(t: np.ndarray) -> np.ndarray:
+    return np.abs(np.sin(0.7 * t) + 0.6 * np.sin(1.9 * t + 1) + 0.3 * np.sin(4.3 * t))
+
+
+@settings(max_examples=25)
+@given(st.floats(-0.4, 0.4), st.floats(-0.003, 0.003), st.sampled_from([0.03, 0.05, 0.1]))
+def test_any_offset_and_drift_is_found_with_its_sign(offset: float, drift: float, period: float) -> None:
+    reference = turning(np.arange(0.0, 40.0, 0.01), swaying)
+    found = clock_difference(turning(np.arange(1.0, 39.0, period), swaying, offset, drift), reference)
+    assert found is not None
+    middle = offset + drift * (20.0 - offset)
+    assert found.offset == pytest.approx(middle, abs=0.003)
+    assert found.drift == pytest.approx(drift, abs=3e-4)
+
+
+def test_two_that_do_not_turn_alike_tell_nothing() -> None:
+    times = np.arange(0.0, 30.0, 0.02)
+    noise = np.random.default_rng(3).uniform(0, 1, len(times) - 1)
+    still = Turning(0, times[:-1], times[1:], np.zeros(len(times) - 1))
+    assert clock_difference(Turning(0, times[:-1], times[1:], noise), turning(times, swaying)) is None
+    assert clock_difference(still, turning(times, swaying)) is None
+    assert clock_difference(turning(times[:20], swaying), turning(times, swaying)) is None
+
+
+def report(contract: Contract | None = None, **sensors: object) -> Report:
+    return lint(MadeMaterial(simulated(**sensors)), contract)
+
+
+def clock_findings(found: Report) -> dict[tuple[str, str], dict[str, float]]:
+    return {(f.check, f.stream): dict(f.values or {}) for f in found.findings if f.check.startswith("clock")}
+
+
+def test_a_robot_with_good_clocks_is_sound() -> None:
+    found = report()
+    assert found.findings == []
+    assert {"robot1/imu", "robot1/ground_truth", "robot1/wheel_ticks", "robot1/wheel_odometry"} <= set(found.clocks)
+
+
+@pytest.mark.parametrize("delay", [60, 150])
+def test_a_late_gyroscope_is_named_by_its_offset_against_all_others(delay: int) -> None:
+    found = clock_findings(report(inertial={"delay": f"{delay}ms"}))
+    assert list(found) == [("clock offset", "robot1/imu")]
+    assert found["clock offset", "robot1/imu"]["offset_ms"] == pytest.approx(delay, abs=3)
+
+
+def test_a_gyroscope_whose_clock_drifts_is_named_with_sign_and_rate() -> None:
+    found = clock_findings(report(inertial={"clock_drift": 0.004}))
+    assert list(found) == [("clock drift", "robot1/imu")]
+    assert found["clock drift", "robot1/imu"]["drift_ms_per_s"] == pytest.approx(4.0, abs=0.2)
+
+
+def test_the_sign_is_turned_where_the_contract_trusts_the_gyroscope() -> None:
+    trusted = Contract.model_validate({"clocks": {"reference": "imu"}})
+    found = clock_findings(report(trusted, inertial={"delay": "150ms"}))
+    assert ("clock offset", "robot1/imu") not in found
+    assert found["clock offset", "robot1/ground_truth"]["offset_ms"] == pytest.approx(-150, abs=3)
+
+
+def test_an_outage_of_the_wheels_is_a_gap_and_the_clocks_are_still_told() -> None:
+    found = report(wheels={"outages": [[10, 13]]})
+    gaps = {f.stream: dict(f.values or {}) for f in found.findings if f.check == "gap"}
+    assert set(gaps) == {"robot1/wheel_ticks", "robot1/wheel_odometry"}
+    assert gaps["robot1/wheel_ticks"]["longest_s"] == pytest.approx(3.0, abs=0.11)
+    assert gaps["robot1/wheel_ticks"]["missing"] == pytest.approx(60, abs=1)
+    assert clock_findings(found) == {}

@@ -1,0 +1,47 @@
+"""Bags are looked at as they are: with the timestamps of their headers, in the order of recording."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from made_bags import SECOND, header, ros, write_ros2
+from typer.testing import CliRunner
+
+from dataflow.cli.main import app
+from dataflow.interop.opening import open_bag
+from dataflow.lint.bags import BagMaterial
+
+BEGIN = 1_700_000_000 * SECOND
+TENTH = SECOND // 10
+
+
+def bag(folder: Path) -> Path:
+    """An IMU at 10 Hz with a gap of a second, a repeated and a backward timestamp; and texts without a header."""
+    stamps = [BEGIN + k * TENTH for k in range(40) if not 20 <= k < 29]
+    stamps[5] = stamps[4]
+    stamps[10] = stamps[8] + 1
+    rows = [
+        ("/imu", BEGIN + k * SECOND, ros("sensor_msgs/Imu", header=header(stamp, "imu")))
+        for k, stamp in enumerate(stamps)
+    ]
+    rows += [("/text", BEGIN + k * SECOND, ros("std_msgs/String", data="x")) for k in range(9)]
+    return write_ros2(folder / "bag", rows)
+
+
+def test_timestamps_are_taken_from_headers_else_from_the_recording(tmp_path: Path) -> None:
+    opened = open_bag(bag(tmp_path))
+    material = BagMaterial(opened)
+    assert material.stamps("/imu")[:6].tolist() == [BEGIN + k * TENTH for k in (0, 1, 2, 3, 4, 4)]
+    assert material.stamps("/text").tolist() == [BEGIN + k * SECOND for k in range(9)]
+    assert [message.stamp for message in material.messages("/imu")][:2] == [BEGIN, BEGIN + TENTH]
+    opened.close()
+
+
+def test_planted_faults_of_a_bag_are_named(tmp_path: Path) -> None:
+    told = CliRunner().invoke(app, ["lint", str(bag(tmp_path)), "--json"])
+    assert told.exit_code == 1, told.stderr
+    found = {f["check"]: f for f in json.loads(told.stdout)["findings"] if f["stream"] == "/imu"}
+    assert found["duplicate"]["values"] == {"messages": 1}
+    assert found["backward"]["values"]["messages"] == 1
+    assert abs(found["gap"]["values"]["longest_s"] - 1.0) < 0.01

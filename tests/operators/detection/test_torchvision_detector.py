@@ -1,0 +1,125 @@
+"""torchvision's detectors by name: the same answers as the model called directly, names from its own weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dataflow.firing.failure import OperatorFailure
+from dataflow.messages import Image
+from dataflow.testing import play
+from operators.detection import TorchvisionDetector
+
+torch = pytest.importorskip("torch", reason="needs the extra [torch]")
+models = pytest.importorskip("torchvision.models", reason="needs the extra [torch]")
+
+NAME = "ssdlite320_mobilenet_v3_large"
+CLASSES = ("__background__", "person", "mug", "N/A", "chair")
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small network with random weights and five classes of its own."""
+    torch.manual_seed(3)
+    model = models.get_model(NAME, weights=None, weights_backbone=None, num_classes=len(CLASSES))
+    for name, weight in model.named_parameters():
+        if "classification_head" in name and name.endswith("bias"):
+            torch.nn.init.normal_(weight, 0.0, 1.5)  # so that some boxes are sure
+    file = tmp_path_factory.mktemp("weights") / "mine.pt"
+    torch.save({"model": model.state_dict(), "classes": list(CLASSES)}, file)
+    return file
+
+
+def image(seed: int = 0, *, gray: bool = False) -> Image:
+    rng = np.random.default_rng(seed)
+    shape = (96, 128) if gray else (96, 128, 3)
+    return Image(stamp=seed, frame="camera", data=rng.integers(0, 255, shape, dtype=np.uint8))
+
+
+def detector(checkpoint: Path, **params: object) -> TorchvisionDetector:
+    return TorchvisionDetector(model=NAME, checkpoint=str(checkpoint), score_threshold=0.2, **params)  # type: ignore[arg-type]
+
+
+def test_boxes_are_those_of_the_model_itself(checkpoint: Path) -> None:
+    (found,) = play(detector(checkpoint), {"image": [image()]})["detections"]
+    model = models.get_model(NAME, weights=None, weights_backbone=None, num_classes=len(CLASSES))
+    model.load_state_dict(torch.load(checkpoint, weights_only=True)["model"])
+    with torch.inference_mode():
+        direct = model.eval()([torch.from_numpy(image().data.transpose(2, 0, 1)).float() / 255])[0]
+    wanted = [i for i, (s, c) in enumerate(zip(direct["scores"], direct["labels"], strict=True)) if s >= 0.2 and c != 3]
+    wanted = wanted[:100]
+    assert len(wanted) > 3
+    np.testing.assert_allclose(found.boxes, direct["boxes"][wanted], atol=1e-4)
+    np.testing.assert_allclose(found.scores, direct["scores"][wanted], atol=1e-6)
+    assert found.class_ids.tolist() == direct["labels"][wanted].tolist()
+    assert found.class_names == CLASSES
+
+
+def test_only_the_classes_asked_for_are_given(checkpoint: Path) -> None:
+    (found,) = play(detector(checkpoint, classes=("mug",)), {"image": [image()]})["detections"]
+    assert set(found.labels()) == {"mug"}
+    with pytest.raises(OperatorFailure, match="did you mean 'mug'"):
+        play(detector(checkpoint, classes=("mugg",)), {"image": [image()]})
+
+
+def test_equal_images_give_equal_boxes_and_grey_ones_are_taken(checkpoint: Path) -> None:
+    streams = {"image": [image(1), image(2, gray=True)]}
+    once, again = play(detector(checkpoint), streams), play(detector(checkpoint), streams)
+    assert once.digests() == again.digests()
+
+
+def test_a_lower_threshold_is_not_cut_off_by_the_model(checkpoint: Path) -> None:
+    few = play(detector(checkpoint), {"image": [image()]})["detections"][0]
+    operator = TorchvisionDetector(
+        model=NAME, checkpoint=str(checkpoint), score_threshold=0.0, max_detections=1000, nms_iou=1.0
+    )
+    many = play(operator, {"image": [image()]})["detections"][0]
+    assert len(many.scores) > len(few.scores)
+
+
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ({"model": "fasterrcn_resnet50_fpn"}, "did you mean 'fasterrcnn_resnet50_fpn'"),
+        ({"model": NAME, "weights": "COCO_V7"}, "torchvision has COCO_V1"),
+        ({"model": NAME, "device": "cuda:9"}, "device 'cuda:9' is not available here; there is cpu"),
+        ({"model": NAME, "device": "gpu"}, "device 'gpu' is unknown"),
+    ],
+)
+def test_what_is_not_there_is_named_with_what_is(params: dict[str, str], words: str) -> None:
+    with pytest.raises(OperatorFailure, match=words):
+        play(TorchvisionDetector(**params), {"image": [image()]})  # type: ignore[arg-type]
+
+
+def test_missing_weights_are_said_with_the_way_to_get_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    with pytest.raises(OperatorFailure, match=rf"looked for {tmp_path}.*ssdlite320.*get them with"):
+        play(TorchvisionDetector(model=NAME), {"image": [image()]})
+
+
+def test_weights_in_the_cache_bring_their_own_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    weights = models.get_model_weights(NAME).COCO_V1
+    (tmp_path / "hub" / "checkpoints").mkdir(parents=True)
+    model = models.get_model(NAME, weights=None, weights_backbone=None)
+    torch.save(model.state_dict(), tmp_path / "hub" / "checkpoints" / weights.url.rsplit("/", 1)[-1])
+    operator = TorchvisionDetector(model=NAME, score_threshold=0.0)
+    (found,) = play(operator, {"image": [image()]})["detections"]
+    assert found.class_names[:3] == ("__background__", "person", "bicycle")
+    assert found.class_names[90] == "toothbrush"
+    assert "N/A" not in found.labels()
+
+
+def test_weights_of_another_model_or_no_weights_at_all_are_refused(checkpoint: Path, tmp_path: Path) -> None:
+    with pytest.raises(OperatorFailure, match=r"mine\.pt do not fit ssd300_vgg16"):
+        play(TorchvisionDetector(model="ssd300_vgg16", checkpoint=str(checkpoint)), {"image": [image()]})
+    (tmp_path / "text.pt").write_text("no checkpoint")
+    with pytest.raises(OperatorFailure, match=r"no checkpoint of torch\.save"):
+        play(TorchvisionDetector(model=NAME, checkpoint=str(tmp_path / "text.pt")), {"image": [image()]})
+
+
+def test_half_precision_needs_a_gpu(checkpoint: Path) -> None:
+    with pytest.raises(OperatorFailure, match="half precision needs a GPU"):
+        play(detector(checkpoint, half=True), {"image": [image()]})

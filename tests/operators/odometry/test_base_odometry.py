@@ -1,0 +1,54 @@
+"""BaseOdometry on a camera whose place on the robot is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataflow.firing.failure import OperatorFailure
+from dataflow.messages import Odometry, Transforms
+from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_matrix
+from dataflow.testing import play
+from operators.geometry.se3 import about_fixed_axes, exp
+from operators.odometry import BaseOdometry
+
+T_BASE_CAMERA = transform_matrix([0.1, 0.05, 1.1], [-0.45, 0.55, -0.55, 0.45])
+MOUNT = Transforms.from_matrix(T_BASE_CAMERA, stamp=0, frame="base_link", child_frame="camera")
+
+
+def seen(T_start_base: np.ndarray, covariance: np.ndarray | None = None) -> Odometry:
+    """The camera's own odometry while the base moves."""
+    T = invert(T_BASE_CAMERA) @ T_start_base @ T_BASE_CAMERA
+    fixed = None if covariance is None else about_fixed_axes(covariance, T)
+    return Odometry.from_matrix(T, stamp=1, frame="odom", child_frame="camera", pose_covariance=fixed)
+
+
+def on_base(sensor: Odometry) -> Odometry:
+    (made,) = play(BaseOdometry(), {"sensor": [sensor], "extrinsics": [MOUNT]}, static=["extrinsics"])["odometry"]
+    assert isinstance(made, Odometry)
+    return made
+
+
+def test_the_bases_pose_is_that_of_the_base() -> None:
+    T = transform_matrix([1.5, -0.4, 0.0], quaternion_from_yaw(0.7))
+    made = on_base(seen(T))
+    np.testing.assert_allclose(made.matrix(), T, atol=1e-9)
+    assert (made.frame, made.child_frame) == ("odom_base", "base_link")
+
+
+def test_covariance_is_that_of_the_base_by_sampling() -> None:
+    rng = np.random.default_rng(0)
+    spread = np.diag([1e-4, 2e-4, 1e-4, 1e-5, 4e-5, 2e-5])
+    T = transform_matrix([1.5, -0.4, 0.0], quaternion_from_yaw(0.7))
+    made = on_base(seen(T, spread))
+    T_camera = invert(T_BASE_CAMERA) @ T @ T_BASE_CAMERA
+    drawn = [T_camera @ exp(rng.multivariate_normal(np.zeros(6), spread)) for _ in range(4000)]
+    places = np.array([(T_BASE_CAMERA @ t @ invert(T_BASE_CAMERA))[:3, 3] for t in drawn])
+    assert made.pose_covariance is not None
+    np.testing.assert_allclose(made.pose_covariance[:3, :3], np.cov(places.T), atol=1.5e-5)
+
+
+def test_extrinsics_without_the_sensor_are_refused() -> None:
+    other = Transforms.from_matrix(np.eye(4), stamp=0, frame="base_link", child_frame="lidar")
+    with pytest.raises(OperatorFailure, match="no transform between 'camera' and 'base_link'"):
+        play(BaseOdometry(), {"sensor": [seen(np.eye(4))], "extrinsics": [other]}, static=["extrinsics"])

@@ -1,0 +1,126 @@
+"""Questions to a scene graph, from Python and on the command line."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dataflow.messages import SceneGraph
+from dataflow.recording import RecordingWriter
+from operators.scene.commands import scene
+from operators.scene.query import Clause, QueryError, as_json, ask, parse
+
+NAMES = ("mug", "table", "person", "floor", "room")
+NODES = ((-2, 4), (0, 3), (1, 1), (2, 0), (3, 0), (4, 2), (5, 1))
+RELATIONS = ((2, "on", 1, 0.9), (3, "on", 0, 0.8), (2, "near", 4, 0.7), (1, "left_of", 5, 0.6), (4, "holding", 3, 0.4))
+
+
+def graph(stamp: int = 1_000_000_000) -> SceneGraph:
+    """Two tables, two mugs, a person: mug 2 is on table 1 near person 4, mug 3 on the floor."""
+    ids = [i for i, _ in NODES]
+    return SceneGraph(
+        stamp=stamp,
+        frame="world",
+        class_names=NAMES,
+        ids=np.array(ids, np.int64),
+        class_ids=np.array([c for _, c in NODES], np.int32),
+        positions=np.arange(3 * len(ids), dtype=float).reshape(-1, 3),
+        sizes=np.ones((len(ids), 3)),
+        scores=np.full(len(ids), 0.95, np.float32),
+        predicates=tuple(p for _, p, _, _ in RELATIONS),
+        subjects=np.array([ids.index(s) for s, _, _, _ in RELATIONS], np.int32),
+        objects=np.array([ids.index(o) for _, _, o, _ in RELATIONS], np.int32),
+        relation_scores=np.array([s for _, _, _, s in RELATIONS], np.float32),
+    )
+
+
+@pytest.mark.parametrize(
+    ("question", "ids"),
+    [
+        ("mug on table near person", [2]),
+        ("the mug that is on a floor", [3]),
+        ("table supports mug", [1]),
+        ("table right of table 1", [5]),
+        ("mug not on table", [3]),
+        ("person near mug", [4]),
+        ("anything on anything", [2, 3]),
+        ("person holding mug 3", [4]),
+        ("mug 2", [2]),
+        ("person on table", []),
+    ],
+)
+def test_a_question_finds_what_fits(question: str, ids: list[int]) -> None:
+    made = graph()
+    assert [int(made.ids[m.node]) for m in ask(made, question)] == ids
+
+
+def test_the_score_is_that_of_the_weakest_link() -> None:
+    assert ask(graph(), "mug on table near person")[0].score == pytest.approx(0.7)
+
+
+def test_relations_of_several_words_are_understood() -> None:
+    assert parse("mug in front of table and not left_of person", NAMES) == (
+        "mug",
+        [Clause("in_front_of", "table"), Clause("left_of", "person", False)],
+    )
+
+
+@pytest.mark.parametrize(
+    ("question", "words"),
+    [
+        ("mugg on table", "did you mean 'mug'"),
+        ("mug nearr table", "did you mean 'near'"),
+        ("mug on", "ends where a thing should be named"),
+        ("", "the question is empty"),
+    ],
+)
+def test_what_is_not_understood_is_named(question: str, words: str) -> None:
+    with pytest.raises(QueryError, match=words):
+        ask(graph(), question)
+
+
+def test_the_graph_as_json_names_layers_and_scores() -> None:
+    made = as_json(graph())
+    assert {n["name"]: n["layer"] for n in made["nodes"]}["room -2"] == "room"
+    assert made["relations"][0] == {"subject": 2, "predicate": "on", "object": 1, "score": 0.9}
+    json.dumps(made)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    file = tmp_path / "room.mcap"
+    with RecordingWriter(file, metadata={}) as writer:
+        writer.add_stream("robot1/scene/graph", SceneGraph)
+        for k in range(3):
+            writer.write("robot1/scene/graph", graph((k + 1) * 1_000_000_000), seq=k)
+    return file
+
+
+def asked(*words: str) -> tuple[int, str]:
+    done = CliRunner().invoke(scene, list(words))
+    return done.exit_code, done.output
+
+
+def test_the_command_answers_from_a_recording(recording: Path) -> None:
+    code, out = asked(str(recording), "--query", "mug on table near person")
+    assert code == 0
+    assert out.startswith("mug 2 at (9.00, 10.00, 11.00) m, score 0.70: on table 1; near person 4")
+    assert asked(str(recording), "--query", "person on table")[0] == 1
+    code, out = asked(str(recording), "--at", "1.2", "--query", "mug", "--json")
+    assert code == 0
+    assert json.loads(out)["stamp"] == 2_000_000_000
+    assert [m["id"] for m in json.loads(out)["matches"]] == [2, 3]
+    assert "holding" in asked(str(recording))[1]
+
+
+def test_the_command_says_what_is_wrong(recording: Path, tmp_path: Path) -> None:
+    code, out = asked(str(recording), "--query", "cup on table")
+    assert (code, "'cup' is no class of this graph" in " ".join(out.split())) == (2, True)
+    code, out = asked(str(tmp_path / "none.mcap"))
+    assert (code, "there is no file" in out) == (2, True)
+    code, out = asked(str(recording), "--stream", "other")
+    assert (code, "robot1/scene/graph" in " ".join(out.split())) == (2, True)

@@ -1,0 +1,219 @@
+"""SceneGraphBuilder on rooms whose relations are known."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.firing.failure import OperatorFailure
+from dataflow.messages import Activity, Diagnostics, Pose, SceneGraph
+from dataflow.messages.geometry import quaternion_from_yaw
+from dataflow.testing import Played, play
+from operators.scene import SceneGraphBuilder
+from operators.scene.agents import GoalInference
+from operators.scene.relations import Body, Hysteresis, footprint_share, gap
+
+STEP = 200_000_000  # ns
+Thing = tuple[int, str, Sequence[float], Sequence[float]]
+"""Id, class, centre, full size."""
+
+TABLE: Thing = (1, "table", (2, 0, 0.375), (1.5, 0.8, 0.75))
+MUG: Thing = (2, "mug", (2, 0.2, 0.8), (0.1, 0.08, 0.1))
+CHAIR: Thing = (3, "chair", (2, -0.9, 0.5), (0.5, 0.5, 1.0))
+SHELF: Thing = (4, "shelf", (4, 2, 0.9), (0.3, 1.0, 1.8))
+BOOK: Thing = (5, "book", (4, 2.1, 0.9), (0.2, 0.05, 0.25))
+CRATE: Thing = (6, "box", (2.2, 0.1, 0.15), (0.3, 0.3, 0.3))
+LAMP: Thing = (7, "lamp", (2, 0, 1.5), (0.3, 0.3, 0.3))
+
+
+def person(x: float, y: float, height: float = 1.7, id: int = 9) -> Thing:
+    return (id, "person", (x, y, height / 2), (0.5, 0.5, height))
+
+
+def room(k: int, things: Sequence[Thing]) -> SceneGraph:
+    names = tuple(dict.fromkeys(name for _, name, _, _ in things))
+    return SceneGraph(
+        stamp=(k + 1) * STEP,
+        frame="world",
+        class_names=names,
+        ids=np.array([t[0] for t in things], np.int64),
+        class_ids=np.array([names.index(t[1]) for t in things], np.int32),
+        positions=np.array([t[2] for t in things], np.float64).reshape(-1, 3),
+        sizes=np.array([t[3] for t in things], np.float64).reshape(-1, 3),
+        subjects=np.zeros(0, np.int32),
+        objects=np.zeros(0, np.int32),
+    )
+
+
+def robot(k: int, frame: str = "world") -> Pose:
+    return Pose(stamp=(k + 1) * STEP, frame=frame, child_frame="base", position=[0, 0, 0], orientation=[0, 0, 0, 1])
+
+
+def built(rooms: Sequence[Sequence[Thing]], **params: Any) -> Played:
+    nodes = [room(k, things) for k, things in enumerate(rooms)]
+    return play(SceneGraphBuilder(**params), {"nodes": nodes, "robot": [robot(k) for k in range(len(rooms))]})
+
+
+def relations(message: Any) -> Mapping[tuple[int, str, int], float]:
+    assert isinstance(message, SceneGraph)
+    assert message.relation_scores is not None
+    ids = message.ids.tolist()
+    triples = [(ids[s], p, ids[o]) for s, p, o in message.relations()]
+    return dict(zip(triples, message.relation_scores.tolist(), strict=True))
+
+
+def test_a_room_has_the_relations_that_a_person_would_name() -> None:
+    found = relations(built([[TABLE, MUG, CHAIR, SHELF, BOOK, CRATE, LAMP]])["graph"][0])
+    for relation in (
+        (2, "on", 1),
+        (1, "on", 0),
+        (3, "on", 0),
+        (4, "on", 0),
+        (5, "in", 4),
+        (6, "on", 0),
+        (6, "under", 1),
+        (7, "above", 1),
+        (0, "part_of", -2),
+        (1, "near", 3),
+    ):
+        assert found[relation] > 0.6, relation
+    assert sum(p in ("on", "in") for s, p, _ in found if s == 2) == 1
+    assert not any(s in (1, 2, 3) and o in (4, 5) for s, _, o in found)
+    assert (1, "left_of", 3) in found
+
+
+def test_left_and_front_are_those_of_the_robots_view() -> None:
+    """The robot looks along x from the origin; y is to its left."""
+    nearer: Thing = (1, "box", (2.0, 0, 0.1), (0.2, 0.2, 0.2))
+    farther: Thing = (2, "box", (2.5, 0.05, 0.1), (0.2, 0.2, 0.2))
+    left: Thing = (3, "box", (2.05, 0.5, 0.1), (0.2, 0.2, 0.2))
+    found = relations(built([[nearer, farther, left]])["graph"][0])
+    assert (1, "in_front_of", 2) in found
+    assert (3, "left_of", 1) in found
+    assert (2, "in_front_of", 1) not in found
+
+
+def test_relations_begin_and_end_with_hysteresis() -> None:
+    """A mug that flickers between table and air keeps its relation; one that is gone for good loses it."""
+    lifted: Thing = (2, "mug", (2, 0.2, 1.3), (0.1, 0.08, 0.1))
+    flicker = [[TABLE, lifted if k % 4 == 3 else MUG] for k in range(16)]
+    played = built(flicker)
+    assert all((2, "on", 1) in relations(m) for m in played["graph"])
+    gone = built([*flicker, *([[TABLE, lifted]] * 10)])
+    assert (2, "on", 1) not in relations(gone["graph"][-1])
+    last = [m for m in gone["changes"] if isinstance(m, Diagnostics) and "on table 1 ends" in m.messages]
+    assert len(last) == 1
+
+
+def test_a_person_walks_to_a_chair_and_sits_down() -> None:
+    """From 3 m away along a straight line past the table; the chair is the goal long before the arrival."""
+    walk = [[TABLE, MUG, CHAIR, SHELF, person(2 + 3 - 0.16 * k, -0.9 - 0.02 * k)] for k in range(18)]
+    sit = [[TABLE, MUG, CHAIR, SHELF, person(2.05, -0.95, max(1.3, 1.7 - 0.08 * k))] for k in range(16)]
+    played = built(walk + sit)
+    acts = []
+    for message in played["activities"]:
+        assert isinstance(message, Activity)
+        acts.append(message.class_names[message.class_ids[0]])
+    assert acts[10] == "walking"
+    assert "sitting_down" in acts[18:26]
+    assert acts[-1] == "sitting"
+    goal = played["activities"][12]
+    assert isinstance(goal, Activity)
+    assert goal.goals[0].startswith("chair 3")
+    found = relations(played["graph"][12])
+    assert found[9, "heads_for", 3] > 0.4
+    assert (9, "facing", 3) in found
+    assert (9, "sitting_on", 3) in relations(played["graph"][-1])
+
+
+def test_what_a_hand_has_is_held() -> None:
+    cup: Thing = (2, "mug", (1.65, -2, 1.2), (0.1, 0.08, 0.1))
+    found = relations(built([[TABLE, cup, person(1.4, -2)]] * 6)["graph"][-1])
+    assert (9, "holding", 2) in found
+    assert not any(s == 2 and p == "on" for s, p, _ in found)
+
+
+def test_a_recognised_activity_counts_while_it_is_fresh() -> None:
+    nodes = [room(k, [TABLE, person(0, 3)]) for k in range(8)]
+    told = Activity(
+        stamp=3 * STEP,
+        class_names=("drinking",),
+        subjects=np.array([9]),
+        class_ids=np.array([0], np.int32),
+        scores=np.array([0.7], np.float32),
+    )
+    played = play(SceneGraphBuilder(), {"nodes": nodes, "recognized": [told]})
+    names = [m.class_names[m.class_ids[0]] for m in played["activities"] if isinstance(m, Activity)]
+    assert names[2:4] == ["drinking", "drinking"]
+    assert names[-1] == "standing"
+
+
+def test_nodes_without_a_place_are_counted_and_other_frames_refused() -> None:
+    nowhere: Thing = (2, "mug", (np.nan, 0, 0), (0.1, 0.1, 0.1))
+    operator = SceneGraphBuilder()
+    operator.setup()
+    graph = operator.process(room(0, [TABLE, nowhere]))["graph"]
+    assert 2 not in graph.ids.tolist()
+    assert operator.summary()["unusable nodes"] == 1
+    with pytest.raises(OperatorFailure, match="the robot is in 'odom', the map in 'world'"):
+        play(SceneGraphBuilder(), {"nodes": [room(0, [TABLE])], "robot": [robot(0, "odom")]})
+    assert built([[]])["graph"][0].stamp == STEP
+
+
+def test_two_plays_are_equal_and_a_restored_graph_goes_on_the_same() -> None:
+    rooms = [[TABLE, MUG, CHAIR, person(5 - 0.15 * k, -0.9)] for k in range(20)]
+    whole = built(rooms)
+    assert whole.digests() == built(rooms).digests()
+    first, second = SceneGraphBuilder(), SceneGraphBuilder()
+    for operator in (first, second):
+        operator.setup()
+    for k in range(10):
+        first.process(room(k, rooms[k]), robot(k))
+    second.restore(first.snapshot())
+    again = [second.process(room(k, rooms[k]), robot(k)) for k in range(10, 20)]
+    assert [a["graph"] for a in again] == whole["graph"][10:]
+    assert [a["activities"] for a in again] == whole["activities"][10:]
+
+
+def body(x: float, y: float, size: float, yaw: float) -> Body:
+    return Body(1, "box", np.array([x, y, 0.5]), np.array([size, 2 * size, 1.0]), yaw, np.zeros(3))
+
+
+@given(st.floats(-3, 3), st.floats(-3, 3), st.floats(0.1, 1), st.floats(-3, 3))
+def test_gap_is_symmetric_and_no_share_exceeds_one(x: float, y: float, size: float, yaw: float) -> None:
+    first, second = body(0, 0, 0.6, 0.3), body(x, y, size, yaw)
+    assert gap(first, second) == pytest.approx(gap(second, first), abs=1e-5)
+    assert 0 <= footprint_share(first, second) <= 1
+    assert gap(first, second) == 0 or footprint_share(first, second) == 0
+
+
+def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
+    goals = [
+        Body(i, "chair", np.array([x, y, 0.5]), np.ones(3), 0.0, np.zeros(3)) for i, x, y in ((1, 4, 0), (2, 0, 4))
+    ]
+    inference = GoalInference(4.0, 4.0, 2.5)
+    for k in range(15):
+        walker = Body(9, "person", np.array([0.15 * k, 0.0, 0.85]), np.ones(3), 0.0, np.zeros(3))
+        beliefs = inference.update(0.2 * k, walker, goals)
+    assert sum(beliefs.values()) == pytest.approx(1)
+    assert beliefs[1] > 0.8
+
+
+def test_hysteresis_forgets_what_is_no_more() -> None:
+    held = Hysteresis(0.5, 0.25, 0.4)
+    held.update(0, {(1, "on", 2): 1.0})
+    held.forget({2})
+    assert held.update(STEP, {}) == ({}, [], [])
+
+
+def test_orientation_turns_a_footprint() -> None:
+    nodes = room(0, [TABLE]).replace(orientations=quaternion_from_yaw(np.array([np.pi / 2])))
+    graph = play(SceneGraphBuilder(), {"nodes": [nodes]})["graph"][0]
+    assert isinstance(graph, SceneGraph)
+    floor = graph.ids.tolist().index(0)
+    np.testing.assert_allclose(graph.sizes[floor, :2], [0.8, 1.5], atol=1e-9)

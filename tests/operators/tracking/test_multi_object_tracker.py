@@ -1,0 +1,162 @@
+"""MultiObjectTracker on boxes whose motion is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.firing.failure import OperatorFailure
+from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, TrackState
+from dataflow.testing import play
+from operators.tracking import MultiObjectTracker
+from operators.tracking.assignment import assign, overlap
+
+FRAME = 100_000_000  # ns
+
+
+def image(k: int, rows: Sequence[Sequence[float]], classes: Sequence[int] | None = None, **more: Any) -> Detections2D:
+    """Detections of frame k: rows of (x1, y1, x2, y2, score)."""
+    table = np.array(rows, np.float64).reshape(-1, 5)
+    return Detections2D(
+        stamp=(k + 1) * FRAME,
+        **{"frame": "camera", "width": 640, "height": 480} | more,
+        class_names=("person", "mug"),
+        boxes=table[:, :4],
+        scores=table[:, 4].astype(np.float32),
+        class_ids=np.array(classes if classes is not None else [0] * len(table), np.int32),
+    )
+
+
+def walker(x: float, score: float = 0.9) -> list[float]:
+    return [x, 100, x + 60, 260, score]
+
+
+def tracked(images: Sequence[Detections2D], **params: Any) -> list[Tracks]:
+    return [m for m in play(MultiObjectTracker(**params), {"detections": images})["tracks"] if isinstance(m, Tracks)]
+
+
+def ids(message: Tracks, *states: TrackState) -> list[int]:
+    wanted = states or (TrackState.CONFIRMED,)
+    return message.ids[np.isin(message.states, wanted)].tolist()
+
+
+def test_a_steady_box_keeps_one_id_and_its_place() -> None:
+    messages = tracked([image(k, [walker(100 + 8 * k)]) for k in range(12)])
+    assert {i for m in messages for i in ids(m)} == {1}
+    assert messages[-1].boxes is not None
+    np.testing.assert_allclose(messages[-1].boxes[0], walker(100 + 8 * 11)[:4], atol=1.5)
+    assert messages[-1].ages[0] == pytest.approx(1.1)
+
+
+def test_an_id_outlasts_an_occlusion_and_a_crossing() -> None:
+    """Two walk towards each other; one is hidden for half a second in the middle."""
+    images = []
+    for k in range(40):
+        rows = [walker(20 + 10 * k)]
+        if not 17 <= k <= 22:
+            rows.append(walker(430 - 10 * k))
+        images.append(image(k, rows))
+    messages = tracked(images)
+    assert ids(messages[-1]) == [1, 2]
+    boxes = messages[-1].boxes
+    assert boxes is not None
+    assert boxes[0, 0] > boxes[1, 0] + 300
+    assert ids(messages[19], TrackState.COASTING) == [2]
+
+
+def test_weak_detections_continue_a_track_and_begin_none() -> None:
+    weak = [image(k, [walker(100, 0.25), [400, 300, 440, 380, 0.25]]) for k in range(4, 12)]
+    messages = tracked([image(k, [walker(100)]) for k in range(4)] + weak)
+    assert all(ids(m) == [1] for m in messages)
+
+
+def test_one_false_box_confirms_no_track() -> None:
+    messages = tracked([image(0, [[10, 10, 80, 90, 0.6]]), *(image(k, []) for k in range(1, 6))])
+    assert all(not ids(m, TrackState.CONFIRMED, TrackState.COASTING) for m in messages)
+    assert ids(messages[-1], *TrackState) == []
+
+
+def test_an_end_is_told_once_and_its_id_is_not_used_again() -> None:
+    seen = [image(k, [walker(100)]) for k in range(4)]
+    gone = [image(k, []) for k in range(4, 30)]
+    messages = tracked([*seen, *gone, *(image(k, [walker(100)]) for k in range(30, 34))])
+    assert [ids(m, TrackState.ENDED) for m in messages].count([1]) == 1
+    assert ids(messages[-1]) == [2]
+
+
+def test_boxes_of_another_class_are_another_object() -> None:
+    messages = tracked([image(k, [walker(100), walker(102)], [0, 1]) for k in range(5)])
+    assert ids(messages[-1]) == [1, 2]
+    assert messages[-1].labels() == ("person", "mug")
+
+
+def test_appearance_keeps_apart_what_overlap_alone_confuses() -> None:
+    """Two boxes change places between two images, as after a drop of frames."""
+    red, blue = [1.0, 0.0], [0.0, 1.0]
+    left, right = walker(100), walker(115)
+    images, features = [], []
+    for k in range(8):
+        first, second = (left, right) if k < 5 else (right, left)
+        images.append(image(k, [first, second]))
+        vectors = np.array([red, blue], np.float32)
+        features.append(FeatureVector(stamp=images[-1].stamp, model="colour", vectors=vectors))
+    played = play(MultiObjectTracker(appearance=0.7), {"detections": images, "features": features})
+    last = played["tracks"][-1]
+    assert isinstance(last, Tracks)
+    assert last.boxes is not None
+    assert ids(last) == [1, 2]
+    assert last.boxes[0, 0] > last.boxes[1, 0]
+
+
+def test_unusable_boxes_are_counted_and_survived() -> None:
+    flat = [50, 10, 50, 60, 0.9]
+    played = play(MultiObjectTracker(), {"detections": [image(k, [walker(100), flat]) for k in range(3)]})
+    tracks, status = played["tracks"][-1], played["status"][-1]
+    assert isinstance(tracks, Tracks)
+    assert isinstance(status, Diagnostics)
+    assert ids(tracks) == [1]
+    assert status.pairs(0)["unusable boxes"] == "1"
+    assert status.levels[0] == 1
+
+
+def test_another_image_size_begins_anew_and_another_camera_is_refused() -> None:
+    changed = [image(k, [walker(100)], width=640 if k < 3 else 320) for k in range(6)]
+    assert ids(tracked(changed)[-1]) == [2]
+    with pytest.raises(OperatorFailure, match="detections are of camera rear, those before were of camera"):
+        tracked([image(0, []), image(1, [], frame="rear")])
+
+
+def test_two_plays_are_equal_and_a_restored_tracker_goes_on_the_same() -> None:
+    rng = np.random.default_rng(3)
+    images = [image(k, [walker(60 * j + 6 * k + rng.normal(), 0.8) for j in range(4)]) for k in range(20)]
+    whole, again = (play(MultiObjectTracker(), {"detections": images}) for _ in range(2))
+    assert whole.digests() == again.digests()
+    first, second = MultiObjectTracker(), MultiObjectTracker()
+    for operator in (first, second):
+        operator.setup()
+    for each in images[:10]:
+        first.process(each)
+    second.restore(first.snapshot())
+    assert [second.process(m)["tracks"] for m in images[10:]] == whole["tracks"][10:]
+
+
+@given(st.integers(0, 6), st.integers(0, 6), st.integers(0, 1000))
+def test_assignment_takes_as_many_allowed_pairs_as_there_can_be(rows: int, columns: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    value, allowed = rng.random((rows, columns)), rng.random((rows, columns)) < 0.5
+    pairs = assign(value, allowed)
+    assert all(allowed[p] for p in pairs)
+    assert len({a for a, _ in pairs}) == len({b for _, b in pairs}) == len(pairs)
+    free = np.array(sorted(set(range(rows)) - {a for a, _ in pairs}), int)
+    left = np.array(sorted(set(range(columns)) - {b for _, b in pairs}), int)
+    assert not allowed[np.ix_(free, left)].any()
+
+
+def test_overlap_is_the_share_of_the_union() -> None:
+    boxes = np.array([[0.0, 0, 2, 2], [1, 0, 3, 2], [5, 5, 5, 5]])
+    np.testing.assert_allclose(overlap(boxes[:1], boxes), [[1, 1 / 3, 0]])

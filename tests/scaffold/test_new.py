@@ -1,0 +1,108 @@
+"""What `dataflow new` writes passes its own tests."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from dataflow.cli.main import app
+from dataflow.graph import load_graph
+from dataflow.scaffold.files import KINDS, NameFault, camel, snake
+
+REPOSITORY = Path(__file__).resolve().parents[2]
+
+
+def call(*words: object, code: int = 0):
+    outcome = CliRunner().invoke(app, [str(word) for word in words])
+    assert outcome.exit_code == code, (outcome.stdout, outcome.stderr, outcome.exception)
+    return outcome
+
+
+def run_tests(folder: Path, runtime: Path) -> str:
+    """pytest in that folder, in a process of its own."""
+    environment = {**os.environ, "PYTHONPATH": str(REPOSITORY), "XDG_RUNTIME_DIR": str(runtime)}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-o", "addopts="]
+    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=110)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
+    told = call("new", "project", "my-robot", "--to", tmp_path).stdout
+    project = tmp_path / "my-robot"
+
+    assert "pytest && dataflow run graphs/my_robot.yaml" in told
+    for kind in KINDS:
+        call("new", "operator", f"Another{kind}", "--kind", kind, "--to", project / "my_robot")
+    call("new", "graph", "second", "--to", project / "graphs")
+    assert (project / "tests" / "test_anothersource.py").is_file()
+    assert "9 passed" in run_tests(project, tmp_path)
+
+
+def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> None:
+    for kind in KINDS:
+        call("new", "operator", f"My{kind.title()}", "--kind", kind, "--to", tmp_path)
+    assert {file.name for file in tmp_path.glob("*.py")} == {
+        *(f"my_{kind}.py" for kind in KINDS),
+        *(f"test_my_{kind}.py" for kind in KINDS),
+    }
+    assert "4 passed" in run_tests(tmp_path, tmp_path)
+
+
+def test_what_is_written_is_in_the_projects_own_format(tmp_path: Path) -> None:
+    ruff = Path(sys.executable).parent / "ruff"
+    if not ruff.is_file():
+        pytest.skip("ruff (the [dev] extra) is not installed")
+    call("new", "project", "neat", "--to", tmp_path)
+    for kind in KINDS:
+        call("new", "operator", f"other_{kind}", "--kind", kind, "--to", tmp_path / "neat" / "neat")
+    settings = ["--config", str(REPOSITORY / "pyproject.toml")]
+    for words in (["format", "--check", *settings], ["check", *settings, "--ignore", "I"]):
+        done = subprocess.run([str(ruff), *words, str(tmp_path)], capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_a_graph_is_sound(tmp_path: Path) -> None:
+    files = json.loads(call("new", "graph", "ObstacleWatch", "--to", tmp_path, "--json").stdout)["files"]
+    assert files == [str(tmp_path / "obstacle_watch.yaml")]
+    assert set(load_graph(files[0]).nodes) == {"camera", "cloud"}
+
+
+def test_nothing_that_is_there_is_replaced(tmp_path: Path) -> None:
+    (tmp_path / "test_mine.py").write_text("precious")
+    assert "is there already" in call("new", "operator", "mine", "--to", tmp_path, code=2).stderr
+    assert not (tmp_path / "mine.py").exists()
+    assert (tmp_path / "test_mine.py").read_text() == "precious"
+    (tmp_path / "robot").mkdir()
+    (tmp_path / "robot" / "notes").touch()
+    assert "not empty" in call("new", "project", "robot", "--to", tmp_path, code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("select", "taken"), ("class", "taken"), ("3d", "cannot be"), ("dataflow", "taken"), ("ü", "cannot")],
+)
+def test_a_name_that_python_has_already_is_refused(name: str, words: str) -> None:
+    with pytest.raises(NameFault, match=words):
+        snake(name)
+    assert words in call("new", "operator", name, code=2).stderr
+    assert "expected one of operator, timer, source" in call("new", "operator", "x", "--kind", "y", code=2).stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "module", "kind"),
+    [
+        ("NearestObstacle", "nearest_obstacle", "NearestObstacle"),
+        ("nearest-obstacle", "nearest_obstacle", "NearestObstacle"),
+        ("IMUFilter", "imu_filter", "ImuFilter"),
+        ("lidar2d", "lidar2d", "Lidar2d"),
+    ],
+)
+def test_names_of_modules_and_classes(name: str, module: str, kind: str) -> None:
+    assert (snake(name), camel(name)) == (module, kind)
