@@ -56,7 +56,7 @@ def row_of(message: Message, columns: Mapping[str, Sequence[str]]) -> dict[str, 
 def export_csv(material: Material, folder: Path, done: Exported) -> None:
     """Writes `<stream>.csv`, slashes of the name as folders; stamps in ns, floats with all their digits."""
     with ExitStack() as files:
-        writers: dict[str, tuple[Any, Mapping[str, list[str]]]] = {}
+        writers: dict[str, tuple[Any, dict[str, list[str]]]] = {}
         for name, columns in _tables(material, done):
             path = _file(folder, material.names[name], ".csv")
             file = files.enter_context(path.open("w", newline="", encoding="utf-8"))
