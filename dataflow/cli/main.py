@@ -14,6 +14,7 @@ from rich.markup import escape
 
 from dataflow.cli import (
     completion,
+    convert,
     demo,
     doctor,
     inspection,
@@ -95,6 +96,7 @@ def dataflow(
 
 
 _MAKE, _LOOK, _FOLLOW = "Run, replay, verify", "Look at graphs, operators and recordings", "Follow a running graph"
+_MATERIAL = "Work with recordings and bags"
 
 
 def _paragraphs(text: str) -> str:
@@ -122,6 +124,7 @@ _add(inspection.operators, _LOOK)
 _add(demo.graphs, _LOOK)
 _add(recordings.info, _LOOK)
 _add(recordings.diff, _LOOK)
+_add(convert.convert, _MATERIAL)
 _add(latency.latency, _LOOK)
 _add(lint.lint, _LOOK)
 _add(viewing.view, _LOOK)

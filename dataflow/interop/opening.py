@@ -36,8 +36,8 @@ def open_bag(path: Path) -> Bag:
         return RosBag(_with_suffix(path, ".db3"))
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
     raise BagError(
-        f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are ROS 1 bags (.bag), ROS 2 bags (a folder with metadata.yaml, .db3 or "
-        ".mcap) and MCAP files"
+        f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag) and "
+        "ROS 2 bags (a folder with metadata.yaml, .db3 or .mcap)"
     )
 
 

@@ -47,6 +47,19 @@ class RosType:
         """Names of its fields."""
         return tuple(name for name, _ in self._store.fielddefs[self.name][1])
 
+    def as_ros2(self) -> SchemaText:
+        """Returns its definition, and those that it needs, as ROS 2 writes them."""
+        return SchemaText(
+            self.name, "ros2msg", _as_ros2(self._store).generate_msgdef(self.name, ros_version=2)[0].encode()
+        )
+
+    def to_cdr(self, data: bytes | memoryview) -> bytes:
+        """Returns a ROS 1 message as ROS 2 serialises it; raises `RecordingError`."""
+        try:
+            return bytes(_as_ros2(self._store).ros1_to_cdr(data, self.name))
+        except Exception as error:  # the library's parsers raise whatever broken bytes make them raise
+            raise RecordingError(f"not a {self.name}: {type(error).__name__}: {error}") from error
+
     def parse(self, data: bytes | memoryview) -> Any:
         """Returns the message as an object; raises `RecordingError`."""
         try:
@@ -69,6 +82,18 @@ def _store(name: str, encoding: str, schema: SchemaText) -> Typestore:
         first = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise RecordingError(f"the definition of {name} in the bag cannot be read ({first})") from error
     return store
+
+
+@cache
+def _as_ros2(store: Typestore) -> Typestore:
+    """The same types with the header of ROS 2, which has no sequence number."""
+    made = get_typestore(Stores.EMPTY)
+    types = dict(store.fielddefs)
+    if HEADER in types:
+        constants, fields = types[HEADER]
+        types[HEADER] = constants, [field for field in fields if field[0] != "seq"]
+    made.register(types)
+    return made
 
 
 def _types(name: str, encoding: str, text: str) -> Any:

@@ -86,6 +86,7 @@ class RecordingWriter:
         self._namespace = namespace
         self._streams: dict[str, _Stream] = {}
         self._firings: dict[str, tuple[int, int]] = {}
+        self._untouched: dict[str, tuple[int, int]] = {}
         self._events: tuple[int, int] | None = None
         self._logs: tuple[int, int] | None = None
         self._newest = 0
@@ -166,6 +167,20 @@ class RecordingWriter:
         known.last_seq, known.last_stamp = seq, stamp
         known.digest.update(message.digest())
         self._newest = max(self._newest, stamp)
+
+    def add_untouched(self, topic: str, encoding: str, schema: SchemaText, metadata: Mapping[str, str]) -> None:
+        """Declares a topic of another program whose messages are kept as they are."""
+        if topic in self._untouched:
+            raise RecordingError(f"{self.path}: topic {topic!r} is declared twice")
+        known = self._schema(schema) if schema.name else 0
+        others = {key: value for key, value in metadata.items() if key != "kind"}
+        self._untouched[topic] = (self._file.add_channel(topic, encoding, known, others), 0)
+
+    def write_untouched(self, topic: str, log_time: int, data: bytes) -> None:
+        """Adds a message of such a topic, byte for byte."""
+        channel, count = self._untouched[topic]
+        self._file.add_messages([(channel, log_time, count % SEQUENCE_SPAN, [data])])
+        self._untouched[topic] = (channel, count + 1)
 
     def write_firings(self, operator: str, stamp: int, payload: bytes) -> None:
         """Adds a batch of firing records of one operator, as the runtime encoded them (msgpack).

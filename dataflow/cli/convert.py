@@ -1,0 +1,172 @@
+"""`dataflow convert`: recordings and bags in the formats of other systems, and bags as recordings."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from rich.markup import escape
+from rich.progress import Progress, SpinnerColumn, TextColumn
+from rich.text import Text
+
+from dataflow.cli.arguments import (
+    AnyRecording,
+    Clock,
+    End,
+    Json,
+    Overwrite,
+    Start,
+    chosen_streams,
+    existing_recording,
+    output_file,
+)
+from dataflow.cli.output import count, err, fail, friendly_errors, out, plural, print_json, say, table
+
+if TYPE_CHECKING:
+    from dataflow.interop.export.material import Material
+    from dataflow.interop.export.report import Exported
+
+Format = Literal["mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "csv", "parquet"]
+SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
+"""Of formats that are one file; the others are folders."""
+
+
+def convert(
+    recording: AnyRecording,
+    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The file or folder to write.")],
+    to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="The format; the examples name all of them.")],
+    streams: Annotated[
+        list[str] | None,
+        typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
+    ] = None,
+    start: Start = None,
+    end: End = None,
+    clock: Clock = "auto",
+    overwrite: Overwrite = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=" ", help="Show no progress.")] = False,
+    json: Json = False,
+) -> None:
+    """Convert a recording or a bag to another format.
+
+    Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
+    what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
+    kept as they are. Datasets (tum, 7scenes, euroc, kitti) take one stream of a kind: --stream chooses among several.
+
+    Exit codes:
+
+      0    everything was written, but for what is said to be left out
+      2    could not convert: a wrong option, a stream that the format needs and the recording lacks
+
+    Examples:
+
+      dataflow convert run.mcap bag --to ros2
+      dataflow convert drive.bag drive.mcap --to mcap
+      dataflow convert run.mcap run_foxglove.mcap --to foxglove
+      dataflow convert run.mcap run.rrd --to rrd
+      dataflow convert run.mcap folder --to tum
+      dataflow convert run.mcap folder --to 7scenes
+      dataflow convert run.mcap folder --to euroc
+      dataflow convert run.mcap folder --to kitti --stream camera/*
+      dataflow convert run.mcap folder --to csv --stream imu/imu
+      dataflow convert run.mcap folder --to parquet --start 5 --end 10
+    """
+    with friendly_errors():
+        existing_recording(recording)
+        _check_output(output, to, overwrite)
+        if to == "rrd":
+            from dataflow.cli.viewing import view
+
+            view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
+            return
+        with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
+            done = _export(material, output, to, overwrite, watch)
+    if json:
+        print_json(done.as_json())
+        return
+    made = table("stream", "messages", right=("messages",))
+    for name, number in done.written.items():
+        made.add_row(Text(name), count(number))
+    out.print(made)
+    for name, reason in done.left_out.items():
+        say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
+    shown = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
+    for file in shown:
+        out.print(f"wrote {escape(file)}", soft_wrap=True)
+
+
+def _check_output(output: Path, to: str, overwrite: bool) -> None:
+    suffix = SUFFIXES.get(to)
+    if suffix is not None:
+        output_file(output, suffix, overwrite=overwrite, option=f"--to {to}")
+    elif output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise fail(f"{output} exists; {to} is written to a new or empty folder")
+    elif output.exists():
+        output.rmdir()
+
+
+@contextmanager
+def _opened(
+    path: Path, words: list[str] | None, start: float | None, end: float | None, clock: Literal["auto", "header", "log"]
+) -> Iterator[Material]:
+    from dataflow.interop.export.material import Material
+    from dataflow.recording.layout import RECORDING
+
+    with Material(path, clock=clock) as whole:
+        names = [*whole.streams, *(t.name for t in whole.untouched)]
+        namespace = ""
+        if not whole.foreign:
+            from dataflow.recording import Recording
+
+            with Recording(path) as opened:
+                namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
+        chosen = chosen_streams(words, names, namespace) if words else None
+        firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
+        firsts += [t.first for t in whole.untouched if t.first is not None]
+        first = min(firsts, default=0)
+        if whole.clock:
+            say(f"[dim]stamps: {escape(whole.clock)}[/]")
+    begin = None if start is None else first + round(start * 1e9)
+    finish = None if end is None else first + round(end * 1e9)
+    with Material(path, chosen, clock, begin, finish) as material:
+        yield material
+
+
+def _export(
+    material: Material, output: Path, to: str, overwrite: bool, watch: Callable[[int], None] | None
+) -> Exported:
+    from dataflow.interop.export.datasets import DATASETS
+    from dataflow.interop.export.foxglove import export_foxglove
+    from dataflow.interop.export.own import export_own
+    from dataflow.interop.export.report import Exported
+    from dataflow.interop.export.ros2 import export_ros2
+    from dataflow.interop.export.tables import export_csv, export_parquet
+
+    done = Exported(watch=watch)
+    match to:
+        case "mcap":
+            export_own(material, output, done, overwrite=overwrite)
+        case "foxglove":
+            export_foxglove(material, output, done)
+        case "ros2":
+            export_ros2(material, output, done)
+        case "csv":
+            export_csv(material, output, done)
+        case "parquet":
+            export_parquet(material, output, done)
+        case _:
+            DATASETS[to](material, output, done)
+    return done
+
+
+@contextmanager
+def _progress(hidden: bool) -> Iterator[Callable[[int], None] | None]:
+    """Shows how many messages are written."""
+    if hidden or not err.is_terminal:
+        yield None
+        return
+    with Progress(SpinnerColumn(), TextColumn("{task.description}"), console=err, transient=True) as progress:
+        task = progress.add_task("converting")
+        yield lambda seen: progress.update(task, description=f"converting · {count(seen)} messages")

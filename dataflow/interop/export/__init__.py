@@ -1,0 +1,1 @@
+"""Writes recordings and bags in the formats of other systems."""

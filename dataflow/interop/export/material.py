@@ -1,0 +1,117 @@
+"""Material of an export: the streams of a recording or the topics of a bag, and those that nobody here can read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Self
+
+from dataflow.interop.bag import Bag, Stored, Topic
+from dataflow.interop.clocks import Choice
+from dataflow.interop.opening import is_foreign, open_bag
+from dataflow.interop.playing import readings_of
+from dataflow.interop.streams import BagStreams, Played
+from dataflow.messages import Message
+from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
+from dataflow.recording.container import MAGIC
+from dataflow.recording.layout import RECORDING
+
+
+class Material:
+    """A recording or a bag opened for conversion: a context manager.
+
+    `streams`: what is read as messages, by name; `names`: what each is called outside (without the namespace).
+    `untouched`: topics that no message type fits; `bag`: the same file as a bag, None for one that is none.
+    `start`, `end`: stamps (ns) of the span.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        topics: Sequence[str] | None = None,
+        clock: Choice = "auto",
+        start: int | None = None,
+        end: int | None = None,
+    ) -> None:
+        self.path, self.foreign = Path(path), is_foreign(Path(path))
+        self._source: Recording | BagStreams | None = None
+        self.bag: Bag = open_bag(self.path)
+        self.start, self.end = start, end
+        try:
+            if self.foreign:
+                readings = [r for r in readings_of(self.bag) if r.playable and r.topic.count]
+                played = {
+                    r.topic.name: Played(r.topic.name, r.read_as.SCHEMA)
+                    for r in readings
+                    if r.read_as is not None and (topics is None or r.topic.name in topics)
+                }
+                self._source = BagStreams(self.path, played, clock)
+                namespace = ""
+            else:
+                self._source = Recording(self.path)
+                namespace = self._source.metadata.get(RECORDING, {}).get("namespace", "")
+            self.streams: dict[str, StreamInfo] = {
+                name: info
+                for name, info in self._source.streams.items()
+                if info.message_type is not None and info.count and (topics is None or name in topics)
+            }
+            self.names = {name: name.removeprefix(f"{namespace}/") if namespace else name for name in self.streams}
+            self.untouched: tuple[Topic, ...] = tuple(
+                topic
+                for name, topic in self.bag.topics.items()
+                if name not in self._source.streams or self._source.streams[name].message_type is None
+                if topics is None or name in topics
+            )
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def clock(self) -> str:
+        """The clock of a bag, and why; empty for a recording."""
+        return f"{self._source.clock.kind}: {self._source.clock.why}" if isinstance(self._source, BagStreams) else ""
+
+    def messages(self, names: Sequence[str] | None = None) -> Iterator[Recorded]:
+        """The messages of some streams, or of all, merged by (stamp, stream); static ones first."""
+        assert self._source is not None
+        return self._source.messages(list(self.streams if names is None else names), self.start, self.end)
+
+    def of_type(self, *types: type[Message]) -> list[str]:
+        """Streams of some message types, the order of `types` first."""
+        return [name for kind in types for name, info in self.streams.items() if info.message_type is kind]
+
+    def stored(self, topics: Sequence[str]) -> Iterator[Stored]:
+        """Serialised messages of topics by log time, those of the span."""
+        low, high = self.start or 0, self.end
+        for stored in self.bag.messages(topics):
+            if stored.log_time >= low and (high is None or stored.log_time <= high):
+                yield stored
+
+    def only(self, what: str, *types: type[Message]) -> str:
+        """The one stream of some types; raises `RecordingError` that names the choice."""
+        found = self.of_type(*types)
+        if len(found) == 1:
+            return found[0]
+        kinds = " or ".join(t.__name__ for t in types)
+        if not found:
+            raise RecordingError(f"{self.path}: {what} takes a stream of {kinds}; there is none among those chosen")
+        names = ", ".join(self.names[name] for name in found)
+        raise RecordingError(f"{self.path}: {what} takes one stream of {kinds}; choose with --stream among {names}")
+
+    def close(self) -> None:
+        """Closes the files. Idempotent."""
+        self.bag.close()
+        if self._source is not None:
+            self._source.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def is_mcap(path: Path) -> bool:
+    """Tells whether a file begins as an MCAP does."""
+    with path.open("rb") as file:
+        return file.read(len(MAGIC)) == MAGIC

@@ -1,0 +1,32 @@
+"""Recordings of our own, from bags: adapted streams, and untouched topics as they are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dataflow.interop.export.material import Material
+from dataflow.interop.export.report import Exported
+from dataflow.recording import RecordingWriter
+from dataflow.recording.layout import BAG
+
+
+def export_own(material: Material, file: Path, done: Exported, *, overwrite: bool = False) -> None:
+    """Writes a recording: every stream as its message type, topics that nothing here reads byte for byte."""
+    metadata = {BAG: {"file": material.path.name, "clock": material.clock}}
+    with RecordingWriter(file, metadata=metadata, overwrite=overwrite) as writer:
+        names = {name: name.strip("/") or name for name in material.streams}
+        for name, info in material.streams.items():
+            assert info.message_type is not None
+            writer.add_stream(names[name], info.message_type, static=info.static, extra={"topic": name})
+        for topic in material.untouched:
+            writer.add_untouched(topic.name, topic.encoding, topic.schema, topic.channel)
+        numbers: dict[str, int] = {}
+        for recorded in material.messages():
+            seq = numbers.get(recorded.stream, 0)
+            writer.write(names[recorded.stream], recorded.message, seq=seq)
+            numbers[recorded.stream] = seq + 1
+            done.count(names[recorded.stream])
+        for stored in material.stored([t.name for t in material.untouched]):
+            writer.write_untouched(stored.topic, stored.log_time, bytes(stored.data))
+            done.count(stored.topic)
+    done.files.append(str(file))

@@ -1,0 +1,215 @@
+"""ROS 2 bags: a folder with one MCAP file and the metadata that rosbag2 wants."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from dataflow.interop.bag import Topic
+from dataflow.interop.export.material import Material
+from dataflow.interop.export.report import Exported
+from dataflow.interop.ros.outward import OUTWARD, typestore
+from dataflow.interop.typestores import RosType
+from dataflow.messages import Transforms
+from dataflow.recording.codecs import SchemaText
+from dataflow.recording.errors import RecordingError
+
+VOLATILE, LATCHED = 2, 1
+_QOS = """- history: 1
+  depth: {depth}
+  reliability: 1
+  durability: {durability}
+  deadline:
+    sec: 9223372036
+    nsec: 854775807
+  lifespan:
+    sec: 9223372036
+    nsec: 854775807
+  liveliness: 1
+  liveliness_lease_duration:
+    sec: 9223372036
+    nsec: 854775807
+  avoid_ros_namespace_conventions: false"""
+
+
+@dataclass(slots=True)
+class _Channel:
+    id: int
+    type: str
+    qos: str
+    count: int = 0
+
+
+class Ros2Writer:
+    """Writes topics of CDR messages as a ROS 2 bag; the folder must not exist."""
+
+    def __init__(self, folder: Path) -> None:
+        folder.mkdir(parents=True)
+        self.folder = folder
+        self.file = folder / f"{folder.name}_0.mcap"
+        self._stream = self.file.open("wb")
+        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
+        self._writer.start(profile="ros2", library="dataflow convert")
+        self._schemas: dict[SchemaText, int] = {}
+        self._channels: dict[str, _Channel] = {}
+        self._first: int | None = None
+        self._last = 0
+
+    def write(self, topic: str, schema: SchemaText, data: bytes, stamp: int, *, latched: bool = False) -> None:
+        """Adds a message; raises `RecordingError` for another type than the topic has."""
+        channel = self._channels.get(topic)
+        if channel is None:
+            channel = self._channels[topic] = self._open(topic, schema, latched)
+        if channel.type != schema.name:
+            raise RecordingError(f"topic {topic} is {channel.type} already, and cannot hold {schema.name}")
+        self._writer.add_message(channel.id, log_time=stamp, publish_time=stamp, data=data, sequence=channel.count)
+        channel.count += 1
+        self._first = stamp if self._first is None else min(self._first, stamp)
+        self._last = max(self._last, stamp)
+
+    def _open(self, topic: str, schema: SchemaText, latched: bool) -> _Channel:
+        if schema not in self._schemas:
+            self._schemas[schema] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+        qos = _QOS.format(depth=1 if latched else 10, durability=LATCHED if latched else VOLATILE)
+        number = self._writer.register_channel(
+            topic, "cdr", self._schemas[schema], metadata={"offered_qos_profiles": qos}
+        )
+        return _Channel(number, schema.name, qos)
+
+    def close(self) -> None:
+        """Finishes the file and writes metadata.yaml."""
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._stream.close()
+        (self.folder / "metadata.yaml").write_text(self._metadata(), encoding="utf-8")
+
+    def _metadata(self) -> str:
+        first = 0 if self._first is None else self._first
+        total = sum(c.count for c in self._channels.values())
+        span = self._last - first if total else 0
+        lines = [
+            "rosbag2_bagfile_information:",
+            "  version: 5",
+            "  storage_identifier: mcap",
+            "  duration:",
+            f"    nanoseconds: {span}",
+            "  starting_time:",
+            f"    nanoseconds_since_epoch: {first}",
+            f"  message_count: {total}",
+            "  topics_with_message_count:" if self._channels else "  topics_with_message_count: []",
+        ]
+        for topic, channel in self._channels.items():
+            lines += [
+                "    - topic_metadata:",
+                f"        name: {topic}",
+                f"        type: {channel.type}",
+                "        serialization_format: cdr",
+                "        offered_qos_profiles: |-",
+                *(f"          {line}" for line in channel.qos.splitlines()),
+                f"      message_count: {channel.count}",
+            ]
+        lines += [
+            '  compression_format: ""',
+            '  compression_mode: ""',
+            "  relative_file_paths:",
+            f"    - {self.file.name}",
+            "  files:",
+            f"    - path: {self.file.name}",
+            "      starting_time:",
+            f"        nanoseconds_since_epoch: {first}",
+            "      duration:",
+            f"        nanoseconds: {span}",
+            f"      message_count: {total}",
+        ]
+        return "\n".join(lines) + "\n"
+
+
+def export_ros2(material: Material, folder: Path, done: Exported) -> None:
+    """Writes a ROS 2 bag. Topics of ROS stay as they are, byte for byte (of ROS 1: field by field).
+
+    Streams of messages become ROS messages: transforms /tf and /tf_static, others a topic of their name. Raises
+    `RecordingError`.
+    """
+    ros = [t for t in material.bag.topics.values() if t.encoding in ("cdr", "ros1")]
+    chosen = {*material.streams, *(t.name for t in material.untouched)}
+    ros = [t for t in ros if t.name in chosen]
+    others = [name for name in material.streams if name not in {t.name for t in ros}]
+    for topic in material.untouched:
+        if topic not in ros:
+            done.left_out[topic.name] = f"{topic.encoding} messages of {topic.schema.name or 'no schema'}"
+    writer = Ros2Writer(folder)
+    try:
+        _copy(material, ros, writer, done)
+        _convert(material, others, writer, done)
+    finally:
+        writer.close()
+    done.files.append(str(folder))
+
+
+def _copy(material: Material, topics: list[Topic], writer: Ros2Writer, done: Exported) -> None:
+    kinds: dict[str, RosType] = {}
+    schemas: dict[str, SchemaText] = {}
+    latched = {t.name: t.latched for t in topics}
+    for topic in topics:
+        if topic.encoding == "cdr" and topic.schema.data:
+            schemas[topic.name] = topic.schema
+            continue
+        try:
+            kind = RosType(topic.schema.name, topic.encoding, topic.schema)
+            schemas[topic.name] = kind.as_ros2()
+        except RecordingError as error:
+            done.left_out[topic.name] = str(error)
+            continue
+        if topic.encoding == "ros1":
+            kinds[topic.name] = kind
+    for stored in material.stored(list(schemas)):
+        kind_of = kinds.get(stored.topic)
+        data = bytes(stored.data) if kind_of is None else kind_of.to_cdr(stored.data)
+        name = _ros_name(stored.topic)
+        writer.write(name, schemas[stored.topic], data, stored.log_time, latched=latched[stored.topic])
+        done.count(name)
+
+
+def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exported) -> None:
+    store = typestore()
+    schemas: dict[str, SchemaText] = {}
+    mapped = []
+    for name in names:
+        kind = material.streams[name].message_type
+        assert kind is not None
+        if kind in OUTWARD:
+            mapped.append(name)
+        else:
+            done.left_out[material.names[name]] = f"{kind.SCHEMA} has no counterpart in ROS"
+    begin = _first_stamp(material, mapped)
+    for recorded in material.messages(mapped) if mapped else ():
+        name = recorded.stream
+        static = material.streams[name].static
+        kind_of, message = OUTWARD[type(recorded.message)](recorded.message)
+        if kind_of not in schemas:
+            schemas[kind_of] = SchemaText(kind_of, "ros2msg", store.generate_msgdef(kind_of, ros_version=2)[0].encode())
+        topic = _ros_name(material.names[name])
+        if isinstance(recorded.message, Transforms):
+            topic = "/tf_static" if static else "/tf"
+        stamp = begin if static else recorded.stamp
+        try:
+            data = bytes(store.serialize_cdr(message, kind_of))
+        except (struct.error, OverflowError, ValueError) as error:
+            raise RecordingError(f"{name} at {recorded.stamp} does not fit into {kind_of}: {error}") from error
+        writer.write(topic, schemas[kind_of], data, stamp, latched=static)
+        done.count(topic)
+
+
+def _first_stamp(material: Material, names: list[str]) -> int:
+    """The stamp at which static messages are recorded: that of the first other one."""
+    firsts: Iterator[int] = (
+        info.first for name in names if not (info := material.streams[name]).static and info.first is not None
+    )
+    return max(min(firsts, default=0), material.start or 0)
+
+
+def _ros_name(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"

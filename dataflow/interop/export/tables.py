@@ -1,0 +1,127 @@
+"""Tables of streams: one CSV or Parquet file a stream, a row a message, small arrays as columns of their own."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dataflow.interop.export.material import Material
+from dataflow.interop.export.report import Exported
+from dataflow.messages import Message
+from dataflow.messages.base import ArrayField
+from dataflow.recording.errors import RecordingError
+
+MAX_COLUMNS = 36
+"""Elements of an array that become columns; larger arrays, and those of no fixed shape, are left out."""
+ROWS = 4096
+
+
+def columns_of(kind: type[Message]) -> tuple[dict[str, list[str]], list[str]]:
+    """The columns by field of a message type, and the fields that have none."""
+    columns: dict[str, list[str]] = {}
+    left_out: list[str] = []
+    for field in kind.FIELDS:
+        if not isinstance(field, ArrayField):
+            columns[field.name] = [field.name]
+            continue
+        sizes = [size for size in field.shape_text().strip("()").split(",") if size]
+        sizes = [size.strip() for size in sizes]
+        if all(size.isdecimal() for size in sizes) and math.prod(map(int, sizes)) <= MAX_COLUMNS:
+            places = np.ndindex(*map(int, sizes))
+            columns[field.name] = [f"{field.name}_{'_'.join(map(str, place))}" for place in places]
+        else:
+            left_out.append(field.name)
+    return columns, left_out
+
+
+def row_of(message: Message, columns: Mapping[str, Sequence[str]]) -> dict[str, Any]:
+    """The values of a message by column; None for fields without a value."""
+    row: dict[str, Any] = {"stamp": message.stamp}
+    for name, names in columns.items():
+        value = message.__dict__[name]
+        if len(names) == 1 and not isinstance(value, np.ndarray):
+            row[names[0]] = "; ".join(value) if isinstance(value, tuple) else value
+        else:
+            values = [None] * len(names) if value is None else value.ravel().tolist()
+            row |= dict(zip(names, values, strict=True))
+    return row
+
+
+def export_csv(material: Material, folder: Path, done: Exported) -> None:
+    """Writes `<stream>.csv`, slashes of the name as folders; stamps in ns, floats with all their digits."""
+    with ExitStack() as files:
+        writers: dict[str, tuple[Any, dict[str, list[str]]]] = {}
+        for name, columns in _tables(material, done):
+            path = _file(folder, material.names[name], ".csv")
+            file = files.enter_context(path.open("w", newline="", encoding="utf-8"))
+            names = ["stamp", *(column for group in columns.values() for column in group)]
+            writer = csv.DictWriter(file, names)
+            writer.writeheader()
+            writers[name] = writer, columns
+            done.files.append(str(path))
+        for recorded in material.messages(list(writers)) if writers else ():
+            writer, columns = writers[recorded.stream]
+            writer.writerow(row_of(recorded.message, columns))
+            done.count(material.names[recorded.stream])
+
+
+def export_parquet(material: Material, folder: Path, done: Exported) -> None:
+    """Writes `<stream>.parquet`, zstd, a row group every 4,096 messages. Raises `RecordingError` without pyarrow."""
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ImportError:
+        raise RecordingError("--to parquet needs pyarrow: pip install pyarrow") from None
+    for name, columns in _tables(material, done):
+        path = _file(folder, material.names[name], ".parquet")
+        kind = material.streams[name].message_type
+        assert kind is not None
+        schema = pa.schema([("stamp", pa.int64()), *_types(pa, kind, columns)])
+        with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+            rows: list[dict[str, Any]] = []
+            for recorded in material.messages([name]):
+                rows.append(row_of(recorded.message, columns))
+                done.count(material.names[name])
+                if len(rows) == ROWS:
+                    writer.write_table(pa.Table.from_pylist(rows, schema))
+                    rows = []
+            writer.write_table(pa.Table.from_pylist(rows, schema))
+        done.files.append(str(path))
+
+
+def _types(pa: Any, kind: type[Message], columns: Mapping[str, list[str]]) -> Iterator[tuple[str, Any]]:
+    plain = {"int": pa.int64(), "float": pa.float64(), "bool": pa.bool_(), "str": pa.string(), "strs": pa.string()}
+    fields = {f.name: f for f in kind.FIELDS}
+    for name, names in columns.items():
+        field = fields[name]
+        for column in names:
+            if isinstance(field, ArrayField):
+                yield column, pa.from_numpy_dtype(np.dtype(field.dtype_text().split()[0]))
+            else:
+                yield column, plain[field.kind]
+
+
+def _tables(material: Material, done: Exported) -> Iterator[tuple[str, dict[str, list[str]]]]:
+    """The streams that have columns; notes what is left out."""
+    for topic in material.untouched:
+        done.left_out[topic.name] = f"{topic.encoding} messages of {topic.schema.name or 'no schema'}"
+    for name, info in material.streams.items():
+        assert info.message_type is not None
+        columns, left_out = columns_of(info.message_type)
+        if left_out:
+            done.left_out[f"{material.names[name]}: {', '.join(left_out)}"] = "arrays of no fixed, small shape"
+        if columns:
+            yield name, columns
+
+
+def _file(folder: Path, name: str, suffix: str) -> Path:
+    parts = [part for part in name.split("/") if part not in ("", ".", "..")]
+    path = folder.joinpath(*parts[:-1], f"{parts[-1]}{suffix}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
