@@ -24,8 +24,15 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
     Each worker takes a contiguous half and then from the other's end, so that what a module's tests share is made once.
     """
     whole = config.args_source is pytest.Config.ArgsSource.TESTPATHS
+    worker = hasattr(config, "workerinput")  # which would divide its part again, and so on without end
     chosen = config.option.keyword or config.option.markexpr or config.option.usepdb or config.option.collectonly
-    if whole and not chosen and config.pluginmanager.hasplugin("xdist") and config.option.numprocesses is None:
+    if (
+        whole
+        and not worker
+        and not chosen
+        and config.pluginmanager.hasplugin("xdist")
+        and config.option.numprocesses is None
+    ):
         config.option.numprocesses = len(os.sched_getaffinity(0))
         config.option.dist = "worksteal"
 
