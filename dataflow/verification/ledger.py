@@ -41,17 +41,19 @@ class Account:
 class Ledger:
     """The accounts of nodes, and whether the recording tells of its run to the end.
 
-    `ended` is False for a file without a proper end and for a run that failed or was left at once.
+    `ended` is False for a file without a proper end (`torn`) and for a run that failed or was interrupted. Records are
+    stored before messages: what a torn file lacks may have followed, what another lacks was never sent.
     """
 
     accounts: Mapping[str, Account]
     ended: bool
+    torn: bool
 
     def enter(self, verification: Verification) -> None:
         """Tells a verification what its recording cannot account for."""
         account = self.accounts[verification.operator]
         verification.not_stored = account.not_stored
-        lacking = bool(account.not_stored or verification.beyond)  # records are stored before messages
+        lacking = self.torn and bool(account.not_stored or verification.beyond)
         verification.cut = not self.ended and (not account.finished or lacking)
         if verification.cut:
             verification.after_cut = account.unaccounted
@@ -84,7 +86,7 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
             lost[name] = whole(log.of(name))[1]
     accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome")
-    return Ledger(accounts, not recording.torn and outcome == COMPLETE)
+    return Ledger(accounts, not recording.torn and outcome == COMPLETE, recording.torn)
 
 
 def _account(

@@ -32,8 +32,8 @@ class StandIn:
     cut: bool = False
 
     @staticmethod
-    def of(operator: str, account: Account, *, ended: bool) -> StandIn:
-        cut = not ended and (not account.finished or account.not_stored > 0)
+    def of(operator: str, account: Account, *, ended: bool, torn: bool) -> StandIn:
+        cut = not ended and (not account.finished or (torn and account.not_stored > 0))
         return StandIn(
             operator, account.unaccounted, account.lost, not account.finished and not cut, account.not_stored, cut
         )

@@ -241,7 +241,7 @@ def _report(
 
 def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
     """The books of a stand-in, with what reading its messages has shown."""
-    made = StandIn.of(name, task.ledger.accounts[name], ended=task.ledger.ended)
+    made = StandIn.of(name, task.ledger.accounts[name], ended=task.ledger.ended, torn=task.ledger.torn)
     read = [s for s in stored if s.maker == name]
     return replace(
         made,

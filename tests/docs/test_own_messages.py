@@ -68,7 +68,7 @@ def recorded(folder: Path, graph: Graph) -> Path:
 
 def without_the_module(folder: Path, *words: str, **more: Any) -> subprocess.CompletedProcess[str]:
     """Python in another folder, where `brightness` cannot be imported."""
-    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "COLUMNS": "200"}
     return subprocess.run(
         [sys.executable, *words], cwd=folder / "elsewhere", env=env, capture_output=True, text=True, timeout=60, **more
     )
@@ -138,7 +138,7 @@ def test_a_running_graph_is_echoed_where_the_module_is_not(
 ) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     words = ["-m", "dataflow.cli.main", "run", "daylight.yaml", "--live", "--set", "camera.frames=100000"]
-    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    env = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2]), "COLUMNS": "200"}
     running = subprocess.Popen([sys.executable, *words], cwd=folder, env=env, stderr=subprocess.PIPE)
     try:
         echo = ("echo", "photometer/brightness", "--wait", "30", "-n", "1", "--json")

@@ -13,7 +13,6 @@ from dataflow.interop.playing import readings_of
 from dataflow.interop.streams import BagStreams, Played
 from dataflow.messages import Message
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
-from dataflow.recording.container import MAGIC
 from dataflow.recording.layout import RECORDING
 
 
@@ -109,9 +108,3 @@ class Material:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-def is_mcap(path: Path) -> bool:
-    """Tells whether a file begins as an MCAP does."""
-    with path.open("rb") as file:
-        return file.read(len(MAGIC)) == MAGIC
