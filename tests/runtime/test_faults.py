@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -142,7 +143,7 @@ def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) ->
     ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
 
     assert ran.report.restarts == {"smooth": 1}
-    assert "operator 'smooth' failed in fire at stamp" in ran.events("restart")[0]
+    assert re.search(r"operator 'smooth' failed in (fire|tick) at stamp \d+", ran.events("restart")[0])
     assert not ran.events("restarted")
     assert ran.is_repeated()
 
