@@ -244,8 +244,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="cases whose name holds one of these words, separated by commas")
     parser.add_argument("--live", action="store_true", help="live runs")
     parser.add_argument("--memory", action="store_true", help="memory after many messages, instead")
-    parser.add_argument("--processes", action="store_true", help="a process for each operator, instead")
-    parser.add_argument("--apart", action="store_true", help="a process for each operator, instead")
+    parser.add_argument("--processes", action="store_true", help="messages/s of a process each, instead")
+    parser.add_argument("--apart", action="store_true", help="CPU time where each operator has a process, instead")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     if arguments.apart:

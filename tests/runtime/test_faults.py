@@ -143,7 +143,8 @@ def test_an_operator_that_raises_is_made_anew_in_the_same_process(path: Path) ->
     ran = Ran(robot(SMOOTH), path, {"kind": "raise", "operator": "smooth", "at": "300ms"})
 
     assert ran.report.restarts == {"smooth": 1}
-    assert re.search(r"operator 'smooth' failed in (fire|tick) at stamp \d+", ran.events("restart")[0])
+    said = r"operator 'smooth' failed in (fire|tick) at stamp \d+: InjectedFault: planned; made anew"
+    assert re.search(said, ran.events("restart")[0])
     assert not ran.events("restarted")
     assert ran.is_repeated()
 
