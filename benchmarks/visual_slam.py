@@ -33,8 +33,9 @@ from operators.geometry import se3  # noqa: E402
 from operators.odometry.camera import RgbdCamera  # noqa: E402
 from operators.odometry.rgbd_odometry import RgbdOdometry  # noqa: E402
 from operators.odometry.settings import RgbdOdometryConfig  # noqa: E402
+from operators.slam.keyframe_graph import Node  # noqa: E402
 from operators.slam.rgbd_slam import RgbdSlam, SlamResult  # noqa: E402
-from operators.slam.visual_graph import GraphSettings, Node  # noqa: E402
+from operators.slam.visual_graph import GraphSettings  # noqa: E402
 from operators.slam.visual_map_file import read_visual_map, write_visual_map  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -149,7 +150,7 @@ def compare(drive: Drive) -> dict[str, Any]:
         spent["slam"].append(1e3 * (time.process_time() - t))
     poses = np.array([r.T_map_odom @ r.odometry.T_world_camera for r in results if r.T_map_odom is not None])
     at = {int(stamp): T for stamp, T in zip(drive.stamps, drive.truth, strict=True)}
-    nodes = slam.graph.nodes
+    nodes = list(slam.graph.nodes.values())
     errors = from_start(poses, drive.truth)
     square = np.array(
         [e @ np.linalg.solve(r.covariance + 1e-12 * np.eye(6), e) for e, r in zip(errors, results, strict=True)]
@@ -163,7 +164,7 @@ def compare(drive: Drive) -> dict[str, Any]:
         "nees": float(np.median(square[1:]) / 6),
         "keyframes": len(nodes),
         "views": sum(n.view is not None for n in nodes),
-        "loops": sum(e.loop for e in slam.graph.edges),
+        "loops": slam.graph.loops,
         "frames": dict(Counter(str(r.place) for r in results)),
         "refused": dict(Counter(reason for r in results for reason in r.added.refused)),
         "ms_odometry": float(np.mean(spent["odometry"])),
@@ -176,7 +177,7 @@ def compare(drive: Drive) -> dict[str, Any]:
 
 def _false_loops(slam: RgbdSlam, at: dict[int, Array]) -> int:
     wrong = 0
-    for edge in slam.graph.edges:
+    for edge in slam.graph.graph.edges:
         if edge.loop:
             true = invert(at[slam.graph.nodes[edge.first].stamp]) @ at[slam.graph.nodes[edge.last].stamp]
             off = se3.log(invert(true) @ edge.T)

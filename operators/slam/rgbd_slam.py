@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from operators.geometry.se3 import Matrix
 from operators.odometry.camera import RgbdCamera
+from operators.odometry.fitting import Fitter
 from operators.odometry.memory import from_plain, to_plain
 from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
@@ -48,7 +49,7 @@ class RgbdSlam:
     def __init__(self, camera: RgbdCamera, config: RgbdOdometryConfig, settings: GraphSettings) -> None:
         self._camera, self._config = camera, config
         self._odometry = RgbdOdometry(camera, config)
-        self.graph = VisualGraph(settings, config)
+        self.graph = VisualGraph(settings)
         self._jumped = False  # the odometry found its map again, and no keyframe has told the graph
 
     def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> SlamResult:
@@ -62,7 +63,8 @@ class RgbdSlam:
         if result.keyframe:
             factor = max(1, image.shape[1] // self._config.image_width)
             working = replace(self._camera, K_color=scaled_intrinsics(self._camera.K_color, 1.0 / factor))
-            added = self.graph.add(self._odometry.snapshot().keyframes[-1], working, self._jumped)
+            state = self._odometry.snapshot()
+            added = self.graph.add(state.keyframes[-1], Fitter(working, self._config, state.noise), self._jumped)
             self._jumped &= not added.node
         place, reason = self._place(result, added)
         known = self.graph.located

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from operators.odometry.surface import Surface
-from operators.slam.visual_graph import Node, VisualGraph
+from operators.slam.keyframe_graph import Node
+from operators.slam.visual_graph import VisualGraph
 from operators.slam.visual_view import View
 
 VERSION = 1
@@ -19,7 +20,7 @@ SAVED = -1  # the island of nodes that were loaded
 
 def write_visual_map(graph: VisualGraph, path: Path) -> None:
     """Writes the views of a graph whose place in the map is known. The same map gives the same bytes."""
-    nodes = [node for node in graph.nodes if node.view is not None and node.island in graph.tied]
+    nodes = [node for node in graph.nodes.values() if node.view is not None and node.island in graph.tied]
     views = [node.view for node in nodes if node.view is not None]
     arrays: dict[str, Any] = {
         "version": np.array(VERSION),

@@ -129,7 +129,7 @@ class VisualSlam(Operator):
         if result.added.loops:
             messages["path"] = self._path(slam, depth.stamp)
         if slam.graph.located and self._map_due(result, slam):
-            messages["map"] = cloud_of(slam.graph.nodes, self.voxel, self.map_frame, depth.stamp)
+            messages["map"] = cloud_of(slam.graph.nodes.values(), self.voxel, self.map_frame, depth.stamp)
         return messages
 
     def finish(self) -> None:
@@ -194,7 +194,7 @@ class VisualSlam(Operator):
         )
 
     def _path(self, slam: RgbdSlam, stamp: int) -> Path:
-        nodes = [node for node in slam.graph.nodes if node.island in slam.graph.tied]
+        nodes = [node for node in slam.graph.nodes.values() if node.island in slam.graph.tied]
         poses = np.array([node.T for node in nodes])
         return Path(
             stamp=stamp, frame=self.map_frame, positions=poses[:, :3, 3], orientations=matrix_to_quaternion(poses)
@@ -235,5 +235,5 @@ class VisualSlam(Operator):
 
 
 def _sizes(slam: RgbdSlam) -> dict[str, int]:
-    nodes = slam.graph.nodes
+    nodes = slam.graph.nodes.values()
     return {"keyframes": len(nodes), "views": sum(node.view is not None for node in nodes)}

@@ -17,10 +17,8 @@ from operators.odometry.frame import Frame
 from operators.odometry.keyframe import Keyframe
 from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
-from operators.odometry.noise import Noise
 from operators.odometry.recognition import Description, match
 from operators.odometry.relocalizer import rough_points
-from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import Surface
 from operators.odometry.watch import Watch
 from operators.slam.place_index import Words, words_of
@@ -101,7 +99,7 @@ class Judge:
         return ""
 
 
-def sight(known: View, seen: View, camera: RgbdCamera, config: RgbdOdometryConfig, fewest: int) -> Sight | None:
+def sight(known: View, seen: View, fitter: Fitter, fewest: int) -> Sight | None:
     """Measures the pose of a view in the depth camera of a known one; None where fewer than `fewest` features agree.
 
     RANSAC PnP on matched descriptors, then reprojections and point-to-plane distances together.
@@ -112,13 +110,12 @@ def sight(known: View, seen: View, camera: RgbdCamera, config: RgbdOdometryConfi
     points = known.points[pairs[:, 0]].astype(np.float64)
     there = np.isfinite(points[:, 2])
     pixels = seen.pixels[pairs[there, 1]].astype(np.float64)
-    fitter = Fitter(camera, config, Noise())
     sighting = fitter.solve(points[there], pixels, np.zeros(len(pixels), np.int64), PIXELS, fewest)
     if sighting is None:
         return None
     T = sighting.T_world_camera
     fit = fitter.refine(
-        _frame(seen, camera), replace(sighting, recognised=True), Motion(0, T, np.zeros(6)), T, _alone(known), 0
+        _frame(seen, fitter.camera), replace(sighting, recognised=True), Motion(0, T, np.zeros(6)), T, _alone(known), 0
     )
     if fit.inliers < fewest:
         return None
@@ -128,7 +125,7 @@ def sight(known: View, seen: View, camera: RgbdCamera, config: RgbdOdometryConfi
 
 def _frame(view: View, camera: RgbdCamera) -> Frame:
     nothing = np.zeros((1, 1), np.uint8)
-    return Frame(0, nothing, camera.K_color, view.surface.depth, view.surface, None, None, Watch())
+    return Frame(1_000_000_000, nothing, camera.K_color, view.surface.depth, view.surface, None, None, Watch())
 
 
 def _alone(view: View) -> LocalMap:

@@ -40,9 +40,14 @@ def elsewhere(count: int) -> list[Matrix]:
 
 
 @cache
+def room(seed: int) -> Room:
+    return Room(seed)
+
+
+@cache
 def frame(seed: int, pose: bytes) -> Frame:
     T = np.frombuffer(pose).reshape(4, 4)
-    view = Room(seed).render(T, K, SIZE)
+    view = room(seed).render(T, K, SIZE)
     rng = np.random.default_rng([seed, int(1e6 * abs(T[0, 3]))])
     image = np.clip(view.image + rng.normal(0, 2, view.image.shape), 0, 255).astype(np.uint8)
     depth = view.depth + 0.0015 * view.depth**2 * rng.standard_normal(view.depth.shape)
