@@ -28,6 +28,7 @@ from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import about_fixed_axes
 from operators.odometry.camera import RgbdCamera
+from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import DepthNoise
@@ -36,7 +37,6 @@ from operators.slam.visual_cloud import cloud_of
 from operators.slam.visual_graph import GraphSettings
 from operators.slam.visual_map_file import read_visual_map, write_visual_map
 from operators.slam.visual_view import Judge
-from operators.status import counted_status
 
 LEVELS = {
     Place.MAPPED: Level.OK,
@@ -121,10 +121,10 @@ class VisualSlam(Operator):
         check_calibration("depth", depth, depth_info)
         slam = self._running(image_info, depth_info, extrinsics)
         result = slam.track(image.data, depth.data, depth.stamp)
-        self._counts.update({result.place.value: 1, "loops": result.added.loops})
+        self._counts.update({result.place.value: 1})
         self._counts.update(f"refused: {reason}" for reason in result.added.refused)
         messages: dict[str, Message] = outputs(result.odometry, self.odometry_frame, depth.frame)
-        messages["status"] = self._status(result, slam, messages["status"])
+        messages["status"] = self._status(result, slam)
         messages |= self._placed(result, depth)
         if result.added.loops:
             messages["path"] = self._path(slam, depth.stamp)
@@ -153,7 +153,7 @@ class VisualSlam(Operator):
 
     def summary(self) -> Mapping[str, float | int]:
         """Returns the number of frames of each state, of loops, and of views that were refused, by reason."""
-        kept = {} if self._run is None else _sizes(self._run.slam)
+        kept = {} if self._run is None else _sizes(self._run.slam) | {"loops": self._run.slam.graph.loops}
         return dict(self._counts) | kept
 
     # -- what is sent ------------------------------------------------------------------------------------
@@ -178,19 +178,18 @@ class VisualSlam(Operator):
             ),
         }
 
-    def _status(self, result: SlamResult, slam: RgbdSlam, odometry: Message) -> Diagnostics:
-        assert isinstance(odometry, Diagnostics)
-        counts = _sizes(slam) | {"loops": self._counts["loops"]}
-        text, level = f"{result.place}: {result.reason}", LEVELS[result.place]
-        own = counted_status("visual_slam", odometry.stamp, text, level, counts)
+    def _status(self, result: SlamResult, slam: RgbdSlam) -> Diagnostics:
+        """The map's state, then the odometry's."""
+        odometry = result.odometry
+        counts = _sizes(slam) | {"loops": slam.graph.loops}
         return Diagnostics(
             stamp=odometry.stamp,
-            names=own.names + odometry.names,
-            messages=own.messages + odometry.messages,
-            levels=np.concatenate([own.levels, odometry.levels]),
-            keys=own.keys + odometry.keys,
-            values=own.values + odometry.values,
-            owners=np.concatenate([own.owners, odometry.owners + len(own.names)]).astype(np.int32),
+            names=("visual_slam", "visual_odometry"),
+            messages=(f"{result.place}: {result.reason}", f"{odometry.status}: {odometry.reason}"),
+            levels=np.array([LEVELS[result.place], ODOMETRY_LEVELS[odometry.status]], np.uint8),
+            keys=(*counts, "inliers"),
+            values=(*map(str, counts.values()), str(odometry.inliers)),
+            owners=np.array([0] * len(counts) + [1], np.int32),
         )
 
     def _path(self, slam: RgbdSlam, stamp: int) -> Path:
