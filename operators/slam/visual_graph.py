@@ -142,9 +142,8 @@ class VisualGraph:
         if before is not None:
             self._chain(before, number, broken)
         added = Added(node=True)
-        beside = self._beside(number, fitter, depth)
         self._look(number, fitter, depth, added)
-        if beside and not added.loops:
+        if not added.loops and self._beside(number, fitter, depth):
             self.graph.settle(WINDOW)
         self.T_map_odom = se3.orthonormalised(new.T @ invert(new.T_odom))
         if new.view is not None:
