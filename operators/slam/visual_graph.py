@@ -19,7 +19,7 @@ from operators.slam.place_index import PlaceIndex
 from operators.slam.visual_view import Judge, Sight, View, sight
 
 UNKNOWN = np.diag([1.0] * 3 + [1.0] * 3)  # covariance (6, 6) of a motion that nothing measured, m² and rad²
-LEAST = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # of any measured one: calibration errs alike in all
+LEAST = np.diag([0.0005**2] * 3 + [0.0003**2] * 3)  # of any measured one: calibration errs alike in all
 BESIDE = 0.6  # radians of view change at which a keyframe is measured against those a little before it
 WINDOW = 10  # newest keyframes, which are settled at every new one
 STRAIN = 12.6  # squared sigmas (95 % of 6 degrees of freedom) by which a loop may be off before the whole map moves

@@ -24,6 +24,7 @@ from operators.odometry.watch import Watch
 from operators.slam.place_index import Words, words_of
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
+SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
 
 
@@ -120,7 +121,7 @@ def sight(known: View, seen: View, fitter: Fitter, fewest: int) -> Sight | None:
     if fit.inliers < fewest:
         return None
     overlap = fit.compared / fit.offered if fit.offered else 0.0
-    return Sight(fit.T_world_camera, fit.covariance, len(pairs), fit.inliers, overlap, fit.depth_inliers)
+    return Sight(fit.T_world_camera, SURE * fit.covariance, len(pairs), fit.inliers, overlap, fit.depth_inliers)
 
 
 def _frame(view: View, camera: RgbdCamera) -> Frame:
