@@ -19,7 +19,8 @@ from operators.slam.place_index import PlaceIndex
 from operators.slam.visual_view import Judge, Sight, View, sight
 
 UNKNOWN = np.diag([1.0] * 3 + [1.0] * 3)  # covariance (6, 6) of a motion that nothing measured, m² and rad²
-LEAST = np.diag([0.0005**2] * 3 + [0.0003**2] * 3)  # of any measured one: calibration errs alike in all
+DRIFT = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # what odometry may be off besides: it errs more where things move
+LEAST = np.diag([0.0005**2] * 3 + [0.0003**2] * 3)  # of a sight: calibration errs alike in all
 BESIDE = 0.6  # radians of view change at which a keyframe is measured against those a little before it
 WINDOW = 10  # newest keyframes, which are settled at every new one
 STRAIN = 12.6  # squared sigmas (95 % of 6 degrees of freedom) by which a loop may be off before the whole map moves
@@ -329,4 +330,4 @@ def between(node: Node, T_odom: Matrix, covariance_odom: Matrix) -> Matrix:
     grown = covariance_odom - carried
     if np.linalg.eigvalsh(grown)[0] < -1e-9:
         grown = covariance_odom + carried
-    return np.asarray(grown + LEAST, np.float64)
+    return np.asarray(grown + DRIFT, np.float64)

@@ -50,7 +50,7 @@ def read_visual_map(path: Path) -> list[Node]:
         with np.load(path, allow_pickle=False) as archive:
             version = int(archive["version"])
             arrays = {name: archive[name] for name in archive.files}
-    except (ValueError, KeyError, OSError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, OSError, EOFError, zipfile.BadZipFile) as error:
         raise ValueError(f"{path} is no visual map ({type(error).__name__}: {error})") from None
     if version != VERSION:
         raise ValueError(f"{path} is a visual map of version {version}; this program reads version {VERSION}")

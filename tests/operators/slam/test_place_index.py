@@ -41,7 +41,7 @@ def test_the_place_seen_again_is_the_likest_of_many(seed: int) -> None:
     for k in (0, 17, 79):
         likeness = index.likeness(words_of(seen_again(places[k], seed)))
         assert index.keys[int(np.argmax(likeness))] == 1000 + k
-        assert likeness.max() > 2 * np.sort(likeness)[-2]
+        assert likeness.max() > 1.4 * np.sort(likeness)[-2]
 
 
 def test_the_same_view_is_as_like_as_can_be_and_a_view_of_nothing_is_like_none() -> None:
@@ -49,7 +49,7 @@ def test_the_same_view_is_as_like_as_can_be_and_a_view_of_nothing_is_like_none()
     assert index.likeness(words_of(place(0))).tolist() == []
     index.add(3, words_of(place(0)))
     index.add(5, words_of(np.zeros((0, 128), np.uint8)))
-    assert index.likeness(words_of(place(0)))[0] == pytest.approx(1.0)
+    assert index.likeness(words_of(place(0)))[0] == pytest.approx(1.0, abs=1e-4)
     assert index.likeness(words_of(place(0)))[1] == 0.0
     assert (index.likeness(words_of(np.zeros((0, 128), np.uint8))) == 0).all()
     assert len(index) == 2

@@ -23,7 +23,7 @@ from operators.sources.room import Room, camera_path, look_at
 
 SIZE = (192, 144)
 K = np.array([[158.0, 0.0, 95.5], [0.0, 158.0, 71.5], [0.0, 0.0, 1.0]])
-ROUND = 48  # frames
+ROUND = 36  # frames
 
 Frame = tuple[NDArray[np.uint8], NDArray[np.float32]]
 
@@ -92,11 +92,24 @@ def texts(played: Played) -> list[str]:
     return [status.messages[0] for status in played["status"]]
 
 
-def test_odometry_is_that_of_visual_odometry_and_pose_is_its_correction() -> None:
-    seen = frames(on_round(ROUND + 12))
-    slam, plain = run(seen), play(VisualOdometry(), streams(seen), static=STATIC)
-    assert slam.digests()["odometry"] == plain.digests()["odometry"]
-    for odometry, correction, pose in zip(slam["odometry"], slam["correction"], slam["pose"], strict=True):
+@pytest.fixture(scope="module")
+def around() -> Played:
+    """A round and a bit more, from a calibrated camera."""
+    return run(frames(on_round(ROUND + 6)))
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of a round."""
+    file: Path = tmp_path_factory.mktemp("maps") / "room.npz"
+    run(frames(on_round(ROUND)), save=str(file))
+    return file
+
+
+def test_odometry_is_that_of_visual_odometry_and_pose_is_its_correction(around: Played) -> None:
+    plain = play(VisualOdometry(), streams(frames(on_round(ROUND + 6))), static=STATIC)
+    assert around.digests()["odometry"] == plain.digests()["odometry"]
+    for odometry, correction, pose in zip(around["odometry"], around["correction"], around["pose"], strict=True):
         assert (correction.frames, correction.child_frames) == (("map",), ("odom",))
         np.testing.assert_allclose(correction.matrices()[0] @ odometry.matrix(), pose.matrix(), atol=1e-9)
         assert (pose.frame, pose.child_frame, pose.stamp) == ("map", "depth", odometry.stamp)
@@ -117,33 +130,29 @@ def test_a_loop_takes_drift_away() -> None:
 
 
 def test_the_map_does_not_grow_where_it_was_already() -> None:
-    played = run(frames(on_round(2 * ROUND)))
+    played = run(frames(on_round(ROUND + 18)))
     views = [int(s.values[s.keys.index("views")]) for s in played["status"]]
-    assert views[-1] - views[ROUND] < 0.25 * views[ROUND]
+    assert views[-1] - views[ROUND] < 0.5 * (views[18] - views[0])
 
 
-def test_a_saved_map_is_found_from_elsewhere(tmp_path: Path) -> None:
-    file = tmp_path / "room.npz"
-    run(frames(on_round(ROUND)), save=str(file))
-    poses = elsewhere(14)
-    played = run(frames(poses), map_file=str(file))
-    assert texts(played)[0].startswith("searching")
+def test_a_saved_map_is_found_from_elsewhere(saved: Path) -> None:
+    poses = elsewhere(10)
+    played = run(frames(poses), map_file=str(saved))
+    assert "corrected: the map is found" in texts(played)
     assert len(played["pose"]) >= 5
     found = errors(played["pose"], poses[-len(played["pose"]) :], on_round(1)[0])
     assert found.max() < 0.05
 
 
-def test_a_saved_map_of_another_room_is_not_found(tmp_path: Path) -> None:
-    file = tmp_path / "room.npz"
-    run(frames(on_round(ROUND)), save=str(file))
-    played = run(frames(elsewhere(14), seed=5), map_file=str(file))
+def test_a_saved_map_of_another_room_is_not_found(saved: Path) -> None:
+    played = run(frames(elsewhere(10), seed=5), map_file=str(saved))
     assert {text.split(":")[0] for text in texts(played)} == {"searching"}
     assert played["pose"] == []
     assert played["correction"] == []
 
 
 def test_a_saved_map_has_the_same_bytes_each_time(tmp_path: Path) -> None:
-    seen = frames(on_round(20))
+    seen = frames(on_round(10))
     for name in ("a.npz", "b.npz"):
         run(seen, save=str(tmp_path / name))
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
@@ -170,51 +179,48 @@ def test_a_damaged_map_and_one_of_another_version_are_refused(tmp_path: Path) ->
 
 
 def test_blind_frames_are_told_and_survived() -> None:
-    poses = on_round(ROUND)
+    poses = on_round(24)
     seen = frames(poses)
-    dark = [(np.zeros_like(i), np.full_like(d, np.nan)) if 20 <= k < 26 else (i, d) for k, (i, d) in enumerate(seen)]
+    dark = [(np.zeros_like(i), np.full_like(d, np.nan)) if 12 <= k < 15 else (i, d) for k, (i, d) in enumerate(seen)]
     played = run(dark)
     told = texts(played)
-    assert all(text.startswith("adrift: odometry") for text in told[20:26])
+    assert all(text.startswith("adrift: odometry") for text in told[12:15])
     assert told[-1].startswith(("mapped", "corrected"))
     assert errors(played["pose"], poses, poses[0])[-1] < 0.05
 
 
-def test_the_same_frames_give_the_same_bytes() -> None:
-    seen = frames(on_round(ROUND + 6))
-    first, again = run(seen), run(seen)
-    assert first.digests() == again.digests()
+def test_the_same_frames_give_the_same_bytes(around: Played) -> None:
+    assert run(frames(on_round(ROUND + 6))).digests() == around.digests()
 
 
 def test_a_restored_state_goes_on_alike() -> None:
-    seen = frames(on_round(ROUND + 8))
+    seen = frames(on_round(ROUND + 4))
     given = streams(seen)
     one, other = VisualSlam(), VisualSlam()
     one.setup()
     other.setup()
     assert one.snapshot() == {}
     calibration = (given["image_info"][0], given["depth_info"][0])
-    for k in range(ROUND - 8):
+    for k in range(ROUND - 4):
         one.process(given["image"][k], given["depth"][k], *calibration)
     recorded = pack_state(one.snapshot())
     other.restore(unpack_state(recorded))
     assert pack_state(other.snapshot()) == recorded
-    for k in range(ROUND - 8, ROUND + 8):
+    for k in range(ROUND - 4, ROUND + 4):
         sent = one.process(given["image"][k], given["depth"][k], *calibration)
         again = other.process(given["image"][k], given["depth"][k], *calibration)
         assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
 
 
-def test_covariance_covers_the_error() -> None:
-    poses = on_round(ROUND + 10)
-    played = run(frames(poses))
+def test_covariance_covers_the_error(around: Played) -> None:
+    poses = on_round(ROUND + 6)
     squares = []
-    for pose, T in zip(played["pose"][1:], poses[1:], strict=True):
+    for pose, T in zip(around["pose"][1:], poses[1:], strict=True):
         off = (poses[0] @ pose.matrix())[:3, 3] - T[:3, 3]
         R = poses[0][:3, :3]
         squares.append(off @ np.linalg.solve(R @ pose.pose_covariance[:3, :3] @ R.T, off) / 3)
-    assert np.mean(squares) < 3.0
+    assert 0.005 < np.mean(squares) < 3.0
 
 
 def test_truth_of_the_made_path_closes() -> None:
