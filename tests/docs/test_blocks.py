@@ -24,10 +24,11 @@ def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     runner = REPOSITORY / "tests" / "support" / "doc_pages.py"
     path = os.pathsep.join([str(REPOSITORY), *filter(None, sys.path)])
     environment = {**os.environ, "PYTHONPATH": path, "PYTHONWARNINGS": "ignore", "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(runner), str(tmp_path_factory.mktemp("pages")), *PAGES]
+    folder = tmp_path_factory.mktemp("pages")
+    command = [sys.executable, str(runner), str(folder), *PAGES]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=110)
     assert done.returncode == 0, done.stderr
-    found: dict[str, list[str]] = json.loads(done.stdout)
+    found: dict[str, list[str]] = json.loads((folder / "faults.json").read_text(encoding="utf-8"))
     return found
 
 
@@ -37,7 +38,9 @@ def test_the_blocks_of_a_page_do_what_they_say(faults: dict[str, list[str]], pag
 
 
 def checked(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What is wrong with a page of this text, in a folder that has the project's graphs."""
     monkeypatch.chdir(folder)
+    (folder / "graphs").symlink_to(REPOSITORY / "graphs")
     return PageRun("page.md", text).run()
 
 

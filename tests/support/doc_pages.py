@@ -1,7 +1,7 @@
 """Code blocks of documentation pages, by language, and a process that runs them.
 
 `python tests/support/doc_pages.py FOLDER PAGE...` runs each page's blocks in a folder and a process of its own, and
-prints what is wrong as JSON: {page: ["page.md:12: ...", ...]}.
+writes what is wrong to FOLDER/faults.json: {page: ["page.md:12: ...", ...]}.
 
 - `python` runs in order in one namespace; a `text` block right below is what it prints. Functions named `test_...` are
   called. A block that begins with `# file: NAME` is that file, and is imported.
@@ -339,14 +339,21 @@ def _in_a_process_of_its_own(page: str, folder: Path, answer: Any) -> None:
 
 
 def main(folder: Path, pages: list[str]) -> None:
+    import hypothesis
+
     import dataflow
     import dataflow.cli.main
     import dataflow.testing
     import operators.cloud
     import operators.sources  # noqa: F401  (imported once, before the pages' processes are forked)
 
+    hypothesis.settings.register_profile(
+        "pages", derandomize=True, deadline=None, database=None, suppress_health_check=list(hypothesis.HealthCheck)
+    )
+    hypothesis.settings.load_profile("pages")
     os.chdir(folder)
-    dataflow.run(REPOSITORY / "graphs" / "synthetic_rgbd.yaml", record="run.mcap", settings={"frames": 4})
+    small = {"frames": 4, "camera.width": 96, "camera.height": 72}
+    dataflow.run(REPOSITORY / "graphs" / "synthetic_rgbd.yaml", record="run.mcap", settings=small)
     fork = multiprocessing.get_context("fork")
     faults = {}
     for page in pages:
@@ -359,7 +366,7 @@ def main(folder: Path, pages: list[str]) -> None:
         except EOFError:
             faults[page] = [f"{page}: its process died"]
         process.join()
-    json.dump(faults, sys.stdout)
+    (folder / "faults.json").write_text(json.dumps(faults), encoding="utf-8")
 
 
 if __name__ == "__main__":
