@@ -25,6 +25,7 @@ VIEWS: dict[str, tuple[str, ...]] = {
     "depth": ("graphs/depth.yaml",),
     "lidar": ("graphs/simulated_lidar.yaml",),
     "mono_depth": ("graphs/mono_depth.yaml", "--set", f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}"),
+    "slam": ("graphs/slam.yaml",),
     "stereo": ("graphs/simulated_stereo.yaml",),
 }
 """The arguments of `dataflow run` by the picture's name."""
