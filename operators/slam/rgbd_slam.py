@@ -33,7 +33,7 @@ class Place(StrEnum):
 
 @dataclass(frozen=True, eq=False)
 class SlamResult:
-    """What a frame gave. `T_map_odom` is None while the place in the map is not known."""
+    """Holds what a frame gave. `T_map_odom` is None while the place in the map is not known."""
 
     odometry: TrackResult
     place: Place

@@ -33,7 +33,7 @@ AGREE = (0.1, 0.05)  # metres and radians by which two sights of one surprise ma
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """Angles are of view: rotation plus baseline over depth, radians."""
+    """Settings of a map; angles are of view: rotation plus baseline over depth, radians."""
 
     spacing: float = 0.2  # between views of the map
     travel: float = 1.5  # along the way between two views that a loop may join
@@ -62,7 +62,7 @@ class Surprise:
 
 @dataclass(eq=False)
 class Added:
-    """What became of a keyframe: loops found from it, and why views that were compared with were refused."""
+    """Tells what became of a keyframe: loops found from it, and why views that were compared with were refused."""
 
     node: bool = False
     loops: int = 0

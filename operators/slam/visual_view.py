@@ -67,7 +67,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """How a camera's view was measured against a known one, and what supports it.
+    """Holds how a camera's view was measured against a known one, and what supports it.
 
     `inliers` features agree with the pose; `overlap` is the share of the depth image that the known view could see,
     `agreement` the share of that which lies on its surfaces.
@@ -83,7 +83,7 @@ class Sight:
 
 @dataclass(frozen=True)
 class Judge:
-    """What makes a sight certain enough to correct a map by it."""
+    """Decides what makes a sight certain enough to correct a map by it."""
 
     inliers: int = 20
     overlap: float = 0.2
