@@ -39,7 +39,7 @@ class GraphSettings:
     travel: float = 1.5  # along the way between two views that a loop may join
     beside: int = 2  # views compared with, of those a little before
     near: int = 2  # views compared with, of those that the map expects here
-    alike: int = 2  # and of those that look alike, wherever they are
+    alike: int = 2  # and of those that look alike, wherever they are; twice as many while the map is searched for
     judge: Judge = field(default_factory=Judge)
 
 
@@ -243,7 +243,7 @@ class VisualGraph:
         assert view is not None
         likeness = dict(zip(self._index.keys, self._index.likeness(view.words), strict=True))
         ranked = [(-likeness[k], k) for k in self._old(number) if k not in tried and likeness[k] > ALIKE]
-        return [k for _, k in sorted(ranked)[: self._settings.alike]]
+        return [k for _, k in sorted(ranked)[: self._settings.alike * (1 if self.located else 2)]]
 
     def _old(self, number: int) -> list[int]:
         """Returns the nodes of the map with a view, between which and a new one the camera has turned away."""
