@@ -17,18 +17,23 @@ from dataflow.cli import (
     convert,
     demo,
     doctor,
+    editing,
     inspection,
     latency,
     lint,
     live,
     logs,
+    merging,
     new,
     param,
+    playback,
     pub,
+    recording,
     recordings,
     replay,
     run,
     top,
+    trigger,
     verification,
     viewing,
 )
@@ -125,6 +130,11 @@ _add(demo.graphs, _LOOK)
 _add(recordings.info, _LOOK)
 _add(recordings.diff, _LOOK)
 _add(convert.convert, _MATERIAL)
+_add(editing.cut, _MATERIAL)
+_add(editing.filter_, _MATERIAL, "filter")
+_add(editing.split, _MATERIAL)
+_add(merging.merge, _MATERIAL)
+_add(merging.recover, _MATERIAL)
 _add(latency.latency, _LOOK)
 _add(lint.lint, _LOOK)
 _add(viewing.view, _LOOK)
@@ -139,6 +149,9 @@ _add(new.graph, None, to=beginnings)
 _add(new.project, None, to=beginnings)
 app.add_typer(beginnings, name="new", rich_help_panel=_MAKE)
 _add(pub.pub, _FOLLOW)
+_add(recording.record, _FOLLOW)
+_add(playback.playback, _FOLLOW)
+_add(trigger.trigger, _FOLLOW)
 parameters = typer.Typer(no_args_is_help=True, help="Read and change the parameters of a running graph.")
 _add(param.set_, None, "set", parameters, ignore_unknown_options=True)  # so that -1 is a value
 _add(param.get, None, to=parameters)
