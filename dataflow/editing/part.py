@@ -92,21 +92,17 @@ def copy_messages(
 def write_firings(copy: Copy, origins: Sequence[Origin], records: Mapping[str, Sequence[FiringRecord]]) -> None:
     """Writes firing records anew, those of all operators in the order of stamps."""
     first = max(1, min((span[0] for origin in origins if (span := origin.span()) is not None), default=1))
-    channels = {
-        channel.metadata.get("operator", ""): (origin, channel.id)
-        for origin in origins
-        for channel in origin.of_kind(Kind.FIRINGS).values()
-    }
     batches = []
     for operator, listed in records.items():
         for part in consecutive(listed):
             for at in range(0, len(part), BATCH):
                 batch = part[at : at + BATCH]
                 batches.append((max(batch[-1].stamp, first), operator, encode_batch(batch)))
+    channels = {operator: copy.firings_channel(origins[0].namespace, operator) for operator in records}
     sequences: dict[str, int] = {}
     for stamp, operator, data in sorted(batches, key=lambda b: (b[0], b[1])):
         sequence = sequences.get(operator, 0)
-        copy.record(copy.channel(*channels[operator]), min(stamp, 2**63 - 1), sequence, data)
+        copy.record(channels[operator], min(stamp, 2**63 - 1), sequence, data)
         sequences[operator] = sequence + 1
 
 

@@ -18,7 +18,7 @@ from dataflow.recording.contents import Entries
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.frames import FrameTree
 from dataflow.recording.index import McapFile, RawMessage
-from dataflow.recording.layout import RECORDING, Kind, frames_topic
+from dataflow.recording.layout import RECORDING, Kind, firings_topic, frames_topic
 from dataflow.recording.ordering import in_file_order
 from dataflow.recording.packing import Compression
 from dataflow.recording.reader import Recorded, Recording
@@ -151,6 +151,11 @@ class Copy:
             alike.append((id(origin), known))
             self._channels[id(origin), channel] = known
         return known
+
+    def firings_channel(self, namespace: str, operator: str) -> int:
+        """A new channel for the firing records of one operator."""
+        metadata = {"kind": str(Kind.FIRINGS), "operator": operator}
+        return self.writer.add_channel(firings_topic(namespace, operator), "msgpack", 0, metadata)
 
     def message(self, channel: int, raw: RawMessage) -> None:
         """Adds a message of a stream."""
