@@ -18,6 +18,7 @@ from dataflow.cli import (
     demo,
     doctor,
     editing,
+    foxglove,
     inspection,
     latency,
     lint,
@@ -138,6 +139,7 @@ _add(merging.recover, _MATERIAL)
 _add(latency.latency, _LOOK)
 _add(lint.lint, _LOOK)
 _add(viewing.view, _LOOK)
+_add(foxglove.foxglove, _LOOK)
 _add(live.list_running, _FOLLOW, "list")
 _add(live.echo, _FOLLOW)
 _add(live.hz, _FOLLOW)

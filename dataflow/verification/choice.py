@@ -39,24 +39,26 @@ def chosen_operators(graph: Graph, first: str | None, only: str | None) -> set[s
     return following & able
 
 
-def with_makers(recording: Recording, graph: Graph, chosen: set[str]) -> set[str]:
-    """The operators with those that make what they take, as far as it was not recorded."""
+def with_makers(held: Collection[str], graph: Graph, chosen: set[str]) -> set[str]:
+    """The operators with those that make what they take, as far as it is not held in the recording."""
     wanted, left = set(chosen), list(chosen)
     while left:
         for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
             maker = graph.nodes[graph.streams[stream].node]
-            if stream not in recording.streams and not (maker.source or maker.external or maker.name in wanted):
+            if stream not in held and not (maker.source or maker.external or maker.name in wanted):
                 wanted.add(maker.name)
                 left.append(maker.name)
     return wanted
 
 
-def unfed_operators(recording: Recording, graph: Graph, operators: Collection[str]) -> dict[str, str]:
+def unfed_operators(
+    recording: Recording, graph: Graph, operators: Collection[str], incomplete: Collection[str]
+) -> dict[str, str]:
     """The operators whose inputs are not in the recording and cannot be made again, with the stream that is missing."""
     found: dict[str, str] = {}
     for name in operators:
         try:
-            plan_feeding(recording, graph, [name])
+            plan_feeding(recording, graph, [name], incomplete=incomplete)
         except NotRecorded as error:
             found[name] = error.stream
     return found

@@ -34,7 +34,7 @@ from dataflow.verification.choice import (
     with_makers,
 )
 from dataflow.verification.compare import OutputComparison
-from dataflow.verification.ledger import Ledger, read_ledger
+from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.letters import shared_records
 from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
@@ -55,6 +55,7 @@ class _Task:
     operators: tuple[str, ...]
     stood_in: tuple[str, ...]
     stand_ins: tuple[str, ...]
+    incomplete: frozenset[str]
     parts: tuple[partition.Part, ...]
     unchecked: tuple[str, ...]
     facts: tuple[tuple[str, str, str], ...]
@@ -80,8 +81,8 @@ def verify(
     """Re-executes a recording by its firing records and compares.
 
     `first`: verify that operator and what follows from it; `only`: that one alone. Every operator is fed from the
-    recording; where its inputs were not recorded, those that made them run with it. Operators marked `external` are
-    always taken from it. Stored messages are compared with the digests in the firing records, too.
+    recording; where its inputs were not recorded, or not wholly, those that made them run with it. Operators marked
+    `external` are always taken from it. Stored messages are compared with the digests in the firing records, too.
     `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, to see whether they
     differ alike.
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
@@ -106,6 +107,7 @@ def verify(
             "records": descriptor,
             "batches": batches,
             "begin": task.begin,
+            "incomplete": sorted(task.incomplete),
             "tolerance": tolerance,
         }
         calls = [
@@ -127,23 +129,26 @@ def _prepare(
 ) -> _Task:
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
-        chosen = with_makers(recording, played, chosen_operators(played, first, only))
-        unfed = {} if first or only else unfed_operators(recording, played, chosen)
+        log = FiringLog.read(recording)
+        told = [n for n in played.nodes if accountable(recording, played, log, n)]
+        incomplete = incomplete_streams(recording, played, log, told)
+        held = recording.streams.keys() - incomplete
+        chosen = with_makers(held, played, chosen_operators(played, first, only))
+        unfed = {} if first or only else unfed_operators(recording, played, chosen, incomplete)
         if unfed.keys() >= chosen:
-            plan_feeding(recording, played, sorted(chosen))  # says what is missing
+            plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # says what is missing
         chosen -= unfed.keys()
         operators = tuple(name for name in played.nodes if name in chosen)
-        log = FiringLog.read(recording)
         require_records(recording, log, operators)
         require_ports(recording, played, log, operators)
-        plan_feeding(recording, played, operators)
+        plan_feeding(recording, played, operators, incomplete=incomplete)
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, log, n)]
         checks, unchecked = stored_checks(recording, played, log, [*operators, *stand_ins])
-        groups = partition.units(played, recording.streams, operators)
+        groups = partition.units(played, held, operators)
         work = {n: sum(r.duration + partition.PER_FIRING_NS for r in log.of(n)) for n in operators}
         jobs = jobs or partition.jobs_for(work, len(os.sched_getaffinity(0)))
         begin, last = _span(recording, start)
@@ -155,6 +160,7 @@ def _prepare(
             operators=operators,
             stood_in=tuple(name for name in played.nodes if name in feeding),
             stand_ins=tuple(stand_ins),
+            incomplete=incomplete,
             parts=tuple(partition.with_checks(played, partition.balanced(groups, work, jobs), checks)),
             unchecked=unchecked,
             facts=_differing_facts(recording.metadata, played),
