@@ -79,7 +79,7 @@ def records_of_span(
     operators = {name: _operator(records, tuple(outputs.get(name, ())), end) for name, records in log.items()}
     makers = {stream: name for name, streams in outputs.items() for stream in streams}
     if start is not None:
-        bounds = dict.fromkeys(operators, start)
+        bounds = dict.fromkeys(operators, start - 1)  # a state at `start` has seen what lies there
         moved = list(operators)
         while moved:
             name = moved.pop()

@@ -9,7 +9,7 @@ from dataflow.graph.model import Flight, Trigger
 from dataflow.graph.problems import did_you_mean
 from dataflow.graph.tree import Items, Leaf, Table, Tree
 
-KEYS = ("keep", "after", "when", "folder", "files")
+KEYS = ("keep", "after", "when", "folder", "files", "disk")
 AFTER = 10_000_000_000
 LONGEST = 86_400_000_000_000
 MOST_FILES = 10_000
@@ -39,7 +39,7 @@ def read_flight(
     triggers = [trigger for item in items for trigger in _triggers(item, fields, operators, streams_of)]
     folder = fields.text(table.get("folder"), "folder") or "flight"
     files = fields.integer(table.get("files"), "files", 1, MOST_FILES) or 20
-    return Flight(keep, after, tuple(triggers), folder, files)
+    return Flight(keep, after, tuple(triggers), folder, files, fields.size(table.get("disk"), "disk"))
 
 
 def _triggers(

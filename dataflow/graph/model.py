@@ -172,13 +172,17 @@ class Trigger:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A flight recorder: event time to keep before a trigger and after it (ns), where, and how many files at most."""
+    """A flight recorder: event time to keep before a trigger and after it (ns), where, and how many files at most.
+
+    `disk`: bytes that what is not kept yet may take; None: as much as the time needs. With less, less time is there.
+    """
 
     keep: int
     after: int
     when: tuple[Trigger, ...] = ()
     folder: str = "flight"
     files: int = 20
+    disk: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -81,6 +81,7 @@ class FlightSink:
         self._joining: threading.Thread | None = None
         self._kept: list[dict[str, Any]] = []
         self._refused = 0
+        self._said_full = False
         self.messages = 0
         self._sink = self._open()
 
@@ -174,13 +175,25 @@ class FlightSink:
         start = self._clock - self.flight.keep
         if self._wanted is not None:
             start = min(start, self._wanted.start)
-        while len(self._segments) > 2 and (self._segments[1].begin or 0) <= start - self.slack:
+        while len(self._segments) > 2:
+            if (self._segments[1].begin or 0) > start - self.slack and not self._is_full():
+                return
             oldest = self._segments.popleft()
             with Recording(oldest.path) as recording:
                 log = FiringLog.read(recording)
                 for operator in log.operators:
                     self._prologue[operator] = folded([*self._prologue.get(operator, ()), *log.of(operator)])
             oldest.path.unlink()
+
+    def _is_full(self) -> bool:
+        """Tells whether the ring takes more of the disk than it may; says so once."""
+        most = self.flight.disk
+        if most is None or self.ring_bytes <= most:
+            return False
+        if not self._said_full:
+            self._said_full = True
+            print(f"flight recorder: {most} bytes hold less than the time it is to keep", flush=True)
+        return True
 
     # Keeping
 

@@ -58,7 +58,7 @@ def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | 
         if node.operator.stateless or fresh_because(recording, graph, node, stamp) is not None:
             return None
         feeding = plan_feeding(recording, graph, [node.name])
-        begin = stamp if feeding.operators == (node.name,) else None
+        begin = stamp - 1 if feeding.operators == (node.name,) else None  # a state at `stamp` has seen its messages
         log = FiringLog.read(recording)
         work = Recomputation(recording, graph, feeding, log, made=lambda stream, entry: None, begin=begin, end=stamp)
         result = work.run(close=False)[node.name]

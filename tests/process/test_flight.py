@@ -59,7 +59,7 @@ def flown(
     """Gives a flight recorder what a recorder was given; `asks`: stamps (s) at which somebody triggers it."""
     flight = replace(graph.record.flight, when=when, **more)  # type: ignore[type-var]
     made = replace(graph, record=replace(graph.record, flight=flight))
-    largest, files = 0, 0
+    history: list[tuple[int, int]] = []
     asks = sorted(asks)
     with Recording(recorded) as recording:
         metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in ("recording", "digests")}
@@ -72,14 +72,14 @@ def flown(
                 sink.firings(at.operator, at.stamp, encode_batch([at]))
                 at = next(records, None)
             sink.message(found.stream, found.message, found.seq, found.incarnation)
-            largest, files = max(largest, sink.ring_bytes), max(files, len(list((folder / ".ring").iterdir())))
+            history.append((sink.ring_bytes, len(list((folder / ".ring").iterdir()))))
             if asks and found.stamp >= asks[0] * SECOND and found.stamp < 10**14:
                 asks = asks[1:]
                 sink.event("trigger", found.stamp, {"text": "a test"})
         while at is not None:
             sink.firings(at.operator, at.stamp, encode_batch([at]))
             at = next(records, None)
-    return sink, largest, files
+    return sink, history
 
 
 def _records(recording: Recording) -> Iterator[Any]:
@@ -89,7 +89,7 @@ def _records(recording: Recording) -> Iterator[Any]:
 
 @pytest.mark.parametrize("asked", [3.0, 12.0, 21.7, 29.5])
 def test_what_is_kept_verifies_from_its_beginning(recorded: Path, graph: Graph, tmp_path: Path, asked: float) -> None:
-    sink, _, _ = flown(recorded, graph, tmp_path, asks=[asked])
+    sink, _ = flown(recorded, graph, tmp_path, asks=[asked])
     facts = sink.close("complete")
 
     assert [one.get("error") for one in facts["kept"]] == [None]
@@ -108,7 +108,7 @@ def test_what_is_kept_verifies_from_its_beginning(recorded: Path, graph: Graph, 
 
 
 def test_what_is_kept_replays_with_the_states_of_then(recorded: Path, graph: Graph, tmp_path: Path) -> None:
-    sink, _, _ = flown(recorded, graph, tmp_path, asks=[20.0])
+    sink, _ = flown(recorded, graph, tmp_path, asks=[20.0])
     path = Path(sink.close("complete")["kept"][0]["path"])
 
     replay(path, placement="one_process", record=tmp_path / "again.mcap")
@@ -121,17 +121,30 @@ def test_what_is_kept_replays_with_the_states_of_then(recorded: Path, graph: Gra
 
 
 def test_the_disk_that_the_ring_takes_does_not_grow_with_the_run(recorded: Path, graph: Graph, tmp_path: Path) -> None:
-    sink, largest, files = flown(recorded, graph, tmp_path, files=2)
-    expected = (4 + 2 * 1 + 2 * 1) // 1 + 4  # what is kept, what is needed for it, and the files at both ends
+    sink, history = flown(recorded, graph, tmp_path)
     sink.close("complete")
 
-    assert files <= expected
-    assert largest < recorded.stat().st_size * 0.75
+    half = len(history) // 2
+    longest = 4 + 2 * 1 + 2 * 1 + 3  # s: what is kept, what is needed for it, and the files at both ends, of 1 s each
+    assert max(files for _, files in history) <= longest
+    assert max(size for size, _ in history[half:]) <= 1.1 * max(size for size, _ in history[:half])
     assert not list(tmp_path.glob("*.mcap"))  # nobody asked
 
 
+def test_the_ring_keeps_less_time_where_it_may_take_less_of_the_disk(
+    recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    _, history = flown(recorded, graph, tmp_path / "a")
+    most = max(size for size, _ in history) // 2
+    sink, bounded = flown(recorded, graph, tmp_path / "b", disk=most, asks=[20.0])
+    (one,) = sink.close("complete")["kept"]
+
+    assert max(size for size, _ in bounded) < 1.5 * most
+    assert not verify(Path(one["path"])).culprits
+
+
 def test_no_more_is_kept_than_the_graph_allows(recorded: Path, graph: Graph, tmp_path: Path) -> None:
-    sink, _, _ = flown(recorded, graph, tmp_path, asks=[4.0, 12.0, 20.0, 25.0], files=2)
+    sink, _ = flown(recorded, graph, tmp_path, asks=[4.0, 12.0, 20.0, 25.0], files=2)
     facts = sink.close("complete")
 
     assert len(list(tmp_path.glob("*.mcap"))) == len(facts["kept"]) == 2
@@ -139,7 +152,7 @@ def test_no_more_is_kept_than_the_graph_allows(recorded: Path, graph: Graph, tmp
 
 
 def test_triggers_that_come_together_keep_one_recording(recorded: Path, graph: Graph, tmp_path: Path) -> None:
-    sink, _, _ = flown(recorded, graph, tmp_path, asks=[12.0, 13.0])
+    sink, _ = flown(recorded, graph, tmp_path, asks=[12.0, 13.0])
     (one,) = sink.close("complete")["kept"]
 
     assert len(one["reasons"]) == 2
@@ -149,7 +162,7 @@ def test_triggers_that_come_together_keep_one_recording(recorded: Path, graph: G
 
 def test_a_field_of_a_stream_triggers_once_while_it_holds(recorded: Path, graph: Graph, tmp_path: Path) -> None:
     above = Trigger("field", stream="test/left/fast", field="vectors", above=250.0)
-    sink, _, _ = flown(recorded, graph, tmp_path, when=(above,))
+    sink, _ = flown(recorded, graph, tmp_path, when=(above,))
     (one,) = sink.close("complete")["kept"]
 
     assert one["reasons"] == [
@@ -158,7 +171,7 @@ def test_a_field_of_a_stream_triggers_once_while_it_holds(recorded: Path, graph:
 
 
 def test_a_run_that_fails_keeps_its_end(recorded: Path, graph: Graph, tmp_path: Path) -> None:
-    sink, _, _ = flown(recorded, graph, tmp_path, when=(Trigger("raise"),))
+    sink, _ = flown(recorded, graph, tmp_path, when=(Trigger("raise"),))
     (one,) = sink.close("failed: operator 'second' failed in firing 3: boom")["kept"]
 
     assert "boom" in one["reasons"][0]["what"]
