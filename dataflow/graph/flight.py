@@ -60,14 +60,14 @@ def _triggers(
         return [] if rate is None else [Trigger("drops", operator=operator, above=rate)]
     fields.table(item, "when", ("stream", "field", "above", "below", "equals"))
     field = fields.text(item.get("field"), "field")
-    limits = {name: _number(item, name, fields) for name in ("above", "below") if name in item.entries}
-    equals = item.get("equals")
-    if item.get("stream") is None or field is None or not (limits or isinstance(equals, Leaf)):
+    above, below = _number(item, "above", fields), _number(item, "below", fields)
+    limited, equals = above is not None or below is not None, item.get("equals")
+    if item.get("stream") is None or field is None or not (limited or isinstance(equals, Leaf)):
         fields.wrong(item, "when", EXPECTED)
         return []
     same = equals.value if isinstance(equals, Leaf) else None
     return [
-        Trigger("field", stream=stream, field=field, equals=same, **limits)
+        Trigger("field", stream=stream, field=field, above=above, below=below, equals=same)
         for stream in streams_of(item.get("stream"), "when")
     ]
 

@@ -102,7 +102,14 @@ class OperatorProcess:
         )
         self.progress = Progress(channel, self.runners, self.feeding, self.live, paced=config.live)
         self.requests = Requests(
-            config, self.runners, self.live, self.progress, self.outlet.recent, self.pace.event_time, self.feeding
+            config,
+            self.runners,
+            self.live,
+            self.progress,
+            self.outlet.recent,
+            self.pace.event_time,
+            self.feeding,
+            channel,
         )
         self.orders = Orders(self)
         self._watch: Watchdog | None = None

@@ -39,7 +39,7 @@ class Progress:
     ) -> None:
         """`paced`: the run is live."""
         self._every, self._idle = (REPORT_LIVE, REPORT_LIVE) if paced else (REPORT_EVERY, REPORT_IDLE)
-        self.channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
+        self._channel, self._runners, self._feeding, self._live = channel, runners, feeding, live
         self._clock = clock or time.monotonic
         self.counted: dict[str, list[int]] = {}
         """The counts that were last reported, of all operators."""
@@ -87,7 +87,7 @@ class Progress:
         waits = {name: found for name, found in self._waits_of(changed).items() if found != self.waited.get(name)}
         self.waited |= waits
         self.behind = self._live.behind()
-        self.channel.send("progress", done=done, counts=counts, drops=drops, waits=waits, behind=self.behind)
+        self._channel.send("progress", done=done, counts=counts, drops=drops, waits=waits, behind=self.behind)
 
     def next_due(self) -> float | None:
         """Seconds until what has changed is to be reported; None when nothing has."""

@@ -11,6 +11,7 @@ import msgpack
 from dataflow.firing.source import SourceRunner
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
+from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
 from dataflow.process.inbox import Inbox
@@ -38,10 +39,11 @@ class Requests:
         recent: RecentFirings,
         event_clock: Callable[[], int],
         feeding: Feeding,
+        channel: Channel,
     ) -> None:
         self._config, self._runners, self._live = config, runners, live
         self._progress, self._recent, self._event_clock = progress, recent, event_clock
-        self._feeding = feeding
+        self._feeding, self._channel = feeding, channel
         self._given: dict[str, int] = {}
         """The last stamp that each source was given from outside."""
 
@@ -78,7 +80,7 @@ class Requests:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
                 if "action" in asked:
                     feeding.play(asked["action"], int(asked.get("steps", 1)))
-                answer = {"ok": True, "paused": feeding.playback.paused, "ended": feeding.ended}
+                answer: dict[str, Any] = {"ok": True, "paused": feeding.playback.paused, "ended": feeding.ended}
             except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
                 answer = {"ok": False, "error": str(error)}
             stamps = [log.last for log in feeding.logs if log.last != NEVER]
@@ -151,7 +153,7 @@ class Requests:
         with query:
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
-                self._progress.channel.send("trigger", id=str(asked["id"]), text=str(asked["text"]))
+                self._channel.send("trigger", id=str(asked["id"]), text=str(asked["text"]))
                 answer: dict[str, Any] = {"ok": True}
             except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
                 answer = {"ok": False, "error": str(error)}

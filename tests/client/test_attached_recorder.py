@@ -6,13 +6,14 @@ import threading
 from pathlib import Path
 
 import pytest
-from background_run import Background
 
 from dataflow.client.attach import find_running, graph_of
 from dataflow.client.recorder import AttachedRecorder, Splitting, Subscription, record, subscribed
 from dataflow.graph import Graph, load_graph
 from dataflow.messages import FeatureVector
 from dataflow.recording import Recording
+from dataflow.supervision.plan import RunPlan
+from dataflow.supervision.supervisor import Supervisor
 from dataflow.transport import Envelope, Kind
 from dataflow.transport.codec import encode
 
@@ -99,9 +100,9 @@ def test_the_oldest_that_wait_are_let_go_when_there_is_no_room() -> None:
 def test_a_graph_that_runs_is_recorded_from_outside(tmp_path: Path) -> None:
     (tmp_path / "small.yaml").write_text(GRAPH)
     graph = load_graph(tmp_path / "small.yaml", settings=["count=100000"])
-    stop = threading.Event()
-
-    background = Background(graph, placement="one_process", window=(8, 1 << 20))
+    supervisor = Supervisor(RunPlan(graph, placement="one_process", window=(8, 1 << 20)))
+    thread = threading.Thread(target=supervisor.run)
+    thread.start()
     found = find_running("small", wait=30)
     running = graph_of(found)
     streams = ["test/left/constant", "test/left/fast", "test/smooth/mean"]
@@ -115,8 +116,9 @@ def test_a_graph_that_runs_is_recorded_from_outside(tmp_path: Path) -> None:
                 yield True
 
         record(subscription, recorder, goes_on=until_enough())
-    stop.set()
-    assert background.thread.is_alive()
+    supervisor.stop()
+    thread.join(60)
+    assert not thread.is_alive()
 
     with Recording(tmp_path / "a.mcap") as recording:
         fast = [m.seq for m in recording.messages(["test/left/fast"])]
