@@ -51,7 +51,7 @@ NOTES = {
     "torch": "the usual wheel for Linux asks for NVIDIA's CUDA packages, which are proprietary and not listed here",
 }
 NOT_LISTED = ("cuda-", "nvidia-")
-"""How the names of packages begin that only some platforms' wheels of torch ask for."""
+"""Prefixes of the packages that only some platforms' wheels of torch ask for."""
 
 PAGE = """\
 # Licences

@@ -36,7 +36,7 @@ class Runners:
         """Those of them that have something to do."""
         self.consumers: dict[str, list[Runner]] = {}
         self.faults: dict[str, OperatorFaults] = {}
-        """What is done on purpose to the operators of a live run."""
+        """Faults made on purpose in the operators of a live run."""
 
     @property
     def all(self) -> list[Maker]:
