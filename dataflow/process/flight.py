@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+import time
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -32,6 +33,8 @@ from dataflow.sync.stamps import format_stamp
 
 PARTS = 6
 """Files into which the time to keep is divided."""
+MOST_REASONS = 100
+"""Triggers that one recording names."""
 SHORTEST = 1_000_000_000
 """Event time of a file, at least (ns)."""
 
@@ -53,6 +56,8 @@ class Wanted:
     start: int
     due: int
     reasons: list[dict[str, Any]] = field(default_factory=list)
+    over: float = 0.0
+    """When it was seen that it is over (s, steady); 0 until then."""
 
 
 class FlightSink:
@@ -91,7 +96,7 @@ class FlightSink:
             self._clock = max(self._clock, message.stamp)
             if self._first is None:
                 self._first = message.stamp
-            if self._wanted is not None and self._clock > self._wanted.due:
+            if self._wanted is not None and self._is_over(self._wanted):
                 self._keep(self._wanted)
             elif self._clock - self._begun >= self.length:
                 self._rotate()
@@ -197,6 +202,13 @@ class FlightSink:
 
     # Keeping
 
+    def _is_over(self, wanted: Wanted) -> bool:
+        """Tells whether a span is over, and the firing records of it have had the time to come."""
+        if self._clock <= wanted.due:
+            return False
+        wanted.over = wanted.over or time.monotonic()
+        return time.monotonic() - wanted.over >= self._options["settle"]
+
     def _trigger(self, reason: dict[str, Any], stamp: int) -> None:
         """Asks to keep what was before and will be after `stamp`; what is asked for meanwhile becomes one."""
         reason = {**reason, "stamp": stamp}
@@ -207,7 +219,8 @@ class FlightSink:
             self._wanted = Wanted(max(stamp, self._clock) - self.flight.keep, self._clock + self.flight.after)
         elif self._clock + self.flight.after - self._wanted.start <= 2 * (self.flight.keep + self.flight.after):
             self._wanted.due = max(self._wanted.due, self._clock + self.flight.after)
-        self._wanted.reasons.append(reason)
+        if len(self._wanted.reasons) < MOST_REASONS:
+            self._wanted.reasons.append(reason)
 
     def _keep(self, wanted: Wanted, outcome: str = "") -> None:
         """Closes the current file and joins what is wanted of all of them."""
@@ -223,7 +236,8 @@ class FlightSink:
         if not outcome:
             self._sink = self._open()
         whole_beginning = not self._prologue and (self._first or 0) >= wanted.start
-        part = Part(None if whole_beginning else wanted.start, None if outcome else wanted.due)
+        to_the_end = outcome and self._clock <= wanted.due
+        part = Part(None if whole_beginning else wanted.start, None if to_the_end else wanted.due)
         name = f"{self.graph.name}_{format_stamp(wanted.reasons[0]['stamp']).replace(':', '').partition('.')[0]}"
         out = self._free(name)
         one: dict[str, Any] = {"path": str(out), "reasons": wanted.reasons, "bytes": 0}

@@ -16,6 +16,9 @@ if TYPE_CHECKING:  # runs without faults read no fault plan
 
 LOG_PROCESS = "@log"
 RECORDER = "@recorder"
+FLIGHT_SETTLES = 0.75
+"""Seconds after which the firing records of what a flight recorder is to keep have come: batches wait a quarter of
+one."""
 VIEWER_FILE = "@view"
 
 
@@ -133,7 +136,8 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         everything = tuple(s for s in graph.record.streams if s in streams)
         metadata = {name: dict(values) for name, values in plan.metadata.items()}
         options = {"flight": str(plan.flight), "metadata": metadata, "compression": plan.compression, "overwrite": True}
-        sinks[RECORDER] = ("record", everything, options | {"label": f"{graph.name}-{os.getpid()}"})
+        options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES}
+        sinks[RECORDER] = ("record", everything, options)
     if plan.view_file is not None:
         shown = tuple(s for s in sorted(streams) if s not in graph.view.hide)
         sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file)})

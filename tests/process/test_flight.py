@@ -63,7 +63,7 @@ def flown(
     asks = sorted(asks)
     with Recording(recorded) as recording:
         metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in ("recording", "digests")}
-        options = {"metadata": metadata, "compression": "zstd", "overwrite": True, "label": "ring"}
+        options = {"metadata": metadata, "compression": "zstd", "overwrite": True, "label": "ring", "settle": 0.0}
         sink = FlightSink(folder, made, list(made.record.streams), options)
         records = _records(recording)
         at = next(records, None)
