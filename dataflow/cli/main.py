@@ -17,6 +17,7 @@ from dataflow.cli import (
     convert,
     demo,
     doctor,
+    foxglove,
     inspection,
     latency,
     lint,
@@ -128,6 +129,7 @@ _add(convert.convert, _MATERIAL)
 _add(latency.latency, _LOOK)
 _add(lint.lint, _LOOK)
 _add(viewing.view, _LOOK)
+_add(foxglove.foxglove, _LOOK)
 _add(live.list_running, _FOLLOW, "list")
 _add(live.echo, _FOLLOW)
 _add(live.hz, _FOLLOW)
