@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataflow.recording import Recorded, Recording
 
 LOOK_BACK = (500_000_000, 5_000_000_000)
-"""How far before a place (ns) each stream's last message is looked for: the near first, since it is quick."""
+"""Spans before a place (ns) in which each stream's last message is looked for: the near one first: it is quick."""
 
 
 class Clock:
