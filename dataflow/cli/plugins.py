@@ -111,7 +111,7 @@ def _command(entry: EntryPoint) -> Any:
         raise TypeError(f"{entry.value} is {type(value).__name__}; expected a typer.Typer or a function")
     command = typer.main.get_command(app)
     command.name = entry.name
-    if getattr(command, "rich_help_panel", None) is None:
+    if not getattr(command, "rich_help_panel", None):  # of a single command a placeholder that is no name
         command.rich_help_panel = PANEL  # type: ignore[attr-defined]
     return command
 
