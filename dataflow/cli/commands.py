@@ -94,6 +94,7 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Command("latency:latency", LOOK),
     Command("lint:lint", LOOK),
     Command("viewing:view", LOOK),
+    Command("foxglove:foxglove", LOOK),
     Command("live:list_running", FOLLOW, "list"),
     Command("live:echo", FOLLOW),
     Command("live:hz", FOLLOW),

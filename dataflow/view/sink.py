@@ -35,7 +35,7 @@ SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
 
 FILE_OPTIONS = ViewOptions(jpeg_quality=75, depth_step=0.02, max_points=2_500, point_step=2.0**-7)
-"""What a file is to hold unless more is asked for: what can be seen, not what can be measured."""
+"""Contents of a file unless more is asked for: for looking, not for measuring."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,7 +110,8 @@ def test_what_follows_a_graph_does_not_wait_for_pydantic_or_other_commands(words
         "with group.make_context('dataflow', sys.argv[1:]) as context:\n"
         "    name, command, rest = group.resolve_command(context, sys.argv[1:])\n"
         "    command.make_context(name, rest, parent=context)\n"
-        "print(*(name for name in ('pydantic', 'dataflow.cli.run', 'importlib.metadata', 'rerun') if name in sys.modules))\n"
+        "late = ('pydantic', 'dataflow.cli.run', 'importlib.metadata', 'rerun')\n"
+        "print(*(name for name in late if name in sys.modules))\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, *words],
