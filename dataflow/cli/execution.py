@@ -101,7 +101,7 @@ def execute(
     """Runs it; ends the command where it was interrupted."""
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.report import print_report, report_json
-    from dataflow.cli.viewing import attached_viewer, open_saved
+    from dataflow.cli.viewers import attached_viewer, open_saved
     from dataflow.supervision.report import RunFailed
 
     before = {file: _written(file) for file in (outputs.record, outputs.view_file) if file is not None}
