@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import termios
+import threading
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.cli.playback import pressed
+from dataflow.cli.playback import _steered, pressed
 from dataflow.feeds.playback import ACTIONS, Playback
 
 
@@ -58,3 +63,29 @@ def test_an_unknown_action_is_refused() -> None:
 )
 def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     assert list(pressed(typed)) == meant
+
+
+def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+    done: list[str] = []
+    came = threading.Event()
+
+    class Steered:
+        def play(self, action: str) -> None:
+            done.append(action)
+
+        def stop(self) -> None:
+            done.append("stop")
+            came.set()
+
+    with os.fdopen(slave, "r") as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        before = termios.tcgetattr(terminal)
+        with _steered(Steered()):  # type: ignore[arg-type]
+            os.write(master, b" n\x1b[Cq")
+            assert came.wait(10)
+        after = termios.tcgetattr(terminal)
+    os.close(master)
+
+    assert done == ["toggle", "step", "step", "stop"]
+    assert after == before
