@@ -8,10 +8,11 @@ import termios
 import threading
 
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.cli.playback import _steered, pressed
+from dataflow.cli.playback import _steered, looped, pressed
 from dataflow.feeds.playback import ACTIONS, Playback
 
 
@@ -89,3 +90,15 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.Mon
 
     assert done == ["toggle", "step", "step", "stop"]
     assert after == before
+
+
+def test_passes_of_a_loop_are_compared(capsys: pytest.CaptureFixture[str]) -> None:
+    digests = iter([{"s": "a"}, {"s": "a"}, {"s": "b"}])
+
+    looped(2, lambda: next(digests))
+    assert "2 passes, the same digests in each" in capsys.readouterr().out
+
+    digests = iter([{"s": "a"}, {"s": "b"}])
+    with pytest.raises(typer.Exit) as ended:
+        looped(2, lambda: next(digests))
+    assert ended.value.exit_code == 1
