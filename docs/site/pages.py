@@ -17,6 +17,7 @@ from typing import Any
 REPOSITORY = Path(__file__).resolve().parents[2]
 FENCED = re.compile(r"(^```.*?^```$)", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)(?=[)#])")
+CODE_IN_ROW = re.compile(r"`[^`\n]*\\\|[^`\n]*`")
 OUTSIDE = ("benchmarks/**/*.md", "recordings/README.md", "operators/weights/README.md")
 """Pages that lie elsewhere."""
 
@@ -55,7 +56,15 @@ def fitted(text: str, file: str) -> str:
         return posixpath.relpath(place_of(target), here or ".")
 
     pieces = FENCED.split(text)
-    return "".join(LINK.sub(replaced, piece) if k % 2 == 0 else piece for k, piece in enumerate(pieces))
+    return "".join(
+        CODE_IN_ROW.sub(_unescaped, LINK.sub(replaced, piece)) if k % 2 == 0 else piece
+        for k, piece in enumerate(pieces)
+    )
+
+
+def _unescaped(code: re.Match[str]) -> str:
+    """GitHub needs a backslash before `|` in the code of a table's cell; MkDocs shows it."""
+    return code[0].replace("\\|", "|")
 
 
 def notebook_page(path: Path) -> str:

@@ -48,7 +48,8 @@ def checked(text: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> list[st
     ("text", "fault"),
     [
         ("```\nx\n```\n", "page.md:1: no language"),
-        ("text\n\n    dataflow info\n", "page.md:3: code by indentation"),
+        ("text\n\n    dataflow diff run.mcap\n", "page.md:3: dataflow diff run.mcap"),
+        ("text\n\n    error: no such thing\n", "fence output as ```text"),
         ("```python\nprint(1)\n```\n\n```text\n2\n```\n", "page.md:5: the code above prints\n1"),
         ("```python\nx = 1\n```\n```python\ny = x + z\n```\n", "page.md:4: NameError: name 'z'"),
         ("```python\ndef test_a():\n    assert False, 'so'\n```\n", "test_a: AssertionError: so"),
@@ -90,7 +91,8 @@ def test_blocks_are_read_with_line_language_mark_and_file() -> None:
 
 
 def test_a_list_that_goes_on_is_not_code_by_indentation() -> None:
-    assert indented("- one\n    two\n\ntext\n\n    code\n") == [6]
+    (block,) = indented("- one\n    two\n\ntext\n\n    rerun a\n    rerun b\n\nmore\n")
+    assert (block.line, block.text) == (5, "rerun a\nrerun b\n")
 
 
 def test_continued_lines_and_joined_commands_are_taken_apart() -> None:

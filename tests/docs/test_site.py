@@ -69,10 +69,11 @@ def test_the_site_fetches_nothing(site: dict[str, Any]) -> None:
         ("docs/a.md", "```text\n[b](../README.md)\n```", "```text\n[b](../README.md)\n```"),
         ("README.md", "[d](docs/design.md)", "[d](design.md)"),
         ("benchmarks/peers/a.md", "[t](../t.md) [p](p.py)", "[t](../t.md) [p](../../files/benchmarks/peers/p.py)"),
+        ("docs/a.md", "| `int \\| None` | \\| |", "| `int | None` | \\| |"),
         ("benchmarks/a.md", "[d](../docs/design.md#time)", "[d](../design.md#time)"),
     ],
 )
-def test_links_fit_the_site(hooks: ModuleType, file: str, written: str, fitted: str) -> None:
+def test_pages_fit_the_site(hooks: ModuleType, file: str, written: str, fitted: str) -> None:
     assert hooks.fitted(written, file) == fitted
 
 

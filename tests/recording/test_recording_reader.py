@@ -348,7 +348,7 @@ def test_a_recording_of_a_newer_format_is_refused_with_what_to_do(
     monkeypatch.setattr("dataflow.recording.writer.FORMAT", "2")
     with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
         writer.add_stream("robot1/a/pose", Pose)
-        writer.write("robot1/a/pose", pose(1))
+        writer.write("robot1/a/pose", pose(1), seq=0)
     with pytest.raises(RecordingError, match=r"format '2'.*reads format '1'.*newer"):
         Recording(path)
 

@@ -7,7 +7,7 @@ writes what is wrong to FOLDER/faults.json: {page: ["page.md:12: ...", ...]}.
   called. A block that begins with `# file: NAME` is that file, and is imported.
 - `yaml` is a graph, a part of one, a fault plan or a contract, and is loaded as the program does.
 - `sh` is parsed: commands of `dataflow` by its own parser; quick ones run. `json` and `toml` are parsed.
-- `text` is output.
+- `text` is output. Code by indentation is `sh`.
 
 The folder has the graphs and recordings of the project, and `run.mcap`, `a.mcap` and `b.mcap`: a short recorded run.
 
@@ -28,13 +28,13 @@ import sys
 import tomllib
 import traceback
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 LANGUAGES = ("python", "yaml", "sh", "json", "toml", "text", "ini", "dockerfile")
-OUTPUTS = ("record", "view", "to", "complete", "out", "junit", "svg", "baseline", "write_contract")
+OUTPUTS = ("output", "record", "view", "to", "complete", "out", "junit", "svg", "baseline", "write_contract")
 """Parameters of commands that name a file which the command may write."""
 QUICK = ("check", "show", "info", "operators", "graphs", "diff", "latency", "lint", "logs")
 """Commands that run, where their files are there."""
@@ -89,13 +89,17 @@ def blocks_of(text: str) -> list[Block]:
     return found
 
 
-def indented(text: str) -> list[int]:
-    """Returns the lines where code stands by indentation: it has no language, so it should be fenced."""
-    found, fenced, before = [], False, ""
+def indented(text: str) -> list[Block]:
+    """Returns the blocks that are code by indentation: commands, as such blocks have no other language."""
+    found: list[Block] = []
+    fenced, inside, before = False, False, ""
     for number, line in enumerate(text.splitlines(), 1):
         fenced ^= line.startswith("```")
-        if not fenced and line.startswith("    ") and not before:
-            found.append(number)
+        inside = not fenced and line.startswith("    ") and (inside or not before)
+        if inside and before and found:
+            found[-1] = replace(found[-1], text=found[-1].text + line[4:] + "\n")
+        elif inside:
+            found.append(Block(number - 1, "sh", line[4:] + "\n"))
         before = line.strip()
     return found
 
@@ -171,8 +175,8 @@ class PageRun:
     """Runs the blocks of one page in the current folder, which becomes its own."""
 
     def __init__(self, page: str, text: str) -> None:
-        self.page, self.blocks = page, blocks_of(text)
-        self.faults: list[str] = [f"{page}:{line}: code by indentation: fence it" for line in indented(text)]
+        self.page, self.blocks = page, sorted(blocks_of(text) + indented(text), key=lambda block: block.line)
+        self.faults: list[str] = []
         self.names: dict[str, Any] = {"__name__": "page"}
         self.made: set[str] = set()
 
@@ -272,7 +276,7 @@ class PageRun:
                 if program == "dataflow":
                     self._command(words[1:])
                 elif program not in PROGRAMS:
-                    raise ValueError(f"{program!r} is none of {', '.join(PROGRAMS)}")
+                    raise ValueError(f"{program!r} is none of {', '.join(PROGRAMS)}; fence output as ```text")
                 else:
                     self._other(program, words[1:])
             except (Exception, SystemExit) as error:
