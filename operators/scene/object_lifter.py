@@ -25,7 +25,7 @@ from dataflow.messages import (
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.cloud.filtering import finite
+from operators.cloud.filtering import in_range
 from operators.cloud.gravity import gravity, unit
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
@@ -84,11 +84,11 @@ class ObjectLifter(Operator):
         """Raises ValueError where the calibration is of another image or no transform relates the frames."""
         _check(detections, image_info)
         up, _ = gravity(cloud, pose, extrinsics, self._up)
-        usable = np.flatnonzero(finite(cloud.points))
-        usable = usable[np.linalg.norm(cloud.points[usable].astype(np.float64), axis=1) <= self.max_range]
+        usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
+        points = cloud.points[usable].astype(np.float64)
         masks = self._masks(detections, segmentation)
         T_image_cloud = transform_between(extrinsics, cloud.frame, detections.frame)
-        seen = _seen(cloud.points[usable].astype(np.float64), T_image_cloud, image_info, masks, up)
+        seen = _seen(points, T_image_cloud, image_info, masks, up)
         rows = np.flatnonzero(detections.scores >= np.float32(self.min_score))
         names = detections.labels()
         known = {} if masks is None else {name: k for k, name in enumerate(masks.class_names)}
@@ -111,7 +111,7 @@ class ObjectLifter(Operator):
         self._counts.update(counts | {"images": 1})
         return {
             "boxes": _boxes(cloud, detections, rows, found),
-            "clusters": _clusters(cloud, labels, found),
+            "clusters": _clusters(cloud, labels, found, points),
             "status": _status(cloud.stamp, counts),
         }
 
@@ -174,9 +174,9 @@ def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], 
         stamp=cloud.stamp,
         frame=cloud.frame,
         class_names=detections.class_names,
-        centers=np.array([f.shape.T[:3, 3] for f in found]).reshape(-1, 3),
-        sizes=np.array([f.shape.size for f in found]).reshape(-1, 3),
-        orientations=matrix_to_quaternion(np.array([f.shape.T for f in found]).reshape(-1, 4, 4)),
+        centers=np.array([f.T[:3, 3] for f in found]).reshape(-1, 3),
+        sizes=np.array([f.size for f in found]).reshape(-1, 3),
+        orientations=matrix_to_quaternion(np.array([f.T for f in found]).reshape(-1, 4, 4)),
         scores=detections.scores[own] * np.array([np.sqrt(f.overlap) for f in found], np.float32),
         class_ids=detections.class_ids[own],
         ids=None if detections.ids is None else detections.ids[own],
@@ -184,14 +184,17 @@ def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], 
     )
 
 
-def _clusters(cloud: PointCloud, labels: NDArray[np.int32], found: list[Lifted]) -> Clusters:
+def _clusters(
+    cloud: PointCloud, labels: NDArray[np.int32], found: list[Lifted], points: NDArray[np.float64]
+) -> Clusters:
+    own = [points[f.points] for f in found]
     return Clusters(
         stamp=cloud.stamp,
         frame=cloud.frame,
         labels=labels,
-        centroids=np.array([f.shape.centroid for f in found]).reshape(-1, 3),
-        lower=np.array([f.shape.lower for f in found]).reshape(-1, 3),
-        upper=np.array([f.shape.upper for f in found]).reshape(-1, 3),
+        centroids=np.array([p.mean(axis=0) for p in own]).reshape(-1, 3),
+        lower=np.array([p.min(axis=0) for p in own]).reshape(-1, 3),
+        upper=np.array([p.max(axis=0) for p in own]).reshape(-1, 3),
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.cells import Cells, completed, standing_box
-from operators.scene.range_view import RangeView
+from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
@@ -36,6 +36,7 @@ class MapSettings:
     missed: float = 0.12
     miss_angle: float = 0.1
     gain: float = 0.3
+    reach: float = 0.15
     mover_reach: float = 0.5
     mover_speed: float = 1.5
     mover_memory: float = 8.0
@@ -136,11 +137,8 @@ class ObjectMap:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 self._begin(each, cells[k], stamp, view.origin)
-        shown = {i: k for k, i in joined.items()}
-        for object in list(self.objects.values()):
-            if object.born != stamp:
-                own = cells[shown[object.id]].points if object.id in shown else None
-                self._look(object, view, own, seconds)
+        shown = {i: cells[k] for k, i in joined.items()}
+        self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
 
@@ -154,15 +152,20 @@ class ObjectMap:
 
     def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
-        ids = sorted(self.objects)
+        s, ids = self._settings, sorted(self.objects)
         value = np.zeros((len(seen), len(ids)))
+        if not ids:
+            return {}
+        known = [self.objects[i] for i in ids]
+        centers, radii = np.array([o.center for o in known]), np.array([float(o.size.max()) for o in known])
+        moves = np.array([self.is_mover(o) for o in known])
         for k, each in enumerate(seen):
-            middle, reach = cells[k].points.mean(axis=0), float(np.ptp(cells[k].points, axis=0).max()) / 2
-            for j, i in enumerate(ids):
-                object = self.objects[i]
-                gap = float(np.linalg.norm(object.center - middle))
-                if gap <= reach + float(object.size.max()) + self._settings.mover_reach + self._settings.mover_speed:
-                    value[k, j] = self._alike(each, cells[k], object, stamp)
+            reach = (
+                float(cells[k].extent.max()) / 2 + radii + np.where(moves, s.mover_reach + 2 * s.mover_speed, s.reach)
+            )
+            gaps = np.linalg.norm(centers - cells[k].middle, axis=1)
+            for j in np.flatnonzero((gaps <= reach) & (moves == (each.class_id in self._movers))).tolist():
+                value[k, j] = self._alike(each, cells[k], known[j], stamp)
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
     def _alike(self, each: Observation, cells: Cells, object: MapObject, stamp: int) -> float:
@@ -177,13 +180,14 @@ class ObjectMap:
             return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
         if self.is_mover(object) or each.class_id in self._movers:
             return 0.0
-        loose = _tolerance(np.ptp(cells.points, axis=0))
         if same:
-            share = object.cells.near(cells.points, loose)
             close = _closeness(cells, object.cells)
+            if close <= 0:
+                return 0.0
+            share = object.cells.near(cells.points, _tolerance(cells.extent))
             alike = _color_likeness(each.color, object.color)
-            return 0.5 * share + 0.4 * close + 0.1 * alike if share >= s.overlap and close > 0 else 0.0
-        if float(np.abs(object.size - np.ptp(cells.points, axis=0)).max()) > 0.5 * float(object.size.max()):
+            return 0.5 * share + 0.4 * close + 0.1 * alike if share >= s.overlap else 0.0
+        if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
             return 0.0
         share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
@@ -222,68 +226,92 @@ class ObjectMap:
         self.objects[made.id] = made
         self._next += 1
 
-    def _look(self, object: MapObject, view: RangeView, own: Array | None, seconds: float) -> None:
-        """Takes what a view says of an object's place; `own` are its points (N, 3) in this view, None for none."""
+    def _look_around(
+        self, view: RangeView, objects: Sequence[MapObject], shown: Mapping[int, Cells], seconds: float
+    ) -> None:
+        """Takes what a view says of the places of objects; `shown` are the voxels of those that it shows, by id."""
         s = self._settings
+        reach = view.reach + s.margin
+        near = [o for o in objects if np.linalg.norm(o.center - view.origin) <= reach + float(o.size.max())]
+        sights = dict(zip((o.id for o in near), view.of_each([o.cells.points for o in near], s.margin), strict=True))
+        for object in objects:
+            self._look(object, sights.get(object.id), view.origin, shown.get(object.id), seconds)
+
+    def _look(self, object: MapObject, sight: Sight | None, eye: Array, own: Cells | None, seconds: float) -> None:
+        """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any."""
+        s, mover = self._settings, self.is_mover(object)
         if not len(object.cells):
             object.evidence = -1.0
             return
-        sight = view.of(object.cells.points, s.margin)
-        looked = int(sight.looked.sum())
-        if not self.is_mover(object):
+        if not mover and sight is not None:
             if own is not None:
-                object.cells.doubt(view.of(object.cells.points, 0.5 * s.margin).confirmed, own)
+                object.cells.doubt(sight.confirmed, own)
             object.cells.carve(sight.free)
             object.most = max(object.most, len(object.cells))
         if own is not None:
             return
         if len(object.cells) < _LEFT * object.most:
             object.evidence = -1.0
-        if self.is_mover(object):
+        if mover:
             object.evidence -= seconds * _MOST / s.mover_memory
+        if sight is None:
+            return
+        looked = np.count_nonzero(sight.looked)
         if looked < max(5, 0.2 * len(sight.looked)):
             return
-        distance = float(np.linalg.norm(object.center - view.origin))
-        if sight.free.sum() >= 0.6 * looked:
-            object.evidence -= s.vacated * (3 if self.is_mover(object) else 1)
-        elif sight.confirmed.sum() >= 0.6 * len(sight.looked) and object.size.max() >= s.miss_angle * distance:
+        distance = float(np.linalg.norm(object.center - eye))
+        if np.count_nonzero(sight.free) >= 0.6 * looked:
+            object.evidence -= s.vacated * (3 if mover else 1)
+        elif (
+            np.count_nonzero(sight.confirmed) >= 0.6 * len(sight.looked)
+            and object.size.max() >= s.miss_angle * distance
+        ):
             object.evidence -= s.missed
 
     def _join_doubles(self, changed: list[int]) -> None:
         """Makes one of two objects that share their voxels."""
+        if not changed:
+            return
+        ids = sorted(self.objects)
+        centers = np.array([self.objects[i].center for i in ids])
+        radii = np.array([float(self.objects[i].size.max()) for i in ids])
         for i in changed:
-            for j in sorted(self.objects):
-                if i not in self.objects or i == j:
-                    continue
-                a, b = self.objects[i], self.objects[j]
-                if float(np.linalg.norm(a.center - b.center)) > float(a.size.max() + b.size.max()) / 2 + 0.1:
-                    continue
-                if self._one(a, b):
-                    kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
-                    if not self.is_mover(kept):
-                        kept.cells.add(other.cells)
-                    kept.votes = kept.votes + other.votes
-                    kept.evidence = min(max(kept.evidence, other.evidence), _MOST)
-                    kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
-                    kept.view = kept.view + other.view
-                    kept.fit(self._usual)
-                    del self.objects[other.id]
+            if i not in self.objects:
+                continue
+            k = ids.index(i)
+            close = np.linalg.norm(centers - centers[k], axis=1) <= (radii + radii[k]) / 2 + 0.1
+            for j in (ids[n] for n in np.flatnonzero(close).tolist()):
+                if i in self.objects and j in self.objects and i != j:
+                    self._join_two(self.objects[i], self.objects[j])
+
+    def _join_two(self, a: MapObject, b: MapObject) -> None:
+        if not self._one(a, b):
+            return
+        kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
+        if not self.is_mover(kept):
+            kept.cells.add(other.cells)
+        kept.votes = kept.votes + other.votes
+        kept.evidence = min(max(kept.evidence, other.evidence), _MOST)
+        kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
+        kept.view = kept.view + other.view
+        kept.fit(self._usual)
+        del self.objects[other.id]
 
     def _one(self, a: MapObject, b: MapObject) -> bool:
         s = self._settings
+        movers = self.is_mover(a), self.is_mover(b)
+        if any(movers) and a.class_id != b.class_id:
+            return False
         if not a.cells.touches(b.cells, 0.3):
             return False
-        movers = self.is_mover(a), self.is_mover(b)
         small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
         if a.class_id == b.class_id:
             if all(movers):
                 return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-            near = large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel)
-            return near >= 0.5 and _closeness(small.cells, large.cells) > 0.3
-        if any(movers):
-            return False
-        shares = (a.cells.near(b.cells.points, s.voxel), b.cells.near(a.cells.points, s.voxel))
-        return min(shares) >= 0.5
+            if _closeness(small.cells, large.cells) <= 0.3:
+                return False
+            return large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel) >= 0.5
+        return a.cells.near(b.cells.points, s.voxel) >= 0.5 and b.cells.near(a.cells.points, s.voxel) >= 0.5
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""
@@ -331,7 +359,7 @@ def _tolerance(extent: Array) -> float:
 
 def _closeness(cells: Cells, known: Cells) -> float:
     """Returns 1 for small things whose middles agree, 0 for ones a middle extent apart; 0.5 for what may be a part."""
-    extent = np.sort(np.ptp(cells.points, axis=0))
+    extent = np.sort(cells.extent)
     if extent[2] > 0.4:
         return 0.5
     away = float(np.linalg.norm(cells.middle - known.middle))
@@ -340,7 +368,7 @@ def _closeness(cells: Cells, known: Cells) -> float:
 
 def _direction(eye: Array, cells: Cells) -> Array:
     """Returns the horizontal direction (2,) from the viewer to an object."""
-    way = (cells.points.mean(axis=0) - eye)[:2]
+    way = (cells.middle - eye)[:2]
     return np.asarray(way / max(float(np.hypot(*way)), 1e-6))
 
 

@@ -106,6 +106,15 @@ class SemanticMap(Operator):
             "status": _status(cloud.stamp, counts),
         }
 
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, by id; empty before the first view."""
+        return self._classes
+
+    def entries(self) -> list[MapObject]:
+        """Returns all objects, those too that are not surely there."""
+        return [] if self._map is None else list(self._map.objects.values())
+
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: so does the map."""
         self._begin()
