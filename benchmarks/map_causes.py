@@ -54,7 +54,15 @@ def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], B
         found = lifter.process(
             frame.detections, frame.cloud, world.image_info, world.extrinsics, frame.segmentation, frame.camera
         )
-        objects = known.process(found["boxes"], found["clusters"], frame.cloud, frame.camera)["objects"]
+        objects = known.process(
+            found["boxes"],
+            found["clusters"],
+            frame.cloud,
+            frame.camera,
+            world.extrinsics,
+            found["images"],
+            world.image_info,
+        )["objects"]
         _note(trails, frame, world, found["boxes"], found["clusters"].labels)
     assert objects is not None
     return trails, objects, known

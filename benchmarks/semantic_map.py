@@ -39,7 +39,15 @@ def mapped(world: World, *, true: bool, **params: Any) -> tuple[list[Boxes3D], l
             enough = (frame.objects.visible >= 0.2) & (frame.objects.pixel_counts >= 100)
             detections = chosen(frame.objects, enough)
         found = lifter.process(detections, frame.cloud, world.image_info, world.extrinsics, masks, frame.camera)
-        made = known.process(found["boxes"], found["clusters"], frame.cloud, frame.camera)
+        made = known.process(
+            found["boxes"],
+            found["clusters"],
+            frame.cloud,
+            frame.camera,
+            world.extrinsics,
+            found["images"],
+            world.image_info,
+        )
         maps.append(made["objects"])
         nodes.append(made["nodes"])
     return maps, nodes

@@ -38,6 +38,7 @@ class Cells:
         self.other: Array = np.zeros(0)
         self._tree: cKDTree | None = None
         self._bounds: tuple[Array, Array] | None = None
+        self._middle: Array | None = None
 
     @classmethod
     def of(cls, points: Array, side: float) -> Cells:
@@ -64,7 +65,7 @@ class Cells:
         # a voxel that is seen again was not free after all
         self.free = np.asarray(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)).clip(min=0))
         self.other = np.asarray(np.bincount(of, np.concatenate([self.other, other.other]), len(keys)))
-        self._keys, self._tree, self._bounds = keys, None, None
+        self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
 
     def carve(self, free: NDArray[np.bool_]) -> None:
         """Counts the voxels that a view saw through, and drops those that were seen through too often."""
@@ -73,7 +74,7 @@ class Cells:
         if gone.any():
             self._keys, self.points = self._keys[~gone], self.points[~gone]
             self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
-            self._tree = self._bounds = None
+            self._tree = self._bounds = self._middle = None
 
     def doubt(self, confirmed: NDArray[np.bool_], shown: Cells) -> None:
         """Counts the confirmed voxels that are not near those which the object showed in the same view."""
@@ -93,7 +94,9 @@ class Cells:
     @property
     def middle(self) -> Array:
         """Mean (3,) of the voxels."""
-        return np.asarray(self.points.mean(axis=0))
+        if self._middle is None:
+            self._middle = np.asarray(self.points.sum(axis=0) / max(len(self.points), 1))
+        return self._middle
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -136,7 +139,7 @@ class Cells:
         self.points = np.array(state["points"], np.float64).reshape(-1, 3)
         self.hits, self.free = np.array(state["hits"], np.float64), np.array(state["free"], np.float64)
         self.other = np.array(state["other"], np.float64)
-        self._tree = self._bounds = None
+        self._tree = self._bounds = self._middle = None
 
 
 def standing_box(points: Array) -> tuple[Array, Array, float]:
@@ -145,24 +148,3 @@ def standing_box(points: Array) -> tuple[Array, Array, float]:
     low, high = float(points[:, 2].min()), float(points[:, 2].max())
     center = np.array([x + points[0, 0], y + points[0, 1], (low + high) / 2])
     return center, np.array([width, depth, high - low]), float(np.radians(angle))
-
-
-def completed(box: tuple[Array, Array, float], view: Array, usual: tuple[float, float]) -> tuple[Array, Array, float]:
-    """Returns a box that is as deep as usual where only its near side was seen.
-
-    `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. `usual` are the
-    shorter and longer side of such objects: the side across the view tells which of the two lies along it. The box
-    grows away from the viewer, less where views differ. No side is much shorter than is usual.
-    """
-    center, size, yaw = box[0].copy(), box[1].copy(), box[2]
-    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    along = axes @ view
-    deep = int(np.argmax(np.abs(along)))
-    short, long = usual
-    across = float(size[1 - deep])
-    size[1 - deep] = max(across, 0.8 * short)  # narrower things are seen in part
-    target = long if across < np.sqrt(short * long) else short
-    lack = max(0.0, target - float(size[deep])) * min(1.0, abs(float(along[deep])) * 1.2)
-    size[deep] += lack
-    center[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
-    return center, size, yaw

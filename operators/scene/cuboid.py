@@ -16,75 +16,121 @@ Box = tuple[Array, Array, float]
 
 _SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
+_PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TURN = 0.15  # radians by which the heading that points show strays
-_MOST_RESIDUAL = 3.0
-_ROUNDS = 4
+_BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
+_ROUNDS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ImageView:
     """One view of an object: `P` (3, 4) maps the world to pixels; `box` (4,) is the object's in the image.
 
-    `edges` (4,) are those of the box, left, upper, right, lower, that are the object's and not the image's.
+    `edges` (4,) are those of the box, left, upper, right, lower, that are the object's and not the image's; `eye` (3,)
+    is where the camera was.
     """
 
     P: Array
     box: Array
     edges: NDArray[np.bool_]
-    origin: Array
+    eye: Array
 
 
-def fit_cuboid(start: Box, views: Sequence[ImageView], points: Array, usual: Usual | None) -> Box:
+def fit_cuboid(
+    start: Box,
+    views: Sequence[ImageView],
+    points: Array,
+    usual: Sequence[Usual],
+    before: tuple[int, Box] | None = None,
+) -> tuple[int, Box]:
     """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
 
     Least squares over centre, sizes and heading, by Gauss and Newton with differences: edges of the box's image against
-    those of each view, with a bounded residual, since things hide each other; points at most on the surface, and on it
-    where a view sees that side; log sizes as is usual. After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018,
-    and Yang and Scherer, "CubeSLAM", 2019.
+    those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
+    where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
+    which such things stand is tried, and the best is returned with its number; with `before`, an earlier result, only
+    that one. After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    center, size, yaw = start
-    x = np.array([*center, *np.log(np.maximum(size, 0.01)), yaw])
-    P = np.stack([v.P for v in views])
+    logs, spreads = _priors(usual)
+    if before is None:
+        x = _starts(start, views, logs)
+    else:
+        logs, spreads = logs[before[0], None], spreads[before[0], None]
+        x = np.array([[*before[1][0], *np.log(before[1][1]), before[1][2]]])
+    heading = float(x[0, 6] + np.remainder(start[2] - x[0, 6] + np.pi / 4, np.pi / 2) - np.pi / 4)
+    P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
-    spread = _PIXELS + _SHARE * np.repeat(boxes[:, 2:] - boxes[:, :2], 2, axis=0).reshape(-1, 2, 2).reshape(-1, 4)
-    eyes = np.stack([v.origin for v in views])
-    weights = edges / spread / np.sqrt(max(1.0, len(views) / 4))
-    prior = None if usual is None else (np.log(usual.size), 1 / np.asarray(usual.spread))
+    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / 4))
 
     def residuals(rows: Array) -> Array:
-        """Returns the residuals (K, R) of boxes (K, 7)."""
-        image = (_images(rows, P) - boxes) * weights
-        image = np.nan_to_num(image).reshape(len(rows), -1)
-        parts = [image, _surface(rows, points, eyes), (rows[:, 6:] - yaw) / _TURN]
-        if prior is not None:
-            parts.append((rows[:, 3:6] - prior[0]) * prior[1])
-        return np.concatenate(parts, axis=1)
+        """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
+        flat = rows.reshape(-1, 7)
+        image = ((_images(flat, P) - boxes) * weights).reshape(len(flat), -1)
+        np.nan_to_num(image, copy=False)
+        size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
+        parts = [image, _surface(flat, points, eyes), (flat[:, 6:] - heading) / _TURN, size]
+        return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
-    for _ in range(_ROUNDS):
-        probes = np.concatenate([x[None], x + np.diag(_STEPS)])
-        values = residuals(probes)
-        r, J = values[0], (values[1:] - values[0]).T / _STEPS
-        weight = np.minimum(1.0, _MOST_RESIDUAL / np.maximum(np.abs(r), 1e-9))  # Huber
-        A = J.T @ (weight[:, None] * J) + np.diag([1e-3] * 7)
-        step = np.linalg.solve(A, -J.T @ (weight * r))
-        x = x + np.clip(step, -20 * _STEPS, 20 * _STEPS)
+    for _ in range(_ROUNDS if before is None else 2):
+        values = residuals(x[:, None] + _PROBES)
+        r, J = values[:, 0], (values[:, 1:] - values[:, :1]) / _STEPS[:, None]
+        weighted = J * np.minimum(1.0, _BOUND / np.maximum(np.abs(r), 1e-9))[:, None]  # Huber
+        A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
+        step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
+        x = x + step
         if (np.abs(step) < 0.1 * _STEPS).all():
             break
-    return x[:3].copy(), np.exp(x[3:6]), float(x[6])
+    form = 0 if before is None else before[0]
+    if len(x) > 1:
+        r = np.abs(residuals(x[:, None])[:, 0])
+        form = int(np.argmin(np.where(r < _BOUND, 0.5 * r * r, _BOUND * (r - 0.5 * _BOUND)).sum(axis=1)))
+    best = x[form if len(x) > 1 else 0]
+    return form, (best[:3].copy(), np.exp(best[3:6]), float(best[6]))
+
+
+def _priors(usual: Sequence[Usual]) -> tuple[Array, Array]:
+    """Returns the usual log sizes (A, 3) and their spreads, with the sides on the ground either way round."""
+    rows = []
+    for each in usual:
+        a, b, c = each.size
+        rows.append(((a, b, c), each.spread))
+        if b > 1.3 * a:
+            rows.append(((b, a, c), (each.spread[1], each.spread[0], each.spread[2])))
+    if not rows:
+        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0)))
+    return np.log([row[0] for row in rows]), np.array([row[1] for row in rows])
+
+
+def _starts(start: Box, views: Sequence[ImageView], logs: Array) -> Array:
+    """Returns the beginnings (A, 7): boxes that are as deep as usual away from the viewers."""
+    center, size, yaw = start
+    eye = np.mean([v.eye for v in views], axis=0)
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    along = axes @ (center - eye)[:2]
+    deep = int(np.argmax(np.abs(along)))
+    rows = []
+    for usual in np.exp(logs):
+        own, middle = np.maximum(size, 0.01), center.copy()
+        lack = max(0.0, float(usual[deep] - own[deep]))
+        own[deep] += lack
+        middle[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
+        rows.append([*middle, *np.log(own), yaw])
+    return np.array(rows)
 
 
 def image_boxes(boxes: Array, P: Array) -> Array:
     """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind."""
     rows = boxes.copy()
     rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
-    return np.asarray(_images(rows, P[None])[:, 0])
+    return np.asarray(_images(rows, P)[:, 0])
 
 
 def _images(rows: Array, P: Array) -> Array:
-    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V, 3, 4), NaN where a corner is behind the camera."""
+    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V * 3, 4), NaN where partly behind the camera."""
     c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
     local = _SIGNS[None] * np.exp(rows[:, None, 3:6])
     corners = np.empty_like(local)
@@ -92,12 +138,11 @@ def _images(rows: Array, P: Array) -> Array:
     corners[..., 1] = s[:, None] * local[..., 0] + c[:, None] * local[..., 1]
     corners[..., 2] = local[..., 2]
     corners += rows[:, None, :3]
-    seen = np.einsum("vij,kcj->kvci", P[:, :, :3], corners) + P[:, None, :, 3]
-    depth = seen[..., 2]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uv = seen[..., :2] / depth[..., None]
-    image = np.concatenate([uv.min(axis=2), uv.max(axis=2)], axis=-1)
-    image[(depth < _NEAREST).any(axis=2)] = np.nan
+    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), 8, -1, 3)
+    depth = np.maximum(seen[..., 2], 1e-6)
+    u, v = seen[..., 0] / depth, seen[..., 1] / depth
+    image = np.stack([u.min(axis=1), v.min(axis=1), u.max(axis=1), v.max(axis=1)], axis=-1)
+    image[depth.min(axis=1) < _NEAREST] = np.nan
     return np.asarray(image)
 
 
@@ -106,16 +151,14 @@ def _surface(rows: Array, points: Array, eyes: Array) -> Array:
 
     Sides that no view sees may be farther out than the points.
     """
-    c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-    axes = np.zeros((len(rows), 3, 3))
-    axes[:, 0, 0], axes[:, 0, 1], axes[:, 1, 0], axes[:, 1, 1], axes[:, 2, 2] = c, s, -s, c, 1.0
-    local = np.einsum("kij,knj->kni", axes, points[None] - rows[:, None, :3])
-    half = np.exp(rows[:, 3:6]) / 2
-    ranked = np.sort(local, axis=1)
-    cut = len(points) // 20
-    low, high = ranked[:, cut] + half, half - ranked[:, len(points) - 1 - cut]
-    towards = np.einsum("kij,kvj->kvi", axes, eyes[None] - rows[:, None, :3])
-    shown_low, shown_high = (towards < -half[:, None]).mean(axis=1) > 0.3, (towards > half[:, None]).mean(axis=1) > 0.3
-    residual = np.concatenate([low, high], axis=1)  # positive: the side is farther out than the points
-    shown = np.concatenate([shown_low, shown_high], axis=1)
-    return np.where(residual > 0, np.where(shown, residual, 0.0), residual) / _INSIDE
+    c, s = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
+    count, half = len(points), np.exp(rows[:, 3:6]) / 2
+    places = np.concatenate([points, eyes])
+    x, y = places[None, :, 0] - rows[:, :1], places[None, :, 1] - rows[:, 1:2]
+    local = np.stack([c * x + s * y, c * y - s * x, places[None, :, 2] - rows[:, 2:3]], axis=1)
+    cut = count // 20
+    ranked = np.partition(local[..., :count], (cut, count - 1 - cut), axis=2)
+    residual = np.concatenate([ranked[..., cut] + half, half - ranked[..., count - 1 - cut]], axis=1)
+    eye = local[..., count:]
+    shown = np.concatenate([(eye < -half[..., None]).mean(axis=2), (eye > half[..., None]).mean(axis=2)], axis=1) > 0.3
+    return np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE  # positive: the side is beyond the points

@@ -19,6 +19,7 @@ Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
+_WHOLE = 0.6  # overlap from which points without a gap in range are not divided
 _DENSE = 256  # so many places are compared each with each
 
 
@@ -147,7 +148,12 @@ def _object(
     if len(rows) < s.min_points:
         return None
     points = seen.points[rows]
-    reach = s.reach + s.reach_growth * float(np.sqrt(np.median(np.einsum("ij,ij->i", points, points))))
+    ranges = np.sort(np.sqrt(np.einsum("ij,ij->i", points, points)))
+    reach = s.reach + s.reach_growth * float(ranges[len(ranges) // 2])
+    whole = _part(seen, rows)
+    value = _overlap(whole.image, box)
+    if value >= _WHOLE and float(np.diff(ranges).max()) <= reach:
+        return rows, value  # nothing to divide
     voxels = Voxels.by_size(points.astype(np.float32), reach / 2)
     labels = _linked(voxels.means(points), reach)[voxels.of]
     parts = [_part(seen, rows[labels == c]) for c in np.flatnonzero(np.bincount(labels) >= _FEWEST)]

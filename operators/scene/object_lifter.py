@@ -54,6 +54,7 @@ class ObjectLifter(Operator):
     )
     pose: Sampled[Pose | Odometry] = Sampled(required=False, doc="the cloud's sensor or its robot; tells what is up")
     boxes: Out[Boxes3D] = Out(doc="objects in the cloud's frame, with their numbers of points")
+    images: Out[Detections2D] = Out(doc="the image's boxes of the objects, in the order of the boxes")
     clusters: Out[Clusters] = Out(doc="the object of every point of the cloud, in the order of the boxes")
     status: Out[Diagnostics] = Out(doc="detections with and without an object; a warning where all are without")
 
@@ -111,6 +112,7 @@ class ObjectLifter(Operator):
         self._counts.update(counts | {"images": 1})
         return {
             "boxes": _boxes(cloud, detections, rows, found),
+            "images": _images(cloud.stamp, detections, rows, found),
             "clusters": _clusters(cloud, labels, found, points),
             "status": _status(cloud.stamp, counts),
         }
@@ -181,6 +183,21 @@ def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], 
         class_ids=detections.class_ids[own],
         ids=None if detections.ids is None else detections.ids[own],
         point_counts=np.array([len(f.points) for f in found], np.int64),
+    )
+
+
+def _images(stamp: int, detections: Detections2D, rows: NDArray[np.intp], found: list[Lifted]) -> Detections2D:
+    own = rows[[f.detection for f in found]] if found else rows[:0]
+    return Detections2D(
+        stamp=stamp,
+        frame=detections.frame,
+        width=detections.width,
+        height=detections.height,
+        class_names=detections.class_names,
+        boxes=detections.boxes[own],
+        scores=detections.scores[own],
+        class_ids=detections.class_ids[own],
+        ids=None if detections.ids is None else detections.ids[own],
     )
 
 

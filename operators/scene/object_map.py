@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.cells import Cells, completed, standing_box
+from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.cells import Cells, standing_box
+from operators.scene.class_sizes import Usual
+from operators.scene.cuboid import ImageView, image_boxes
+from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.range_view import RangeView, Sight
-from operators.tracking.assignment import assign
+from operators.tracking.assignment import assign, overlap
 
 Array = NDArray[np.float64]
-_MOST = 6.0
-_PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most")
-_BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
-_ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
+_LARGE = 0.4  # metres from which a thing is seldom seen whole, so that its voxels tell it from its neighbours
+_SLACK = 0.02  # of the distance, by which points stray
 
 
 @dataclass(frozen=True)
@@ -28,15 +30,15 @@ class MapSettings:
 
     voxel: float = 0.03
     margin: float = 0.1
-    bin: float = 0.012
     overlap: float = 0.25
+    image_overlap: float = 0.25
     confirm: float = 1.0
     views: int = 3
     vacated: float = 1.0
     missed: float = 0.12
     miss_angle: float = 0.1
     gain: float = 0.3
-    reach: float = 0.15
+    reach: float = 0.12
     mover_reach: float = 0.5
     mover_speed: float = 1.5
     mover_memory: float = 8.0
@@ -45,63 +47,24 @@ class MapSettings:
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known."""
+    """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known.
+
+    `image` is what the image shows of it, where there is one; those of one time share `P`.
+    """
 
     points: Array
     class_id: int
     score: float
     color: Array | None = None
-
-
-@dataclass
-class MapObject:
-    """One object of the map, in an upright box. Times in nanoseconds.
-
-    `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views;
-    `most` is the largest number of voxels that it had.
-    """
-
-    id: int
-    cells: Cells
-    votes: Array
-    evidence: float
-    born: int
-    seen: int
-    views: int = 1
-    color: Array = field(default_factory=lambda: np.full(3, np.nan))
-    center: Array = field(default_factory=lambda: np.zeros(3))
-    size: Array = field(default_factory=lambda: np.zeros(3))
-    yaw: float = 0.0
-    velocity: Array = field(default_factory=lambda: np.zeros(3))
-    view: Array = field(default_factory=lambda: np.zeros(2))
-    most: int = 0
-
-    @property
-    def class_id(self) -> int:
-        return int(np.argmax(self.votes))
-
-    @property
-    def score(self) -> float:
-        """Probability that the object is there."""
-        return 1 / (1 + math.exp(-self.evidence))
-
-    def fit(self, usual: Mapping[int, tuple[float, float]]) -> None:
-        """Puts the box around what is surely the object's, as deep as usual for its class where one side was seen."""
-        sure = self.cells.sure()
-        if len(sure):
-            center, size, yaw = standing_box(sure)
-            box = (center, size + 2 * _BRINK, yaw)
-            known = usual.get(self.class_id)
-            if known is not None:
-                box = completed(box, self.view / max(self.views, 1), known)
-            self.center, self.size, self.yaw = box
+    image: ImageView | None = None
 
 
 class ObjectMap:
     """Joins observations to objects, and keeps, moves and forgets objects.
 
-    An observation is of the object of its class whose voxels it shares most, colour deciding near ties; of another
-    class where the two cover each other. Two objects that come to share their voxels are one. Places that a view looks
+    An observation is of the object of its class whose box, seen from where it was seen, covers its own in the image,
+    and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
+    other. Colour decides near ties. Two objects that come to share their place are one. Places that a view looks
     through lose voxels; an object whose place is empty, or that is in plain view and not detected, loses evidence and
     at last goes. If one of its class and size appears elsewhere, that is the same object, moved.
     `movers` are classes whose place is that of their last view; they are joined by predicted place.
@@ -114,9 +77,9 @@ class ObjectMap:
         classes: int,
         movers: Iterable[int],
         settings: MapSettings,
-        usual: Mapping[int, tuple[float, float]] | None = None,
+        usual: Mapping[int, Sequence[Usual]] | None = None,
     ) -> None:
-        """`usual` are the shorter and longer side on the ground of classes whose size is known, metres."""
+        """`usual` are the sizes of classes whose size is known."""
         self._settings, self._classes, self._movers = settings, classes, frozenset(movers)
         self._usual = dict(usual or {})
         self.objects: dict[int, MapObject] = {}
@@ -154,65 +117,91 @@ class ObjectMap:
         """Returns the object's id of each observation that is of a known one."""
         s, ids = self._settings, sorted(self.objects)
         value = np.zeros((len(seen), len(ids)))
-        if not ids:
+        if not ids or not seen:
             return {}
         known = [self.objects[i] for i in ids]
-        centers, radii = np.array([o.center for o in known]), np.array([float(o.size.max()) for o in known])
+        rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
         moves = np.array([self.is_mover(o) for o in known])
+        shared = _shared_images(seen, rows)
         for k, each in enumerate(seen):
-            reach = (
-                float(cells[k].extent.max()) / 2 + radii + np.where(moves, s.mover_reach + 2 * s.mover_speed, s.reach)
-            )
-            gaps = np.linalg.norm(centers - cells[k].middle, axis=1)
-            for j in np.flatnonzero((gaps <= reach) & (moves == (each.class_id in self._movers))).tolist():
-                value[k, j] = self._alike(each, cells[k], known[j], stamp)
+            mover = each.class_id in self._movers
+            more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
+            near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
+            near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
+            for j in np.flatnonzero((near <= more) & (moves == mover)).tolist():
+                if mover:
+                    value[k, j] = self._alike_mover(each, cells[k], known[j], stamp)
+                else:
+                    value[k, j] = self._alike(each, cells[k], known[j], None if shared is None else shared[k, j])
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
-    def _alike(self, each: Observation, cells: Cells, object: MapObject, stamp: int) -> float:
-        """Returns how likely an observation is of an object, in [0, 1]; 0 where it is not."""
+    def _alike_mover(self, each: Observation, cells: Cells, object: MapObject, stamp: int) -> float:
+        if each.class_id != object.class_id:
+            return 0.0
         s = self._settings
-        same = each.class_id == object.class_id
-        if same and self.is_mover(object):
-            since = (stamp - object.seen) * 1e-9
-            center, _, _ = standing_box(cells.points)
-            away = center - object.center - object.velocity * min(since, 1.0)
-            reach = s.mover_reach + s.mover_speed * min(since, 2.0)
-            return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
-        if self.is_mover(object) or each.class_id in self._movers:
+        since = (stamp - object.seen) * 1e-9
+        center, _, _ = standing_box(cells.points)
+        away = center - object.center - object.velocity * min(since, 1.0)
+        reach = s.mover_reach + s.mover_speed * min(since, 2.0)
+        return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
+
+    def _alike(self, each: Observation, cells: Cells, object: MapObject, shared: float | None) -> float:
+        """Returns how likely an observation is of an object, in [0, 1]; 0 where it is not.
+
+        `shared` is the IoU of its image with that of the object's box, None where there is none.
+        """
+        s = self._settings
+        away = _outside(cells.middle, object.box)
+        reach = (
+            s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
+        )
+        if away > reach:
             return 0.0
-        if same:
-            close = _closeness(cells, object.cells)
-            if close <= 0:
+        if each.class_id != object.class_id:
+            if shared is not None:
+                return 0.5 * shared if shared >= 0.6 else 0.0
+            if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
                 return 0.0
-            share = object.cells.near(cells.points, _tolerance(cells.extent))
-            alike = _color_likeness(each.color, object.color)
-            return 0.5 * share + 0.4 * close + 0.1 * alike if share >= s.overlap else 0.0
-        if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
+            share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
+            return 0.5 * share if share >= 0.5 else 0.0
+        value = 0.3 * (1 - away / reach) + 0.1 * _color_likeness(each.color, object.color)
+        if shared is not None and shared >= s.image_overlap:
+            return value + 0.6 * shared
+        large = max(float(object.size.max()), float(cells.extent.max())) >= _LARGE
+        if shared is not None and not large:
             return 0.0
-        share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
-        return 0.5 * share if share >= 0.5 else 0.0
+        share = object.cells.near(cells.points, _tolerance(cells.extent))
+        if shared is None and not large:
+            value *= _closeness(cells, object.cells)
+        return value + 0.3 * share if share >= s.overlap else 0.0
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         mover = self.is_mover(object)
         direction = _direction(eye, cells)
         object.views += 1
         object.view = direction * object.views if mover else object.view + direction
-        if mover:
-            before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
-            object.cells = cells
-            object.fit(self._usual)
-            speed = (object.center - before) / since
-            share = min(1.0, since / 0.5)
-            object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
-        else:
-            object.cells.add(cells)
+        before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
+        voted = object.class_id
         object.votes[each.class_id] += each.score
-        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), _MOST)
+        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
             known = np.isfinite(object.color).all()
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
-        if not mover:
+        if mover:
+            object.cells = cells
+            object.form = -1
+            object.images = [] if each.image is None or not each.image.edges.any() else [each.image]
+            object.fit(self._usual)
+            speed = (object.center - before) / since
+            share = min(1.0, since / 0.5)
+            object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
+            return
+        object.cells.add(cells)
+        new = each.image is not None and object.look(each.image)
+        if object.class_id != voted:
+            object.form = -1
+        if new or not object.images or object.class_id != voted:
             object.fit(self._usual)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
@@ -222,6 +211,9 @@ class ObjectMap:
         if each.color is not None:
             made.color = each.color
         made.view = _direction(eye, cells)
+        made.center = cells.middle
+        if each.image is not None:
+            made.look(each.image)
         made.fit(self._usual)
         self.objects[made.id] = made
         self._next += 1
@@ -253,7 +245,7 @@ class ObjectMap:
         if len(object.cells) < _LEFT * object.most:
             object.evidence = -1.0
         if mover:
-            object.evidence -= seconds * _MOST / s.mover_memory
+            object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory
         if sight is None:
             return
         looked = np.count_nonzero(sight.looked)
@@ -290,8 +282,10 @@ class ObjectMap:
         kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
         if not self.is_mover(kept):
             kept.cells.add(other.cells)
+            for image in other.images:
+                kept.look(image)
         kept.votes = kept.votes + other.votes
-        kept.evidence = min(max(kept.evidence, other.evidence), _MOST)
+        kept.evidence = min(max(kept.evidence, other.evidence), MOST_EVIDENCE)
         kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
         kept.view = kept.view + other.view
         kept.fit(self._usual)
@@ -302,16 +296,21 @@ class ObjectMap:
         movers = self.is_mover(a), self.is_mover(b)
         if any(movers) and a.class_id != b.class_id:
             return False
-        if not a.cells.touches(b.cells, 0.3):
+        if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
             return False
+        if all(movers):
+            return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
+        if a.class_id != b.class_id:
+            return upright_iou(a.box, b.box) >= 0.5
+        volume = shared_volume(a.box, b.box)
+        if volume >= 0.5 * min(float(np.prod(a.size)), float(np.prod(b.size))):
+            return True
         small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
-        if a.class_id == b.class_id:
-            if all(movers):
-                return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-            if _closeness(small.cells, large.cells) <= 0.3:
-                return False
-            return large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel) >= 0.5
-        return a.cells.near(b.cells.points, s.voxel) >= 0.5 and b.cells.near(a.cells.points, s.voxel) >= 0.5
+        if a.images and b.images and float(small.size.max()) < _LARGE:
+            return False
+        if _closeness(small.cells, large.cells) <= 0.3:
+            return False
+        return large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel) >= 0.5
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""
@@ -337,19 +336,43 @@ class ObjectMap:
             "next": self._next,
             "stamp": self._stamp,
             "moved": self.moved,
-            "objects": [_packed(o) for o in self.objects.values()],
-            "gone": [[stamp, _packed(o)] for stamp, o in self.gone.values()],
+            "objects": [o.snapshot() for o in self.objects.values()],
+            "gone": [[stamp, o.snapshot()] for stamp, o in self.gone.values()],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         side = self._settings.voxel
         self._next, self._stamp, self.moved = int(state["next"]), state["stamp"], int(state["moved"])
-        objects = [_unpacked(row, side) for row in state["objects"]]
+        objects = [MapObject.restored(row, side) for row in state["objects"]]
         self.objects = {o.id: o for o in objects}
         self.gone = {}
         for stamp, row in state["gone"]:
-            old = _unpacked(row, side)
+            old = MapObject.restored(row, side)
             self.gone[old.id] = (int(stamp), old)
+
+
+def _shared_images(seen: Sequence[Observation], rows: Array) -> Array | None:
+    """Returns the IoU (N, M) of the observations' images with those of boxes (M, 7); None without images."""
+    if any(each.image is None for each in seen):
+        return None
+    images = [each.image for each in seen if each.image is not None]
+    boxes = np.stack([image.box for image in images])
+    known = image_boxes(rows, images[0].P)
+    for image in images:  # what reaches beyond the image is cut off there
+        for edge in np.flatnonzero(~image.edges).tolist():
+            cut = np.maximum if edge < 2 else np.minimum
+            known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], image.box[edge])
+    return np.nan_to_num(overlap(boxes, known))
+
+
+def _outside(place: Array, box: tuple[Array, Array, float]) -> float:
+    """Returns how far a place (3,) is from a box, 0 inside."""
+    center, size, yaw = box
+    c, s = math.cos(yaw), math.sin(yaw)
+    x, y, z = (place - center).tolist()
+    w, d, h = (size / 2).tolist()
+    gaps = (max(abs(c * x + s * y) - w, 0.0), max(abs(c * y - s * x) - d, 0.0), max(abs(z) - h, 0.0))
+    return math.sqrt(sum(g * g for g in gaps))
 
 
 def _tolerance(extent: Array) -> float:
@@ -392,14 +415,3 @@ def _moved(old: MapObject, new: MapObject) -> bool:
     fits = np.abs(sizes[0] - sizes[1]).max() <= 0.1 + 0.4 * sizes[0].max()
     fits &= abs(old.size[2] - new.size[2]) <= 0.1 + 0.3 * old.size[2]
     return bool(fits) and _color_likeness(new.color, old.color) >= 0.4
-
-
-def _packed(object: MapObject) -> dict[str, Any]:
-    return {name: getattr(object, name) for name in (*_PLAIN, *_ARRAYS)} | {"cells": object.cells.snapshot()}
-
-
-def _unpacked(state: Mapping[str, Any], side: float) -> MapObject:
-    cells = Cells(side)
-    cells.restore(state["cells"])
-    fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
-    return MapObject(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)

@@ -9,16 +9,31 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Boxes3D, Clusters, Diagnostics, Odometry, PointCloud, Pose, SceneGraph, Transforms
+from dataflow.messages import (
+    Boxes3D,
+    CameraInfo,
+    Clusters,
+    Detections2D,
+    Diagnostics,
+    Odometry,
+    PointCloud,
+    Pose,
+    SceneGraph,
+    Transforms,
+)
 from dataflow.messages.diagnostics import Level
-from dataflow.messages.geometry import quaternion_from_yaw, transform_points
+from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.cloud.filtering import finite
+from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
 from operators.scene.class_sizes import CLASS_SIZES
-from operators.scene.object_map import MapObject, MapSettings, ObjectMap, Observation
+from operators.scene.cuboid import ImageView
+from operators.scene.map_object import MapObject
+from operators.scene.object_map import MapSettings, ObjectMap, Observation
 from operators.scene.range_view import RangeView
 from operators.status import counted_status
+
+_BORDER = 3.0  # pixels; boxes that end nearer to the image's edge may go on beyond it
 
 
 class SemanticMap(Operator):
@@ -42,6 +57,11 @@ class SemanticMap(Operator):
     extrinsics: Sampled[Transforms] = Sampled(
         required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
     )
+    images: Sampled[Detections2D] = Sampled(
+        required=False,
+        doc="the image's boxes of the same objects, in their order; not used where of another stamp",
+    )
+    image_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of that image")
     objects: Out[Boxes3D] = Out(doc="the objects that are surely there, in the map's frame; scores are probabilities")
     nodes: Out[SceneGraph] = Out(doc="the same objects as nodes without relations, with when each was last seen")
     status: Out[Diagnostics] = Out(doc="objects by what became of them; a warning for a view without points")
@@ -72,6 +92,8 @@ class SemanticMap(Operator):
         cloud: PointCloud,
         pose: Pose | Odometry,
         extrinsics: Transforms | None = None,
+        images: Detections2D | None = None,
+        image_info: CameraInfo | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError where boxes, clusters and cloud do not belong together or the pose's frame changes."""
         if clusters.count != boxes.count or len(clusters.labels) != cloud.count:
@@ -82,13 +104,19 @@ class SemanticMap(Operator):
         known = self._opened(boxes, pose)
         sensor = pose.child_frame or cloud.frame
         T = pose.matrix() @ transform_between(extrinsics, cloud.frame, sensor)
-        usable = np.flatnonzero(finite(cloud.points))
+        usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
         points = cloud.points[usable].astype(np.float64)
-        near = np.linalg.norm(points, axis=1) <= self.max_range
-        usable, points = usable[near], points[near]
         labels, world = clusters.labels[usable], transform_points(T, points)
-        seen = [self._observation(boxes, cloud, usable[labels == k], world[labels == k], k) for k in range(boxes.count)]
-        known.update(cloud.stamp, [each for each in seen if each is not None], RangeView(points, T, 0.012))
+        shown = _images(boxes, cloud, images, image_info, T, extrinsics)
+        seen = [
+            self._observation(boxes, cloud, rows, usable, world, k, shown[k])
+            for k, rows in enumerate(_rows_of(labels, boxes.count))
+        ]
+        known.update(
+            cloud.stamp,
+            [each for each in seen if each is not None],
+            RangeView(points[:: 1 + len(points) // 20_000], T, 0.012),
+        )
         objects = known.confirmed()
         counts = {
             "objects": len(objects),
@@ -163,12 +191,20 @@ class SemanticMap(Operator):
         return ObjectMap(max(len(self._classes), 1), movers, settings, usual)
 
     def _observation(
-        self, boxes: Boxes3D, cloud: PointCloud, rows: NDArray[np.intp], world: NDArray[np.float64], k: int
+        self,
+        boxes: Boxes3D,
+        cloud: PointCloud,
+        rows: NDArray[np.intp],
+        usable: NDArray[np.intp],
+        world: NDArray[np.float64],
+        k: int,
+        image: ImageView | None,
     ) -> Observation | None:
         if len(rows) < 3:
             return None
-        color = None if cloud.colors is None else cloud.colors[rows].mean(axis=0) / 255.0
-        return Observation(world, int(boxes.class_ids[k]) if self._classes else 0, float(boxes.scores[k]), color)
+        color = None if cloud.colors is None else cloud.colors[usable[rows]].mean(axis=0) / 255.0
+        class_id = int(boxes.class_ids[k]) if self._classes else 0
+        return Observation(world[rows], class_id, float(boxes.scores[k]), color, image)
 
     def _boxes(self, stamp: int, objects: list[MapObject]) -> Boxes3D:
         return Boxes3D(
@@ -200,6 +236,37 @@ class SemanticMap(Operator):
             subjects=np.zeros(0, np.int32),
             objects=np.zeros(0, np.int32),
         )
+
+
+def _rows_of(labels: NDArray[np.int32], count: int) -> list[NDArray[np.intp]]:
+    """Returns the rows of each label from 0 on."""
+    order = np.argsort(labels, kind="stable")
+    ends = np.searchsorted(labels[order], np.arange(count + 1))
+    return [order[ends[k] : ends[k + 1]] for k in range(count)]
+
+
+def _images(
+    boxes: Boxes3D,
+    cloud: PointCloud,
+    images: Detections2D | None,
+    info: CameraInfo | None,
+    T_map_cloud: NDArray[np.float64],
+    extrinsics: Transforms | None,
+) -> list[ImageView | None]:
+    """Returns what the image shows of each object; None where there is no image of the same time."""
+    if images is None or info is None or images.stamp != boxes.stamp or images.count != boxes.count:
+        return [None] * boxes.count
+    if (images.width, images.height, images.frame) != (info.width, info.height, info.frame):
+        raise ValueError(
+            f"images are of {images.width}x{images.height} pixels in {images.frame!r}, but image_info describes "
+            f"{info.width}x{info.height} in {info.frame!r}"
+        )
+    T_image_map = transform_between(extrinsics, cloud.frame, images.frame) @ invert(T_map_cloud)
+    P, eye = np.asarray(info.K) @ T_image_map[:3], invert(T_image_map)[:3, 3]
+    size = np.array([images.width, images.height, images.width, images.height])
+    rows = images.boxes.astype(np.float64)
+    whole = np.where(np.arange(4) < 2, rows > _BORDER, rows < size - _BORDER)
+    return [ImageView(P, box - 0.5, edges, eye) for box, edges in zip(rows, whole, strict=True)]
 
 
 def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
