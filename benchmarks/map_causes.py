@@ -18,15 +18,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from semantic_map import IOU, PIXELS, VISIBLE, scored, solids
+from semantic_map import IOU, PIXELS, VISIBLE, scored
 from sensed_worlds import Frame, World, sensed
 
-from dataflow.messages import Boxes3D
+from dataflow.messages import Boxes3D, SceneGraph
 from dataflow.messages.geometry import transform_points
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.box_overlap import upright_iou
+from operators.scene.scoring import Box, NodeScore, boxes_of
 from operators.tracking.assignment import overlap
 
 FEW = 3
@@ -43,18 +44,18 @@ class Trail:
     boxes: list[float] = field(default_factory=list)
 
 
-def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], Boxes3D, SemanticMap]:
+def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], SceneGraph, SemanticMap]:
     """Runs lifter and map on what was sensed, and notes what became of every object that was plainly seen."""
     lifter, known = ObjectLifter(), SemanticMap(**params)
     lifter.setup()
     known.setup()
     trails: dict[int, Trail] = defaultdict(Trail)
-    objects: Boxes3D | None = None
+    nodes: SceneGraph | None = None
     for frame in world.frames[::every]:
         found = lifter.process(
             frame.detections, frame.cloud, world.image_info, world.extrinsics, frame.segmentation, frame.camera
         )
-        objects = known.process(
+        nodes = known.process(
             found["boxes"],
             found["clusters"],
             frame.cloud,
@@ -62,10 +63,10 @@ def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], B
             world.extrinsics,
             found["images"],
             world.image_info,
-        )["objects"]
+        )["nodes"]
         _note(trails, frame, world, found["boxes"], found["clusters"].labels)
-    assert objects is not None
-    return trails, objects, known
+    assert nodes is not None
+    return trails, nodes, known
 
 
 def _note(trails: dict[int, Trail], frame: Frame, world: World, boxes: Boxes3D, labels: Any) -> None:
@@ -111,37 +112,30 @@ Row = tuple[str, str, tuple[object, ...]]
 
 
 def causes(
-    world: World, trails: dict[int, Trail], objects: Boxes3D, known: SemanticMap
-) -> tuple[dict[str, Any], list[Row]]:
+    world: World, trails: dict[int, Trail], nodes: SceneGraph, known: SemanticMap
+) -> tuple[NodeScore, list[Row]]:
     """Returns the figures of a map, and the cause of every miss and every false object."""
-    figures = scored(world, objects)
-    truth = world.frames[-1].scene
-    names = [truth.class_names[c] for c in truth.class_ids.tolist()]
-    true = dict(zip(truth.ids.tolist(), solids(truth.positions, truth.sizes, truth.orientations), strict=True))
-    label = dict(zip(truth.ids.tolist(), names, strict=True))
-    mine = solids(objects.centers, objects.sizes, objects.orientations)
-    assert objects.ids is not None
-    ids, labels = objects.ids.tolist(), objects.labels()
-    entries = known.entries()
+    score = scored(world, nodes)
+    true, label = boxes_of(world.frames[-1].scene)
+    mine, labels = boxes_of(nodes)
     rows: list[Row] = []
-    for name, i in figures["missed"]:
+    for name, i in score.missed:
         trail, box = trails[i], true[i]
         close = 0.5 * float(box[1].max()) + 0.05
-        over = [upright_iou(box, other) for other in mine]
-        near = [(float(np.linalg.norm(box[0] - mine[m][0])), m) for m in range(len(mine)) if labels[m] == name]
+        near = [(float(np.linalg.norm(box[0] - mine[m][0])), m) for m in mine if labels[m] == name]
         gap, nearest = min(near, default=(9.0, -1))
         loose = [
             o
-            for o in entries
-            if o.id not in ids
+            for o in known.entries()
+            if o.id not in mine
             and known.classes[o.class_id] == name
             and float(np.linalg.norm(o.center - box[0])) < close
         ]
         if trail.detected == 0:
             cause = "detected as another class" if trail.other else "never detected"
-        elif any(v >= IOU and labels[m] != name for m, v in enumerate(over)):
+        elif any(labels[m] != name and upright_iou(box, mine[m]) >= IOU for m in mine):
             cause = "of another class"
-        elif gap < close and ids[nearest] not in figures["match"]:
+        elif gap < close and nearest not in score.match:
             cause = "of another extent"
         elif trail.detected < FEW:
             cause = "detected in few images"
@@ -151,20 +145,23 @@ def causes(
             cause = "not confirmed"
         else:
             cause = "merged with a neighbour" if gap < close else "dropped or elsewhere"
-        best = max((v for m, v in enumerate(over) if labels[m] == name), default=0.0)
+        best = max((upright_iou(box, mine[m]) for m in mine if labels[m] == name), default=0.0)
         counts = (trail.seen, trail.detected, trail.lifted)
         tentative = [(round(o.evidence, 1), o.views) for o in loose]
-        extent = (np.round(mine[nearest][1], 2).tolist(), np.round(box[1], 2).tolist()) if gap < close else ()
+        extent = (*_told(mine[nearest]), *_told(box)) if gap < close else ()
         rows.append(("missed: " + cause, name, (i, counts, round(best, 2), round(gap, 2), tentative, *extent)))
-    rows += [("false: double", name, ()) for name, _ in figures["doubles"]]
-    for name, i, best, gap in figures["wrong"]:
-        box = mine[ids.index(i)]
-        stands = [label[t] for t, other in true.items() if t > 0 and upright_iou(other, box) >= 0.2]
+    rows += [("false: double", name, (i, *_told(mine[i]))) for name, i in score.doubles]
+    for name, i, best, gap in score.wrong:
+        box = mine[i]
+        stands = {label[t] for t, other in true.items() if t > 0 and upright_iou(other, box) >= 0.2}
         near_one = gap < 0.5 * float(box[1].max()) + 0.2
-        cause = "another class" if set(stands) - {name} else "displaced" if near_one else "phantom"
-        place = (np.round(box[0], 2).tolist(), np.round(box[1], 2).tolist())
-        rows.append(("false: " + cause, name, (i, best, gap, stands, *place)))
-    return figures, rows
+        cause = "another class" if stands - {name} else "displaced" if near_one else "phantom"
+        rows.append(("false: " + cause, name, (i, best, gap, stands, *_told(box))))
+    return score, rows
+
+
+def _told(box: Box) -> tuple[object, ...]:
+    return (np.round(box[0], 2).tolist(), np.round(box[1], 2).tolist(), round(float(np.degrees(box[2]))))
 
 
 def main() -> None:
@@ -177,7 +174,7 @@ def main() -> None:
     options = parser.parse_args()
     table: Counter[str] = Counter()
     by_class: dict[str, Counter[str]] = defaultdict(Counter)
-    every: list[dict[str, Any]] = []
+    every: list[NodeScore] = []
     for world in sensed(range(options.first, options.first + options.worlds), options.cache):
         figures, rows = causes(world, *follow(world, options.every))
         every.append(figures)
@@ -187,18 +184,18 @@ def main() -> None:
             if options.verbose:
                 print("  ", cause, name, more)
         print(
-            f"{world.name}: {figures['must']} objects, recall {figures['recall']:.3f}, precision "
-            f"{figures['precision']:.3f}, doubles {len(figures['doubles'])}, IoU {np.mean(figures['ious']):.2f}, "
-            f"ignored {figures['ignored']}",
+            f"{world.name}: {figures.must} objects, recall {figures.recall:.3f}, precision "
+            f"{figures.precision:.3f}, doubles {len(figures.doubles)}, IoU {np.mean(figures.ious):.2f}, "
+            f"ignored {figures.ignored}",
             flush=True,
         )
-    print("objects", sum(f["must"] for f in every))
+    print("objects", sum(f.must for f in every))
     for cause, count in sorted(table.items()):
         print(f"{cause}: {count}  {dict(by_class[cause].most_common(6))}")
     for key in ("recall", "precision"):
-        values = [f[key] for f in every]
+        values = [getattr(f, key) for f in every]
         print(f"{key}: mean {np.mean(values):.3f}, worst {min(values):.3f}")
-    doubles = [len(f["doubles"]) for f in every]
+    doubles = [len(f.doubles) for f in every]
     print(f"doubles: mean {np.mean(doubles):.1f}, most {max(doubles)}")
 
 

@@ -20,6 +20,9 @@ Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
 _WHOLE = 0.6  # overlap from which points without a gap in range are not divided
+_SAME = 0.5  # overlap from which two boxes are around the same thing
+_SMALLER = 4.0  # times smaller, and a box in another is in front
+_LEFT = 0.3  # share of its points that an object keeps
 _DENSE = 256  # so many places are compared each with each
 
 
@@ -40,7 +43,8 @@ class LiftSettings:
 class Seen:
     """A cloud as the camera sees it: points (N, 3), their pixels (N, 2), which are in the image, and up (3,).
 
-    `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks.
+    `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks. `grain` is by how many
+    pixels the image of a thing's points falls short of its own on each side.
     """
 
     points: Array
@@ -48,6 +52,7 @@ class Seen:
     inside: Mask
     up: Array
     classes: NDArray[np.int32] | None = None
+    grain: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,15 +122,38 @@ def lift(
         found = _object(seen, np.sort(rows), (left, upper, right, lower), s)
         if found is not None:
             candidates.append((k, *found))
-    free = np.ones(len(seen.points), np.bool_)
-    kept = []
-    for k, points, value in sorted(candidates, key=lambda c: (-c[2], c[0])):
-        own = points[free[points]]
-        if len(own) < s.min_points or len(own) < 0.5 * len(points):
-            continue  # another box has it
-        free[own] = False
-        kept.append(Lifted(k, own, value, *upright_box(seen.points[own], seen.up)))
+    owned = _divided(seen.pixels, boxes, candidates)
+    kept = [
+        Lifted(k, own, value, *upright_box(seen.points[own], seen.up))
+        for (k, points, value), own in zip(candidates, owned, strict=True)
+        if len(own) >= max(_FEWEST, _LEFT * len(points))  # else others have it
+    ]
     return sorted(kept, key=lambda c: c.detection)
+
+
+def _divided(pixels: Array, boxes: Array, candidates: Sequence[tuple[int, Indices, float]]) -> list[Indices]:
+    """Returns what each candidate (box, points, overlap) keeps of its points: each goes to one.
+
+    Of boxes around the same thing the better one gets all. Of others a much smaller one does, since it is in front;
+    else each point goes to the box whose middle is nearer, as measured by the boxes' sides.
+    """
+    owner = np.full(len(pixels), -1)
+    distance = np.zeros(len(pixels))
+    middles, sides = (boxes[:, :2] + boxes[:, 2:]) / 2, np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
+    order = sorted(range(len(candidates)), key=lambda c: (-candidates[c][2], candidates[c][0]))
+    for c in order:
+        k, points, _ = candidates[c]
+        away = np.abs((pixels[points] - middles[k]) / sides[k]).max(axis=1)
+        before = owner[points]
+        wins = before < 0
+        for rival in np.unique(before[~wins]).tolist():
+            other = candidates[rival][0]
+            same = _overlap(tuple(boxes[k].tolist()), tuple(boxes[other].tolist())) >= _SAME
+            ratio = float(np.prod(sides[k]) / np.prod(sides[other]))
+            nearer = away < distance[points] if 1 / _SMALLER < ratio < _SMALLER else ratio <= 1 / _SMALLER
+            wins |= (before == rival) & np.asarray(nearer & (not same))
+        owner[points[wins]], distance[points[wins]] = c, away[wins]
+    return [points[owner[points] == c] for c, (_, points, _) in enumerate(candidates)]
 
 
 def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> Indices:
@@ -199,7 +227,8 @@ def _part(seen: Seen, rows: Indices) -> _Part:
         low, high = uv[cut], uv[len(rows) - 1 - cut]
     else:
         low, high = uv.min(axis=0), uv.max(axis=0)
-    image = float(low[0]), float(low[1]), float(high[0]), float(high[1])
+    g = seen.grain
+    image = float(low[0]) - g, float(low[1]) - g, float(high[0]) + g, float(high[1]) + g
     return _Part(rows, image, np.stack([points.min(axis=0), points.max(axis=0)]))
 
 

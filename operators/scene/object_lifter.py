@@ -32,6 +32,8 @@ from operators.geometry.pinhole import project
 from operators.scene.lifting import Lifted, LiftSettings, Seen, lift
 from operators.status import counted_status
 
+_MOST_GRAIN = 4.0  # pixels
+
 
 class ObjectLifter(Operator):
     """Finds the points of a cloud that belong to the boxes of an image and puts upright 3-D boxes around them.
@@ -160,7 +162,9 @@ def _seen(
         classes = np.full(len(points), -1, np.int32)
         column, row = np.rint(pixels[inside]).astype(np.int64).T
         classes[inside] = np.where(_brink(masks.classes), -1, masks.classes.astype(np.int32))[row, column]
-    return Seen(points, pixels + 0.5, inside, up, classes)  # boxes count from the image's edge
+    spacing = np.sqrt(info.width * info.height / max(np.count_nonzero(inside), 1))
+    grain = min(0.5 * float(spacing) + (masks is not None), _MOST_GRAIN)
+    return Seen(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge
 
 
 def _brink(classes: NDArray[Any]) -> NDArray[np.bool_]:

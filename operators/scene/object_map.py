@@ -4,59 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.box_overlap import shared_volume, upright_iou
-from operators.scene.cells import Cells, standing_box
+from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
-from operators.scene.cuboid import ImageView, image_boxes
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
+from operators.scene.matching import (
+    LARGE,
+    MapSettings,
+    Observation,
+    alike,
+    alike_mover,
+    closeness,
+    color_likeness,
+    shared_images,
+    tolerance,
+)
 from operators.scene.range_view import RangeView, Sight
-from operators.tracking.assignment import assign, overlap
+from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
-_LARGE = 0.4  # metres from which a thing is seldom seen whole, so that its voxels tell it from its neighbours
-_SLACK = 0.02  # of the distance, by which points stray
-
-
-@dataclass(frozen=True)
-class MapSettings:
-    """Lengths in metres, times in seconds, evidence in log odds."""
-
-    voxel: float = 0.03
-    margin: float = 0.1
-    overlap: float = 0.25
-    image_overlap: float = 0.25
-    confirm: float = 1.0
-    views: int = 3
-    vacated: float = 1.0
-    missed: float = 0.12
-    miss_angle: float = 0.1
-    gain: float = 0.3
-    reach: float = 0.12
-    mover_reach: float = 0.5
-    mover_speed: float = 1.5
-    mover_memory: float = 8.0
-    move_memory: float = 120.0
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known.
-
-    `image` is what the image shows of it, where there is one; those of one time share `P`.
-    """
-
-    points: Array
-    class_id: int
-    score: float
-    color: Array | None = None
-    image: ImageView | None = None
 
 
 class ObjectMap:
@@ -122,7 +94,7 @@ class ObjectMap:
         known = [self.objects[i] for i in ids]
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
         moves = np.array([self.is_mover(o) for o in known])
-        shared = _shared_images(seen, rows)
+        shared = shared_images(seen, rows)
         for k, each in enumerate(seen):
             mover = each.class_id in self._movers
             more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
@@ -130,50 +102,10 @@ class ObjectMap:
             near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
             for j in np.flatnonzero((near <= more) & (moves == mover)).tolist():
                 if mover:
-                    value[k, j] = self._alike_mover(each, cells[k], known[j], stamp)
+                    value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
                 else:
-                    value[k, j] = self._alike(each, cells[k], known[j], None if shared is None else shared[k, j])
+                    value[k, j] = alike(each, cells[k], known[j], None if shared is None else shared[k, j], s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
-
-    def _alike_mover(self, each: Observation, cells: Cells, object: MapObject, stamp: int) -> float:
-        if each.class_id != object.class_id:
-            return 0.0
-        s = self._settings
-        since = (stamp - object.seen) * 1e-9
-        center, _, _ = standing_box(cells.points)
-        away = center - object.center - object.velocity * min(since, 1.0)
-        reach = s.mover_reach + s.mover_speed * min(since, 2.0)
-        return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
-
-    def _alike(self, each: Observation, cells: Cells, object: MapObject, shared: float | None) -> float:
-        """Returns how likely an observation is of an object, in [0, 1]; 0 where it is not.
-
-        `shared` is the IoU of its image with that of the object's box, None where there is none.
-        """
-        s = self._settings
-        away = _outside(cells.middle, object.box)
-        reach = (
-            s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
-        )
-        if away > reach:
-            return 0.0
-        if each.class_id != object.class_id:
-            if shared is not None:
-                return 0.5 * shared if shared >= 0.6 else 0.0
-            if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
-                return 0.0
-            share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
-            return 0.5 * share if share >= 0.5 else 0.0
-        value = 0.3 * (1 - away / reach) + 0.1 * _color_likeness(each.color, object.color)
-        if shared is not None and shared >= s.image_overlap:
-            return value + 0.6 * shared
-        large = max(float(object.size.max()), float(cells.extent.max())) >= _LARGE
-        if shared is not None and not large:
-            return 0.0
-        share = object.cells.near(cells.points, _tolerance(cells.extent))
-        if shared is None and not large:
-            value *= _closeness(cells, object.cells)
-        return value + 0.3 * share if share >= s.overlap else 0.0
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         mover = self.is_mover(object)
@@ -306,11 +238,11 @@ class ObjectMap:
         if volume >= 0.5 * min(float(np.prod(a.size)), float(np.prod(b.size))):
             return True
         small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
-        if a.images and b.images and float(small.size.max()) < _LARGE:
+        if a.images and b.images and float(small.size.max()) < LARGE:
             return False
-        if _closeness(small.cells, large.cells) <= 0.3:
+        if closeness(small.cells, large.cells) <= 0.3:
             return False
-        return large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel) >= 0.5
+        return large.cells.near(small.cells.points, 0.5 * tolerance(small.size) + 0.5 * s.voxel) >= 0.5
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""
@@ -351,44 +283,6 @@ class ObjectMap:
             self.gone[old.id] = (int(stamp), old)
 
 
-def _shared_images(seen: Sequence[Observation], rows: Array) -> Array | None:
-    """Returns the IoU (N, M) of the observations' images with those of boxes (M, 7); None without images."""
-    if any(each.image is None for each in seen):
-        return None
-    images = [each.image for each in seen if each.image is not None]
-    boxes = np.stack([image.box for image in images])
-    known = image_boxes(rows, images[0].P)
-    for image in images:  # what reaches beyond the image is cut off there
-        for edge in np.flatnonzero(~image.edges).tolist():
-            cut = np.maximum if edge < 2 else np.minimum
-            known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], image.box[edge])
-    return np.nan_to_num(overlap(boxes, known))
-
-
-def _outside(place: Array, box: tuple[Array, Array, float]) -> float:
-    """Returns how far a place (3,) is from a box, 0 inside."""
-    center, size, yaw = box
-    c, s = math.cos(yaw), math.sin(yaw)
-    x, y, z = (place - center).tolist()
-    w, d, h = (size / 2).tolist()
-    gaps = (max(abs(c * x + s * y) - w, 0.0), max(abs(c * y - s * x) - d, 0.0), max(abs(z) - h, 0.0))
-    return math.sqrt(sum(g * g for g in gaps))
-
-
-def _tolerance(extent: Array) -> float:
-    """Returns how near points of one object are: a third of its middle extent, so that rows of books stay apart."""
-    return float(np.clip(0.35 * np.sort(extent)[1], 0.015, 0.12))
-
-
-def _closeness(cells: Cells, known: Cells) -> float:
-    """Returns 1 for small things whose middles agree, 0 for ones a middle extent apart; 0.5 for what may be a part."""
-    extent = np.sort(cells.extent)
-    if extent[2] > 0.4:
-        return 0.5
-    away = float(np.linalg.norm(cells.middle - known.middle))
-    return max(0.0, 1 - away / (max(float(extent[1]), 0.03) + 0.02))
-
-
 def _direction(eye: Array, cells: Cells) -> Array:
     """Returns the horizontal direction (2,) from the viewer to an object."""
     way = (cells.middle - eye)[:2]
@@ -400,13 +294,6 @@ def _log_odds(score: float, least: float) -> float:
     return max(math.log(bounded / (1 - bounded)), least)
 
 
-def _color_likeness(first: Array | None, second: Array) -> float:
-    """Returns 1 for equal mean colours, 0 for ones half the scale apart; a half where one is not known."""
-    if first is None or not np.isfinite(second).all():
-        return 0.5
-    return max(0.0, 1 - 2 * float(np.abs(first - second).max()))
-
-
 def _moved(old: MapObject, new: MapObject) -> bool:
     """Tells whether a new object is an old one in another place: of its class, size and colour."""
     if old.class_id != new.class_id:
@@ -414,4 +301,4 @@ def _moved(old: MapObject, new: MapObject) -> bool:
     sizes = np.sort(old.size[:2]), np.sort(new.size[:2])
     fits = np.abs(sizes[0] - sizes[1]).max() <= 0.1 + 0.4 * sizes[0].max()
     fits &= abs(old.size[2] - new.size[2]) <= 0.1 + 0.3 * old.size[2]
-    return bool(fits) and _color_likeness(new.color, old.color) >= 0.4
+    return bool(fits) and color_likeness(new.color, old.color) >= 0.4

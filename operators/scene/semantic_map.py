@@ -29,7 +29,8 @@ from operators.geometry.extrinsics import transform_between
 from operators.scene.class_sizes import CLASS_SIZES
 from operators.scene.cuboid import ImageView
 from operators.scene.map_object import MapObject
-from operators.scene.object_map import MapSettings, ObjectMap, Observation
+from operators.scene.matching import MapSettings, Observation
+from operators.scene.object_map import ObjectMap
 from operators.scene.range_view import RangeView
 from operators.status import counted_status
 
