@@ -20,6 +20,8 @@ _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
+_TAIL = 2.0  # standard deviations of noise by which the outermost points are beyond a side
+_ASKEW = 1.5  # cost of lying otherwise than most things around
 _TURN = 0.15  # radians by which the heading that points show strays
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
 _ROUNDS = 5
@@ -45,22 +47,34 @@ def fit_cuboid(
     points: Array,
     usual: Sequence[Usual],
     before: tuple[int, Box] | None = None,
+    heading: float | None = None,
+    noise: float = 0.0,
 ) -> tuple[int, Box]:
     """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
 
     Least squares over centre, sizes and heading, by Gauss and Newton with differences: edges of the box's image against
     those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
     where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
-    which such things stand is tried, and the best is returned with its number; with `before`, an earlier result, only
-    that one. After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
+    which such things stand is tried, along the heading of `start` and along `heading`, that of most things around, and
+    the best is returned with its number; with `before`, an earlier result, only that one.
+
+    `noise` is that of ranges at one metre, m; it grows by the square.
+    After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
     logs, spreads = _priors(usual)
     if before is None:
         x = _starts(start, views, logs)
+        if heading is not None:
+            turned = _nearest_turn(start[2], heading)
+            x = np.concatenate([x, _starts((start[0], start[1], turned), views, logs)])
+            logs, spreads = np.tile(logs, (2, 1)), np.tile(spreads, (2, 1))
+        headings = x[:, 6].copy()
     else:
-        logs, spreads = logs[before[0], None], spreads[before[0], None]
-        x = np.array([[*before[1][0], *np.log(before[1][1]), before[1][2]]])
-    heading = float(x[0, 6] + np.remainder(start[2] - x[0, 6] + np.pi / 4, np.pi / 2) - np.pi / 4)
+        form, box = before
+        logs, spreads = logs[form % len(logs), None], spreads[form % len(logs), None]
+        x = np.array([[*box[0], *np.log(box[1]), box[2]]])
+        towards = heading if heading is not None and form >= len(_priors(usual)[0]) else start[2]
+        headings = np.array([_nearest_turn(box[2], towards)])
     P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
@@ -72,7 +86,8 @@ def fit_cuboid(
         image = ((_images(flat, P) - boxes) * weights).reshape(len(flat), -1)
         np.nan_to_num(image, copy=False)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
-        parts = [image, _surface(flat, points, eyes), (flat[:, 6:] - heading) / _TURN, size]
+        turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
+        parts = [image, _surface(flat, points, eyes, noise), turn, size]
         return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
     for _ in range(_ROUNDS if before is None else 2):
@@ -87,9 +102,17 @@ def fit_cuboid(
     form = 0 if before is None else before[0]
     if len(x) > 1:
         r = np.abs(residuals(x[:, None])[:, 0])
-        form = int(np.argmin(np.where(r < _BOUND, 0.5 * r * r, _BOUND * (r - 0.5 * _BOUND)).sum(axis=1)))
+        cost = np.where(r < _BOUND, 0.5 * r * r, _BOUND * (r - 0.5 * _BOUND)).sum(axis=1)
+        if heading is not None:
+            cost[: len(x) // 2] += _ASKEW
+        form = int(np.argmin(cost))
     best = x[form if len(x) > 1 else 0]
     return form, (best[:3].copy(), np.exp(best[3:6]), float(best[6]))
+
+
+def _nearest_turn(yaw: float, towards: float) -> float:
+    """Returns the heading nearest to `yaw` that is `towards` or turned from it by quarters."""
+    return float(yaw + np.remainder(towards - yaw + np.pi / 4, np.pi / 2) - np.pi / 4)
 
 
 def _priors(usual: Sequence[Usual]) -> tuple[Array, Array]:
@@ -146,7 +169,7 @@ def _images(rows: Array, P: Array) -> Array:
     return np.asarray(image)
 
 
-def _surface(rows: Array, points: Array, eyes: Array) -> Array:
+def _surface(rows: Array, points: Array, eyes: Array, noise: float) -> Array:
     """Returns by how much the points' extents differ from the sides of boxes (K, 7): (K, 6), in standard deviations.
 
     Sides that no view sees may be farther out than the points.
@@ -156,9 +179,13 @@ def _surface(rows: Array, points: Array, eyes: Array) -> Array:
     places = np.concatenate([points, eyes])
     x, y = places[None, :, 0] - rows[:, :1], places[None, :, 1] - rows[:, 1:2]
     local = np.stack([c * x + s * y, c * y - s * x, places[None, :, 2] - rows[:, 2:3]], axis=1)
-    cut = count // 20
+    cut = count // 40
     ranked = np.partition(local[..., :count], (cut, count - 1 - cut), axis=2)
     residual = np.concatenate([ranked[..., cut] + half, half - ranked[..., count - 1 - cut]], axis=1)
     eye = local[..., count:]
+    way = np.abs(eye).mean(axis=2)
+    distance = np.sqrt((way * way).sum(axis=1, keepdims=True))
+    stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
+    residual = residual + np.concatenate([stray, stray], axis=1)
     shown = np.concatenate([(eye < -half[..., None]).mean(axis=2), (eye > half[..., None]).mean(axis=2)], axis=1) > 0.3
     return np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE  # positive: the side is beyond the points

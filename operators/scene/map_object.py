@@ -21,7 +21,7 @@ _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _KEPT = 10  # views of an object
 _APART = 0.05  # angle, rad, and a third of the change of the distance, from which two views tell different things
 _SETTLED = 5  # views after which the way in which it stands is settled
-_POINTS = 40  # points of an object that a fit uses
+_POINTS = 60  # points of an object that a fit uses
 _PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most", "form")
 _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 
@@ -81,8 +81,11 @@ class MapObject:
             self.images.pop(_most_alike([v.eye - self.center for v in self.images]))
         return True
 
-    def fit(self, usual: Mapping[int, Sequence[Usual]]) -> None:
-        """Puts the box around what is surely the object's, in agreement with its images and with its class."""
+    def fit(self, usual: Mapping[int, Sequence[Usual]], heading: float | None = None, noise: float = 0.0) -> None:
+        """Puts the box around what is surely the object's, in agreement with its images and with its class.
+
+        `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square.
+        """
         sure = self.cells.sure()
         if not len(sure):
             return
@@ -91,7 +94,7 @@ class MapObject:
         known = usual.get(self.class_id, ())
         if self.images:
             before = (self.form, self.box) if self.form >= 0 else None
-            form, box = fit_cuboid(box, self.images, sure[:: -(-len(sure) // _POINTS)], known, before)
+            form, box = fit_cuboid(box, self.images, sure[:: -(-len(sure) // _POINTS)], known, before, heading, noise)
             self.form = form if len(self.images) >= _SETTLED else -1
         elif known:
             box = completed(box, self.view / max(self.views, 1), known[0])

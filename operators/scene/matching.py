@@ -21,7 +21,7 @@ _SLACK = 0.02  # of the distance, by which points stray
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Lengths in metres, times in seconds, evidence in log odds."""
+    """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square."""
 
     voxel: float = 0.03
     margin: float = 0.1
@@ -34,6 +34,7 @@ class MapSettings:
     miss_angle: float = 0.1
     gain: float = 0.3
     reach: float = 0.12
+    range_noise: float = 0.0012
     mover_reach: float = 0.5
     mover_speed: float = 1.5
     mover_memory: float = 8.0

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
+from operators.scene.heading import RoomHeading
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.matching import (
     LARGE,
@@ -28,6 +29,8 @@ from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
+_COVERED = 0.3  # share of the smaller of two boxes that both have, from which they are one
+_AGAIN = 8  # views after which the heading of the room is looked for once more
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
 
 
@@ -59,12 +62,18 @@ class ObjectMap:
         self.moved = 0
         self._next = 1
         self._stamp: int | None = None
+        self._room, self._updates = RoomHeading(), 0
+        self._heading: float | None = None
 
     def update(self, stamp: int, seen: Sequence[Observation], view: RangeView) -> None:
         """Takes the observations of one time and the view that they come from."""
         s = self._settings
         seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         self._stamp = stamp
+        if self._updates % _AGAIN == 0:
+            self._room.add(view.points)
+        self._updates += 1
+        self._heading = self._room.angle
         cells = [Cells.of(each.points, s.voxel) for each in seen]
         joined = self._joined(seen, cells, stamp)
         for k, each in enumerate(seen):
@@ -124,7 +133,7 @@ class ObjectMap:
             object.cells = cells
             object.form = -1
             object.images = [] if each.image is None or not each.image.edges.any() else [each.image]
-            object.fit(self._usual)
+            object.fit(self._usual, self._heading, self._settings.range_noise)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
@@ -134,7 +143,7 @@ class ObjectMap:
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
-            object.fit(self._usual)
+            object.fit(self._usual, self._heading, self._settings.range_noise)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
@@ -146,7 +155,7 @@ class ObjectMap:
         made.center = cells.middle
         if each.image is not None:
             made.look(each.image)
-        made.fit(self._usual)
+        made.fit(self._usual, self._heading, self._settings.range_noise)
         self.objects[made.id] = made
         self._next += 1
 
@@ -220,7 +229,7 @@ class ObjectMap:
         kept.evidence = min(max(kept.evidence, other.evidence), MOST_EVIDENCE)
         kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
         kept.view = kept.view + other.view
-        kept.fit(self._usual)
+        kept.fit(self._usual, self._heading, self._settings.range_noise)
         del self.objects[other.id]
 
     def _one(self, a: MapObject, b: MapObject) -> bool:
@@ -234,8 +243,8 @@ class ObjectMap:
             return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
         if a.class_id != b.class_id:
             return upright_iou(a.box, b.box) >= 0.5
-        volume = shared_volume(a.box, b.box)
-        if volume >= 0.5 * min(float(np.prod(a.size)), float(np.prod(b.size))):
+        least = 0.5 if a.seen == b.seen else _COVERED  # two that one view shows are seldom one
+        if shared_volume(a.box, b.box) >= least * min(float(np.prod(a.size)), float(np.prod(b.size))):
             return True
         small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
         if a.images and b.images and float(small.size.max()) < LARGE:
@@ -268,12 +277,16 @@ class ObjectMap:
             "next": self._next,
             "stamp": self._stamp,
             "moved": self.moved,
+            "updates": self._updates,
+            "room": [self._room.scores, self._room.views],
             "objects": [o.snapshot() for o in self.objects.values()],
             "gone": [[stamp, o.snapshot()] for stamp, o in self.gone.values()],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         side = self._settings.voxel
+        self._updates, (scores, self._room.views) = int(state["updates"]), state["room"]
+        self._room.scores = np.array(scores, np.float64)
         self._next, self._stamp, self.moved = int(state["next"]), state["stamp"], int(state["moved"])
         objects = [MapObject.restored(row, side) for row in state["objects"]]
         self.objects = {o.id: o for o in objects}

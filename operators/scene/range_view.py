@@ -31,6 +31,7 @@ class RangeView:
     def __init__(self, points: Array, T_world_sensor: Array, angle: float) -> None:
         """Takes points (N, 3) in the sensor's frame; `angle` is the side of a direction's bin, radians."""
         self._T_sensor_world = invert(T_world_sensor)
+        self._own, self._T_world_sensor = points, T_world_sensor
         self.origin = np.asarray(T_world_sensor, np.float64)[:3, 3]
         self._angle = angle
         column, row, ranges = self._directions(points)
@@ -44,6 +45,11 @@ class RangeView:
             np.minimum.at(self._nearest, bins, ranges)
             np.maximum.at(self._farthest, bins, ranges)
         self.reach = float(ranges.max(initial=0.0))
+
+    @property
+    def points(self) -> Array:
+        """The returns (N, 3) in the world."""
+        return transform_points(self._T_world_sensor, self._own)
 
     def of(self, places: Array, margin: float) -> Sight:
         """Tells what the view says of places (N, 3) in the world, within a margin and 2 % of the range."""
