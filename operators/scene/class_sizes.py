@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Usual:
-    """How large such things are: shorter and longer side on the ground and height, metres, and spreads of the logs."""
+    """Usual size: shorter and longer side on the ground and height, metres, and spreads of their logs."""
 
     size: tuple[float, float, float]
     spread: tuple[float, float, float]

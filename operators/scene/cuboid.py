@@ -21,10 +21,10 @@ _NEAREST = 0.1  # metres before the camera from which a corner has a place in th
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 2.0  # standard deviations of noise by which the outermost points are beyond a side
-_ASKEW = 1.5  # cost of lying otherwise than most things around
-_TURN = 0.15  # radians by which the heading that points show strays
+_ASKEW = 8.0  # cost of lying otherwise than most things around
+_TURN = 0.1  # radians by which the heading that points show strays
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
-_ROUNDS = 5
+_ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def fit_cuboid(
         x = _starts(start, views, logs)
         if heading is not None:
             turned = _nearest_turn(start[2], heading)
-            x = np.concatenate([x, _starts((start[0], start[1], turned), views, logs)])
+            x = np.concatenate([x, _starts(_along(points, turned), views, logs)])
             logs, spreads = np.tile(logs, (2, 1)), np.tile(spreads, (2, 1))
         headings = x[:, 6].copy()
     else:
@@ -84,35 +84,49 @@ def fit_cuboid(
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
         flat = rows.reshape(-1, 7)
         image = ((_images(flat, P) - boxes) * weights).reshape(len(flat), -1)
-        np.nan_to_num(image, copy=False)
-        size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
+        image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
+        size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
         parts = [image, _surface(flat, points, eyes, noise), turn, size]
         return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
-    for _ in range(_ROUNDS if before is None else 2):
+    forms = np.arange(len(x)) if before is None else np.array([before[0]])
+    askew = np.where(forms < len(x) // 2, _ASKEW, 0.0) if heading is not None else np.zeros(len(x))
+    for turn in range(_ROUNDS if before is None else 2):
         values = residuals(x[:, None] + _PROBES)
         r, J = values[:, 0], (values[:, 1:] - values[:, :1]) / _STEPS[:, None]
+        if turn == _CHOICE and len(x) > 1:
+            kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
+            x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
+            forms, askew = forms[kept], askew[kept]
         weighted = J * np.minimum(1.0, _BOUND / np.maximum(np.abs(r), 1e-9))[:, None]  # Huber
         A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
         step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
         x = x + step
         if (np.abs(step) < 0.1 * _STEPS).all():
             break
-    form = 0 if before is None else before[0]
-    if len(x) > 1:
-        r = np.abs(residuals(x[:, None])[:, 0])
-        cost = np.where(r < _BOUND, 0.5 * r * r, _BOUND * (r - 0.5 * _BOUND)).sum(axis=1)
-        if heading is not None:
-            cost[: len(x) // 2] += _ASKEW
-        form = int(np.argmin(cost))
-    best = x[form if len(x) > 1 else 0]
-    return form, (best[:3].copy(), np.exp(best[3:6]), float(best[6]))
+    best = 0 if len(x) == 1 else int(np.argmin(_cost(residuals(x[:, None])[:, 0]) + askew))
+    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6]))
+
+
+def _cost(r: Array) -> Array:
+    """Returns the cost (A,) of residuals (A, R), after Huber."""
+    size = np.abs(r)
+    return np.asarray(np.where(size < _BOUND, 0.5 * size * size, _BOUND * (size - 0.5 * _BOUND)).sum(axis=1))
 
 
 def _nearest_turn(yaw: float, towards: float) -> float:
     """Returns the heading nearest to `yaw` that is `towards` or turned from it by quarters."""
     return float(yaw + np.remainder(towards - yaw + np.pi / 4, np.pi / 2) - np.pi / 4)
+
+
+def _along(points: Array, yaw: float) -> Box:
+    """Returns the upright box with a heading around points (N, 3)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    local = points @ turn.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    return (low + high) / 2 @ turn, high - low, yaw
 
 
 def _priors(usual: Sequence[Usual]) -> tuple[Array, Array]:
@@ -188,4 +202,5 @@ def _surface(rows: Array, points: Array, eyes: Array, noise: float) -> Array:
     stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
     residual = residual + np.concatenate([stray, stray], axis=1)
     shown = np.concatenate([(eye < -half[..., None]).mean(axis=2), (eye > half[..., None]).mean(axis=2)], axis=1) > 0.3
-    return np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE  # positive: the side is beyond the points
+    # positive: the side is beyond the points
+    return np.asarray(np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE)

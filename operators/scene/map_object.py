@@ -21,7 +21,7 @@ _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _KEPT = 10  # views of an object
 _APART = 0.05  # angle, rad, and a third of the change of the distance, from which two views tell different things
 _SETTLED = 5  # views after which the way in which it stands is settled
-_POINTS = 60  # points of an object that a fit uses
+_POINTS = 45  # points of an object that a fit uses
 _PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most", "form")
 _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 

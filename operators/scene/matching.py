@@ -1,4 +1,4 @@
-"""How likely an observation is of an object of the map, and whether two objects are one."""
+"""Rates whether an observation is of an object of the map, by place, image, class and colour."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class MapSettings:
     voxel: float = 0.03
     margin: float = 0.1
     overlap: float = 0.25
-    image_overlap: float = 0.25
+    image_overlap: float = 0.3
     confirm: float = 1.0
     views: int = 3
     vacated: float = 1.0
     missed: float = 0.12
-    miss_angle: float = 0.1
+    miss_angle: float = 0.03
     gain: float = 0.3
     reach: float = 0.12
     range_noise: float = 0.0012

@@ -162,7 +162,7 @@ def _seen(
         classes = np.full(len(points), -1, np.int32)
         column, row = np.rint(pixels[inside]).astype(np.int64).T
         classes[inside] = np.where(_brink(masks.classes), -1, masks.classes.astype(np.int32))[row, column]
-    spacing = np.sqrt(info.width * info.height / max(np.count_nonzero(inside), 1))
+    spacing = np.sqrt(info.width * info.height / max(int(inside.sum()), 1))
     grain = min(0.5 * float(spacing) + (masks is not None), _MOST_GRAIN)
     return Seen(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge
 

@@ -139,7 +139,7 @@ class ObjectMap:
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
             return
         object.cells.add(cells)
-        new = each.image is not None and object.look(each.image)
+        new = each.image is not None and object.look(each.image) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:

@@ -1,4 +1,4 @@
-"""How well a scene graph agrees with the true one: its nodes by overlap in space, its relations by pairs of nodes."""
+"""Scores a scene graph against the true one: its nodes by overlap in space, its relations by pairs of nodes."""
 
 from __future__ import annotations
 

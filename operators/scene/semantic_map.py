@@ -69,9 +69,13 @@ class SemanticMap(Operator):
 
     voxel: float = Param(0.03, gt=0.005, le=0.2, doc="side of the voxels that objects consist of", unit="m")
     overlap: float = Param(0.25, gt=0, le=1, doc="share of a view's points that are near those of the object it is of")
+    image_overlap: float = Param(
+        0.3, gt=0, le=1, doc="IoU in the image of an object's box and that of a view that is of it"
+    )
     confirm: float = Param(1.0, gt=0, doc="evidence from which an object is given, in log odds")
     views: int = Param(3, ge=1, doc="and views from which it was seen")
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
+    plain: float = Param(0.03, gt=0, doc="angle of view from which an object should be detected", unit="rad")
     movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
     mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
@@ -181,6 +185,8 @@ class SemanticMap(Operator):
         settings = MapSettings(
             voxel=self.voxel,
             overlap=self.overlap,
+            image_overlap=self.image_overlap,
+            miss_angle=self.plain,
             confirm=self.confirm,
             views=self.views,
             missed=self.missed,
