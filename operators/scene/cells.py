@@ -76,12 +76,12 @@ class Cells:
             self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
             self._tree = self._bounds = self._middle = None
 
-    def doubt(self, confirmed: NDArray[np.bool_], shown: Cells) -> None:
-        """Counts the confirmed voxels that are not near those which the object showed in the same view."""
+    def doubt(self, confirmed: NDArray[np.bool_], shown: Cells, weight: int) -> None:
+        """Counts the confirmed voxels that are not near those which the object showed in the same view, as `weight`."""
         rows = np.flatnonzero(confirmed)
         if len(shown) and len(rows):
             apart, _ = shown.tree().query(self.points[rows], distance_upper_bound=1.5 * self.side)
-            self.other[rows[~np.isfinite(apart)]] += 1
+            self.other[rows[~np.isfinite(apart)]] += weight
 
     def sure(self) -> Array:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""

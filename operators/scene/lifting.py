@@ -20,6 +20,7 @@ Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
 _WHOLE = 0.6  # overlap from which points without a gap in range are not divided
+_MIDDLE = 0.5  # what holding all points in the middle of a box counts, beside the overlap
 _SAME = 0.5  # overlap from which two boxes are around the same thing
 _SMALLER = 4.0  # times smaller, and a box in another is in front
 _LEFT = 0.3  # share of its points that an object keeps
@@ -30,8 +31,8 @@ _DENSE = 256  # so many places are compared each with each
 class LiftSettings:
     """Lengths in metres. `reach` and `reach_growth` say how near neighbours are: reach + growth * distance."""
 
-    reach: float = 0.06
-    reach_growth: float = 0.02
+    reach: float = 0.04
+    reach_growth: float = 0.012
     gap: float = 0.3
     min_points: int = 8
     min_overlap: float = 0.3
@@ -188,7 +189,9 @@ def _object(
     if not parts:
         return None
     values = [_overlap(part.image, box) for part in parts]
-    order = sorted(range(len(parts)), key=lambda c: (-values[c], c))
+    central = [_central(seen, part.rows, box) for part in parts]
+    ranks = [v + _MIDDLE * n / max(sum(central), _FEWEST) for v, n in zip(values, central, strict=True)]
+    order = sorted(range(len(parts)), key=lambda c: (-ranks[c], c))
     chosen, value = parts[order[0]], values[order[0]]
     for c in order[1:]:
         both = chosen.joined(parts[c])
@@ -198,6 +201,12 @@ def _object(
     if value < s.min_overlap or len(chosen.rows) < s.min_points:
         return None
     return np.sort(chosen.rows), value
+
+
+def _central(seen: Seen, rows: Indices, box: tuple[float, float, float, float]) -> int:
+    """Counts the points in the inner half of a box: of a thing; what shows around it has few."""
+    middle, quarter = np.array([box[0] + box[2], box[1] + box[3]]) / 2, np.array([box[2] - box[0], box[3] - box[1]]) / 4
+    return int((np.abs(seen.pixels[rows] - middle) <= quarter).all(axis=1).sum())
 
 
 def _linked(places: Array, reach: float) -> NDArray[np.intp]:

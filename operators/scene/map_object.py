@@ -73,8 +73,9 @@ class MapObject:
         if len(self.images) >= 3:
             ways = np.array([v.eye for v in self.images]) - self.center
             lengths, length = np.sqrt((ways * ways).sum(axis=1)), float(np.sqrt(way @ way))
-            turned = ways @ way < np.cos(_APART) * lengths * length
-            if not (turned | (np.abs(lengths - length) > 3 * _APART * lengths)).all():
+            apart = _APART * (1 + len(ways) / 4)  # the more are known, the less do others tell
+            turned = ways @ way < np.cos(apart) * lengths * length
+            if not (turned | (np.abs(lengths - length) > 3 * apart * lengths)).all():
                 return False
         self.images.append(view)
         if len(self.images) > _KEPT:

@@ -64,7 +64,8 @@ class ObjectLifter(Operator):
     min_points: int = Param(8, ge=5, live=True, doc="fewest points of an object")
     min_overlap: float = Param(0.3, gt=0, le=1, live=True, doc="least IoU of an object's image with its box")
     max_range: float = Param(6.0, gt=0, live=True, doc="farther points are not used", unit="m")
-    reach: float = Param(0.06, gt=0, doc="points so near, and 2 % of their distance, are one cluster", unit="m")
+    reach: float = Param(0.04, gt=0, doc="points so near are one cluster", unit="m")
+    reach_growth: float = Param(0.012, ge=0, doc="share of their distance by which that grows; more for a lidar")
     gap: float = Param(0.3, gt=0, doc="parts of one object are no farther apart", unit="m")
     up: tuple[float, float, float] = Param(
         (0.0, -1.0, 0.0), doc="direction up in the cloud's frame where no pose comes"
@@ -97,7 +98,11 @@ class ObjectLifter(Operator):
         known = {} if masks is None else {name: k for k, name in enumerate(masks.class_names)}
         background = [k for name, k in known.items() if name not in detections.class_names]
         settings = LiftSettings(
-            reach=self.reach, gap=self.gap, min_points=self.min_points, min_overlap=self.min_overlap
+            reach=self.reach,
+            reach_growth=self.reach_growth,
+            gap=self.gap,
+            min_points=self.min_points,
+            min_overlap=self.min_overlap,
         )
         boxes = detections.boxes[rows].astype(np.float64)
         found = lift(seen, boxes, [known.get(names[k], -1) for k in rows], background, settings)

@@ -30,6 +30,7 @@ from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
 _COVERED = 0.3  # share of the smaller of two boxes that both have, from which they are one
+_SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
 _AGAIN = 8  # views after which the heading of the room is looked for once more
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
 
@@ -74,7 +75,7 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
-        cells = [Cells.of(each.points, s.voxel) for each in seen]
+        cells = [Cells.of(self._near_side(each, view.origin), s.voxel) for each in seen]
         joined = self._joined(seen, cells, stamp)
         for k, each in enumerate(seen):
             if k in joined:
@@ -93,6 +94,20 @@ class ObjectMap:
 
     def is_mover(self, object: MapObject) -> bool:
         return object.class_id in self._movers
+
+    def _near_side(self, each: Observation, eye: Array) -> Array:
+        """Returns an observation's points without those that are farther behind most than such a thing is deep."""
+        usual = self._usual.get(each.class_id)
+        if not usual:
+            return each.points
+        way = each.points[:, :2] - eye[:2]
+        ranges = np.sqrt((way * way).sum(axis=1))
+        deep = max(u.size[1] * math.exp(2 * u.spread[1]) for u in usual)
+        deep += 4 * self._settings.range_noise * float(ranges.min()) ** 2
+        ranked = np.sort(ranges)
+        counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
+        first = ranked[int(np.argmax(counts))]
+        return each.points[(ranges >= first) & (ranges <= first + deep)]
 
     def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
@@ -164,8 +179,10 @@ class ObjectMap:
     ) -> None:
         """Takes what a view says of the places of objects; `shown` are the voxels of those that it shows, by id."""
         s = self._settings
-        reach = view.reach + s.margin
-        near = [o for o in objects if np.linalg.norm(o.center - view.origin) <= reach + float(o.size.max())]
+        if not objects:
+            return
+        centers, radii = np.array([o.center for o in objects]), np.array([float(o.size.max()) for o in objects])
+        near = [objects[k] for k in np.flatnonzero(view.may_show(centers, radii + s.margin)).tolist()]
         sights = dict(zip((o.id for o in near), view.of_each([o.cells.points for o in near], s.margin), strict=True))
         for object in objects:
             self._look(object, sights.get(object.id), view.origin, shown.get(object.id), seconds)
@@ -177,8 +194,8 @@ class ObjectMap:
             object.evidence = -1.0
             return
         if not mover and sight is not None:
-            if own is not None:
-                object.cells.doubt(sight.confirmed, own)
+            if own is not None and object.views % _SELDOM == 0:
+                object.cells.doubt(sight.confirmed, own, _SELDOM)
             object.cells.carve(sight.free)
             object.most = max(object.most, len(object.cells))
         if own is not None:

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _FAR = 1 << 30
+_WIDER = 2.0  # columns narrow towards the poles: at 60 degrees to half
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +67,20 @@ class RangeView:
         free = looked & (nearest > ranges + slack)
         confirmed = looked & (nearest <= ranges + slack) & (farthest >= ranges - slack)
         return Sight(looked, free, confirmed)
+
+    def may_show(self, centers: Array, radii: Array) -> Mask:
+        """Tells which spheres (N,) are at least partly in the directions and the range that the view covers."""
+        column, row, ranges = self._directions(transform_points(self._T_sensor_world, centers))
+        if not len(self._nearest):
+            return np.zeros(len(centers), np.bool_)
+        more = np.ceil(np.arcsin(np.clip(radii / np.maximum(ranges, 1e-9), 0, 1)) / self._angle) * _WIDER
+        across, up = column - self._first[0], row - self._first[1]
+        turned = (across + more >= 0) & (across - more < self._shape[0])
+        around = round(2 * np.pi / self._angle)
+        for turn in (-around, around):  # behind the sensor directions begin anew
+            turned |= (across + turn + more >= 0) & (across + turn - more < self._shape[0])
+        raised = (up + more >= 0) & (up - more < self._shape[1])
+        return np.asarray(((turned & raised) | (ranges <= radii)) & (ranges <= self.reach + radii))
 
     def of_each(self, places: Sequence[Array], margin: float) -> list[Sight]:
         """Tells the same of each of several sets of places."""
