@@ -15,7 +15,9 @@ from operators.scene.map_object import MapObject
 from operators.tracking.assignment import overlap
 
 Array = NDArray[np.float64]
-LARGE = 0.4  # metres from which a thing is seldom seen whole, so that its voxels tell it from its neighbours
+LARGE = 0.8  # metres on the ground from which a thing is seldom seen whole, so that its voxels tell
+_COARSE = 0.3  # metres from which a thing is often hidden in part
+_WITHIN = 0.8  # share of an image box that is in that of an object, where the rest is hidden
 _SLACK = 0.02  # of the distance, by which points stray
 
 
@@ -66,36 +68,45 @@ def alike_mover(each: Observation, cells: Cells, object: MapObject, stamp: int, 
     return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
 
 
-def alike(each: Observation, cells: Cells, object: MapObject, shared: float | None, s: MapSettings) -> float:
+@dataclass(frozen=True)
+class InImage:
+    """An observation's image and that of an object's box: IoU, and the share of the first that is in the second."""
+
+    iou: float
+    within: float
+
+
+def alike(
+    each: Observation, cells: Cells, object: MapObject, image: InImage | None, s: MapSettings, *, large: bool
+) -> float:
     """Returns how likely an observation is of an object, in [0, 1]; 0 where it is not.
 
-    `shared` is the IoU of its image with that of the object's box, None where there is none.
+    `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
     away = _outside(cells.middle, object.box)
     reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
     if away > reach:
         return 0.0
     if each.class_id != object.class_id:
-        if shared is not None:
-            return 0.5 * shared if shared >= 0.6 else 0.0
+        if image is not None:
+            return 0.5 * image.iou if image.iou >= 0.6 else 0.0
         if float(np.abs(object.size - cells.extent).max()) > 0.5 * float(object.size.max()):
             return 0.0
         share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
         return 0.5 * share if share >= 0.5 else 0.0
     value = 0.3 * (1 - away / reach) + 0.1 * color_likeness(each.color, object.color)
-    if shared is not None and shared >= s.image_overlap:
-        return value + 0.6 * shared
-    large = max(float(object.size.max()), float(cells.extent.max())) >= LARGE
-    if shared is not None and not large:
-        return 0.0
+    if image is not None and image.iou >= s.image_overlap:
+        return value + 0.6 * image.iou
+    if image is not None and not large:  # what is hidden in part shows in part of its box
+        return value + 0.2 * image.within if image.within >= _WITHIN and float(object.size.max()) >= _COARSE else 0.0
     share = object.cells.near(cells.points, tolerance(cells.extent))
-    if shared is None and not large:
+    if image is None and not large:
         value *= closeness(cells, object.cells)
     return value + 0.3 * share if share >= s.overlap else 0.0
 
 
-def shared_images(seen: Sequence[Observation], rows: Array) -> Array | None:
-    """Returns the IoU (N, M) of the observations' images with those of boxes (M, 7); None without images."""
+def in_image(seen: Sequence[Observation], rows: Array) -> list[list[InImage]] | None:
+    """Returns for observations (N) and boxes (M, 7) how their images agree; None without images."""
     if any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
@@ -105,7 +116,14 @@ def shared_images(seen: Sequence[Observation], rows: Array) -> Array | None:
         for edge in np.flatnonzero(~image.edges).tolist():
             cut = np.maximum if edge < 2 else np.minimum
             known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], image.box[edge])
-    return np.nan_to_num(overlap(boxes, known))
+    iou = np.nan_to_num(overlap(boxes, known))
+    low = np.maximum(boxes[:, None, :2], known[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])
+    areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)
+    within = np.nan_to_num(np.maximum(high - low, 0).prod(axis=2) / areas[:, None])
+    return [
+        [InImage(*pair) for pair in zip(*row, strict=True)] for row in zip(iou.tolist(), within.tolist(), strict=True)
+    ]
 
 
 def _outside(place: Array, box: tuple[Array, Array, float]) -> float:

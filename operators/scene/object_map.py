@@ -22,7 +22,7 @@ from operators.scene.matching import (
     alike_mover,
     closeness,
     color_likeness,
-    shared_images,
+    in_image,
     tolerance,
 )
 from operators.scene.range_view import RangeView, Sight
@@ -95,6 +95,10 @@ class ObjectMap:
     def is_mover(self, object: MapObject) -> bool:
         return object.class_id in self._movers
 
+    def _is_large(self, object: MapObject) -> bool:
+        usual = self._usual.get(object.class_id)
+        return (max(u.size[1] for u in usual) if usual else float(object.size[:2].max())) >= LARGE
+
     def _near_side(self, each: Observation, eye: Array) -> Array:
         """Returns an observation's points without those that are farther behind most than such a thing is deep."""
         usual = self._usual.get(each.class_id)
@@ -118,7 +122,7 @@ class ObjectMap:
         known = [self.objects[i] for i in ids]
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
         moves = np.array([self.is_mover(o) for o in known])
-        shared = shared_images(seen, rows)
+        images = in_image(seen, rows)
         for k, each in enumerate(seen):
             mover = each.class_id in self._movers
             more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
@@ -128,7 +132,8 @@ class ObjectMap:
                 if mover:
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
                 else:
-                    value[k, j] = alike(each, cells[k], known[j], None if shared is None else shared[k, j], s)
+                    image = None if images is None else images[k][j]
+                    value[k, j] = alike(each, cells[k], known[j], image, s, large=self._is_large(known[j]))
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
@@ -264,7 +269,7 @@ class ObjectMap:
         if shared_volume(a.box, b.box) >= least * min(float(np.prod(a.size)), float(np.prod(b.size))):
             return True
         small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
-        if a.images and b.images and float(small.size.max()) < LARGE:
+        if a.images and b.images and not self._is_large(small):
             return False
         if closeness(small.cells, large.cells) <= 0.3:
             return False
