@@ -44,18 +44,18 @@ class Trail:
     boxes: list[float] = field(default_factory=list)
 
 
-def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], SceneGraph, SemanticMap]:
+def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], list[SceneGraph], SemanticMap]:
     """Runs lifter and map on what was sensed, and notes what became of every object that was plainly seen."""
     lifter, known = ObjectLifter(), SemanticMap(**params)
     lifter.setup()
     known.setup()
     trails: dict[int, Trail] = defaultdict(Trail)
-    nodes: SceneGraph | None = None
+    nodes: list[SceneGraph] = []
     for frame in world.frames[::every]:
         found = lifter.process(
             frame.detections, frame.cloud, world.image_info, world.extrinsics, frame.segmentation, frame.camera
         )
-        nodes = known.process(
+        made = known.process(
             found["boxes"],
             found["clusters"],
             frame.cloud,
@@ -63,9 +63,9 @@ def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], S
             world.extrinsics,
             found["images"],
             world.image_info,
-        )["nodes"]
+        )
+        nodes.append(made["nodes"])
         _note(trails, frame, world, found["boxes"], found["clusters"].labels)
-    assert nodes is not None
     return trails, nodes, known
 
 
@@ -112,9 +112,10 @@ Row = tuple[str, str, tuple[object, ...]]
 
 
 def causes(
-    world: World, trails: dict[int, Trail], nodes: SceneGraph, known: SemanticMap
+    world: World, trails: dict[int, Trail], maps: list[SceneGraph], known: SemanticMap
 ) -> tuple[NodeScore, list[Row]]:
     """Returns the figures of a map, and the cause of every miss and every false object."""
+    nodes = maps[-1]
     score = scored(world, nodes)
     true, label = boxes_of(world.frames[-1].scene)
     mine, labels = boxes_of(nodes)
