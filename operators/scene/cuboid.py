@@ -15,6 +15,8 @@ Box = tuple[Array, Array, float]
 """Centre (3,), full size (3,) and heading about the vertical of an upright box."""
 
 _SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_AROUND = np.radians(22.5 + 45 * np.arange(8))
+_ELLIPSE = np.array([[0.52 * np.cos(a), 0.52 * np.sin(a), z] for a in _AROUND for z in (-0.5, 0.5)])
 _STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
 _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
@@ -75,6 +77,7 @@ def fit_cuboid(
         x = np.array([[*box[0], *np.log(box[1]), box[2]]])
         towards = heading if heading is not None and form >= len(_priors(usual)[0]) else start[2]
         headings = np.array([_nearest_turn(box[2], towards)])
+    outline = _ELLIPSE if usual and usual[0].round else _SIGNS
     P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
@@ -83,7 +86,7 @@ def fit_cuboid(
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
         flat = rows.reshape(-1, 7)
-        image = ((_images(flat, P) - boxes) * weights).reshape(len(flat), -1)
+        image = ((_images(flat, P, outline) - boxes) * weights).reshape(len(flat), -1)
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
@@ -159,23 +162,32 @@ def _starts(start: Box, views: Sequence[ImageView], logs: Array) -> Array:
     return np.array(rows)
 
 
-def image_boxes(boxes: Array, P: Array) -> Array:
-    """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind."""
+def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
+    """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind.
+
+    `rounded` (K,) says which hold something of round outline.
+    """
     rows = boxes.copy()
     rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
-    return np.asarray(_images(rows, P)[:, 0])
+    image = _images(rows, P, _SIGNS)[:, 0]
+    if rounded.any():
+        image[rounded] = _images(rows[rounded], P, _ELLIPSE)[:, 0]
+    return image
 
 
-def _images(rows: Array, P: Array) -> Array:
-    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V * 3, 4), NaN where partly behind the camera."""
+def _images(rows: Array, P: Array, outline: Array) -> Array:
+    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V * 3, 4), NaN where partly behind the camera.
+
+    `outline` (C, 3) are the places in a box of side 1 that are looked at.
+    """
     c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-    local = _SIGNS[None] * np.exp(rows[:, None, 3:6])
+    local = outline[None] * np.exp(rows[:, None, 3:6])
     corners = np.empty_like(local)
     corners[..., 0] = c[:, None] * local[..., 0] - s[:, None] * local[..., 1]
     corners[..., 1] = s[:, None] * local[..., 0] + c[:, None] * local[..., 1]
     corners[..., 2] = local[..., 2]
     corners += rows[:, None, :3]
-    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), 8, -1, 3)
+    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), len(outline), -1, 3)
     depth = np.maximum(seen[..., 2], 1e-6)
     u, v = seen[..., 0] / depth, seen[..., 1] / depth
     image = np.stack([u.min(axis=1), v.min(axis=1), u.max(axis=1), v.max(axis=1)], axis=-1)

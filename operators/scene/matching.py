@@ -105,13 +105,13 @@ def alike(
     return value + 0.3 * share if share >= s.overlap else 0.0
 
 
-def in_image(seen: Sequence[Observation], rows: Array) -> list[list[InImage]] | None:
-    """Returns for observations (N) and boxes (M, 7) how their images agree; None without images."""
+def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> list[list[InImage]] | None:
+    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without images."""
     if any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
     boxes = np.stack([image.box for image in images])
-    known = image_boxes(rows, images[0].P)
+    known = image_boxes(rows, images[0].P, rounded)
     for image in images:  # what reaches beyond the image is cut off there
         for edge in np.flatnonzero(~image.edges).tolist():
             cut = np.maximum if edge < 2 else np.minimum

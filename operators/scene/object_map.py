@@ -122,7 +122,8 @@ class ObjectMap:
         known = [self.objects[i] for i in ids]
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
         moves = np.array([self.is_mover(o) for o in known])
-        images = in_image(seen, rows)
+        usual = [self._usual.get(o.class_id, ()) for o in known]
+        images = in_image(seen, rows, np.array([bool(u) and u[0].round for u in usual]))
         for k, each in enumerate(seen):
             mover = each.class_id in self._movers
             more = s.mover_reach + 2 * s.mover_speed if mover else s.reach

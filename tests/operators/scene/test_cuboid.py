@@ -22,7 +22,7 @@ SIDEWAYS = [0.0, 0.25, -0.3, 0.5, -0.5]
 def view_of(box: Box, y: float, noise: float = 0.0) -> ImageView:
     pose = camera(1, (0.2, y, 1.0), pitch=0.0)
     P = K @ invert(pose.matrix())[:3]
-    image = image_boxes(np.array([[*box[0], *box[1], box[2]]]), P)[0]
+    image = image_boxes(np.array([[*box[0], *box[1], box[2]]]), P, np.array([False]))[0]
     stray = np.random.default_rng(int(1000 + 100 * y)).normal(0, noise, 4)
     return ImageView(P, image + stray, ALL, np.array(pose.position))
 
@@ -69,4 +69,4 @@ def test_edges_that_the_image_cuts_off_do_not_count() -> None:
 
 def test_a_box_that_is_partly_behind_the_camera_has_no_image() -> None:
     P = view_of(BOOK, 0.0).P
-    assert np.isnan(image_boxes(np.array([[0.2, 0, 1, 0.5, 0.5, 0.5, 0]]), P)).all()
+    assert np.isnan(image_boxes(np.array([[0.2, 0, 1, 0.5, 0.5, 0.5, 0]]), P, np.array([False]))).all()
