@@ -52,11 +52,14 @@ class ParticleFilterLocalizer(Operator, merge=True):
     A sensor whose innovations are larger than its noise explains, while another sensor's are not, counts less, and the
     status says so. Beside the fused cloud every modality has a cloud of its own, with the same motion.
 
-    Poses come while the robot is localised: most of the weight lies in one place and observations fit there. Sensors
-    are taken at their own stamps, between the odometry messages around them.
+    Poses come while the robot is localised: most of the weight lies in one place, observations fit there, and nowhere
+    else. A robot that has been found is looked for elsewhere too; while another place explains the observations about
+    as well (a mirrored corridor), it is ambiguous, the status names both, and no pose is given. Sensors are taken at
+    their own stamps, between the odometry messages around them.
 
     Methods: Thrun, Burgard and Fox, "Probabilistic Robotics", 2005, chapter 8 (augmented Monte Carlo localisation);
-    Fox, "Adapting the sample size in particle filters through KLD-sampling", 2003.
+    Fox, "Adapting the sample size in particle filters through KLD-sampling", 2003; Jensfelt and Kristensen, "Active
+    global localization for a mobile robot using multiple hypothesis tracking", 2001.
     """
 
     odometry: In[Odometry] = In(doc="planar motion: increments between messages count, the pose itself does not")
@@ -75,7 +78,9 @@ class ParticleFilterLocalizer(Operator, merge=True):
     lidar_pose: Out[Odometry] = Out(doc="what lidar alone says, while its cloud is in one place")
     landmark_pose: Out[Odometry] = Out(doc="what landmarks and objects alone say")
     position_pose: Out[Odometry] = Out(doc="what positions alone say")
-    status: Out[Diagnostics] = Out(doc="localised, searching or lost, and what each sensor counts; every second")
+    status: Out[Diagnostics] = Out(
+        doc="localised, ambiguous, searching or lost, and what each sensor counts; every second"
+    )
 
     map_frame: str = Param("world", min_length=1, doc="frame of the maps and of the pose")
     base_frame: str = Param("base_link", min_length=1, doc="frame that is posed, on the floor")
