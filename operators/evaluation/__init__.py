@@ -1,4 +1,4 @@
-"""Sinks that score streams against ground truth."""
+"""Scores streams against ground truth, and draws their errors."""
 
 from operators.evaluation.consistency_metrics import ConsistencyMetrics
 from operators.evaluation.depth_metrics import DepthMetrics
@@ -6,6 +6,7 @@ from operators.evaluation.detection_metrics import DetectionMetrics
 from operators.evaluation.orientation_metrics import OrientationMetrics
 from operators.evaluation.segmentation_metrics import SegmentationMetrics
 from operators.evaluation.trajectory_metrics import TrajectoryMetrics
+from operators.evaluation.trajectory_plots import TrajectoryPlots
 
 __all__ = [
     "ConsistencyMetrics",
@@ -14,4 +15,5 @@ __all__ = [
     "OrientationMetrics",
     "SegmentationMetrics",
     "TrajectoryMetrics",
+    "TrajectoryPlots",
 ]
