@@ -44,7 +44,7 @@ class TrajectoryPlots(Operator):
     tolerance: Duration = Param("1ms", doc="farthest in time that an estimate's truth may be")
     period: Duration = Param("5s", doc="time between two pictures")
     size: tuple[int, int] = Param((720, 400), doc="width and height of each of the four charts, pixels")
-    out: str | None = Param(None, doc="folder for plots.png, written at the end; made if missing")
+    out: str = Param("", doc="folder for plots.png, written at the end, made if missing; no file where empty")
 
     def setup(self) -> None:
         """Raises ValueError for charts that are too small to be read."""
@@ -95,7 +95,7 @@ class TrajectoryPlots(Operator):
 
     def finish(self) -> None:
         """Writes the picture of everything."""
-        if self.out is None or not self._rows:
+        if not self.out or not self._rows:
             return
         folder = Path(self.out).expanduser()
         folder.mkdir(parents=True, exist_ok=True)
