@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -142,10 +143,14 @@ class ParticleFilterLocalizer(Operator, merge=True):
         for name, message in sorted(measurements.items()):
             if isinstance(message, Imu):
                 T = transform_between(extrinsics, message.frame, self.base_frame)
-                self._reckoning.feel(message.stamp, vertical_rate(message, T))
+                rate = vertical_rate(message, T)
+                if math.isfinite(rate):
+                    self._reckoning.feel(message.stamp, rate)
+                else:
+                    self._ignored[f"{name.partition('/')[2]}: not finite"] += 1
             else:
                 self._pending.append((message.stamp, name.partition("/")[2], message))
-        if odometry is None:
+        if odometry is None or not self._moves(odometry):
             return None
         around = Surroundings(
             self.base_frame,
@@ -201,6 +206,16 @@ class ParticleFilterLocalizer(Operator, merge=True):
         if grid.frame != self.map_frame:
             raise ValueError(f"the map is in {grid.frame!r}, but the robot is looked for in {self.map_frame!r}")
         self._grid, self._field = grid, LikelihoodField(grid, self.hit_sigma, self.stray)
+
+    def _moves(self, odometry: Odometry) -> bool:
+        """Tells whether odometry can be used; where not, it is counted, and the next tells of both ways."""
+        if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
+            self._ignored["odometry: not finite"] += 1
+            return False
+        if self._reckoning.stamp is not None and odometry.stamp <= self._reckoning.stamp:
+            self._ignored["odometry: stamp not later than the last"] += 1
+            return False
+        return True
 
     def _advance(self, odometry: Odometry, around: Surroundings) -> None:
         """Moves to an odometry message, with the measurements on the way."""
