@@ -2,7 +2,7 @@
 
     python benchmarks/localize.py run office:21-24 table_top:21-24 yard:21-24     worlds and seeds, from and up to
     python benchmarks/localize.py degrade office:21                               a lidar that is knocked
-    python benchmarks/localize.py ambiguous corridor:15-18                        a world that looks alike from two places
+    python benchmarks/localize.py ambiguous corridor:15-18                        a world that looks the same twice
     python benchmarks/localize.py time                                            1,000 particles, no adaptation
     python benchmarks/localize.py map office 7 office_7.yaml                      saves a true map
 

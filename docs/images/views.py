@@ -23,6 +23,7 @@ SIZE = (1600, 1000)
 VIEWS: dict[str, tuple[str, ...]] = {
     "dead_reckoning": ("graphs/dead_reckoning.yaml",),
     "depth": ("graphs/depth.yaml",),
+    "fusion": ("graphs/fusion.yaml",),
     "lidar": ("graphs/simulated_lidar.yaml",),
     "mono_depth": ("graphs/mono_depth.yaml", "--set", f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}"),
     "stereo": ("graphs/simulated_stereo.yaml",),
