@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,17 +18,16 @@ from numpy.typing import NDArray
 
 from operators.fusion.control import Command
 from operators.fusion.error_state import (
-    ROTATION,
     SIZE,
     Noise,
     State,
-    difference,
     mahalanobis,
     propagated,
     shifted,
     updated,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge
+from operators.fusion.hypotheses import combined, reduced, with_clocks
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.nodes import (
     Entry,
@@ -74,7 +73,7 @@ class LateFilter:
     def __init__(self, config: FilterConfig, start: Node) -> None:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
-        self._nodes = [_with_clocks(start, [sigma for _, sigma in config.clocks])]
+        self._nodes = [with_clocks(start, [sigma for _, sigma in config.clocks])]
         self._entries: list[Entry] = []
         self._keys: list[tuple[int, int, str, int]] = []
         self._sample_times: list[int] = []
@@ -273,7 +272,7 @@ class LateFilter:
                 replace(h, state=replace(h.state, covariance=h.state.covariance + room)) for h in hypotheses
             )
         if verdict in ("used", "widened"):
-            hypotheses = _reduced(
+            hypotheses = reduced(
                 [
                     Hypothesis(h.weight - 0.5 * (nis + spread), updated(h.state, r, J, entry.noise))
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
@@ -302,50 +301,3 @@ class LateFilter:
         around = [shifted(state, node.gyro - state.gyro_bias, acceleration, s * _MOMENT) for s in (-0.5, 0.5)]
         before, after = (entry.model.innovation(at, node.gyro)[0] for at in around)
         return (before - after) / _MOMENT
-
-
-def _with_clocks(node: Node, sigmas: Sequence[float]) -> Node:
-    """The node with a time offset of 0 for each standard deviation (s), unless it has them."""
-    made = []
-    for h in node.hypotheses:
-        known = len(h.state.covariance)
-        covariance = np.zeros((SIZE + len(sigmas),) * 2)
-        covariance[:known, :known] = h.state.covariance
-        fresh = range(known, len(covariance))
-        covariance[fresh, fresh] = np.square(sigmas[known - SIZE :])
-        offsets = np.concatenate([h.state.offsets, np.zeros(len(fresh))])
-        made.append(replace(h, state=replace(h.state, covariance=covariance, offsets=offsets)))
-    return replace(node, hypotheses=tuple(made))
-
-
-def combined(hypotheses: Sequence[Hypothesis]) -> State:
-    """Returns the likeliest state, with a covariance that holds the others too."""
-    best = max(hypotheses, key=lambda h: h.weight)
-    if len(hypotheses) == 1:
-        return best.state
-    weights = np.exp([h.weight - best.weight for h in hypotheses])
-    weights /= weights.sum()
-    covariance = np.zeros_like(best.state.covariance)
-    for weight, h in zip(weights, hypotheses, strict=True):
-        apart = difference(best.state, h.state)
-        covariance += weight * (h.state.covariance + np.outer(apart, apart))
-    return replace(best.state, covariance=covariance)
-
-
-def _reduced(hypotheses: list[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Drops hypotheses that have become unlikely, and unites those that have become alike."""
-    if len(hypotheses) == 1:
-        return (replace(hypotheses[0], weight=0.0),)
-    ordered = sorted(hypotheses, key=lambda h: -h.weight)
-    kept: list[Hypothesis] = []
-    for h in ordered:
-        if h.weight < ordered[0].weight - 14.0:  # one in a million
-            continue
-        for k, other in enumerate(kept):
-            apart = difference(other.state, h.state)[ROTATION]
-            if float(apart @ np.linalg.solve(other.state.covariance[ROTATION, ROTATION], apart)) < 1.0:
-                kept[k] = replace(other, weight=float(np.logaddexp(other.weight, h.weight)))
-                break
-        else:
-            kept.append(h)
-    return tuple(replace(h, weight=h.weight - kept[0].weight) for h in kept)
