@@ -124,10 +124,10 @@ def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: N
 def _carried(F: Array, covariance: Array) -> Array:
     """The covariance after a motion F (15, 15) that leaves time offsets as they are."""
     if len(covariance) == SIZE:
-        return F @ covariance @ F.T
+        return np.asarray(F @ covariance @ F.T)
     G = np.eye(len(covariance))
     G[:SIZE, :SIZE] = F
-    return G @ covariance @ G.T
+    return np.asarray(G @ covariance @ G.T)
 
 
 def shifted(state: State, rate: Array, acceleration: Array, seconds: float) -> State:

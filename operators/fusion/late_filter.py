@@ -300,4 +300,4 @@ class LateFilter:
             acceleration = state.rotation @ (node.accel - state.accel_bias) + self._down
         around = [shifted(state, node.gyro - state.gyro_bias, acceleration, s * _MOMENT) for s in (-0.5, 0.5)]
         before, after = (entry.model.innovation(at, node.gyro)[0] for at in around)
-        return (before - after) / _MOMENT
+        return np.asarray((before - after) / _MOMENT)

@@ -80,8 +80,8 @@ def test_a_picture_comes_every_period_and_the_file_holds_everything(tmp_path: Pa
 
 def test_poses_without_truth_or_not_finite_are_counted_and_the_others_compared() -> None:
     bad = poses()
-    bad[3] = bad[3].replace(position=[np.nan, 0, 0])  # type: ignore[assignment]
-    bad[4] = bad[4].replace(pose_covariance=np.full((6, 6), np.nan))  # type: ignore[assignment]
+    bad[3] = bad[3].replace(position=[np.nan, 0, 0])
+    bad[4] = bad[4].replace(pose_covariance=np.full((6, 6), np.nan))
     made, operator = played(bad, poses()[:30])
     assert operator.summary() == {"compared": 29, "without truth": 11}
     assert (len(made["error"]), len(made["nees"])) == (29, 28)
