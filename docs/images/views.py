@@ -23,6 +23,7 @@ SIZE = (1600, 1000)
 VIEWS: dict[str, tuple[str, ...]] = {
     "dead_reckoning": ("run", "graphs/dead_reckoning.yaml"),
     "depth": ("run", "graphs/depth.yaml"),
+    "fusion": ("run", "graphs/fusion.yaml"),
     "lidar": ("run", "graphs/simulated_lidar.yaml"),
     "mono_depth": (
         "run",
