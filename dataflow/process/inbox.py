@@ -20,8 +20,6 @@ from typing import Any
 from dataflow.transport import Incoming
 
 Item = tuple[Any, ...]
-LOOKS = 300
-"""So often a process that was told of a frame looks for it before it waits again; some 0.2 ms."""
 
 
 class Inbox:
@@ -78,20 +76,9 @@ class Inbox:
                 self._turn.acquire()
             if woken:
                 os.eventfd_read(self.wake)
-                self._await_announced()
         self._asleep = False
         for ring in self._incoming:
             ring.awake()
-
-    def _await_announced(self) -> None:
-        """Stays up for a frame that was announced. It is there in a moment, unless its writer has other things to do."""
-        for _ in range(LOOKS):
-            for ring in self._incoming:
-                if ring.roused():
-                    break
-            else:
-                return
-            os.sched_yield()
 
     def get_nowait(self) -> Item:
         """Returns the next item; raises `queue.Empty` when there is none."""

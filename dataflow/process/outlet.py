@@ -91,7 +91,6 @@ class Outlet:
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
         self._publishers: Mapping[str, StreamPublisher] = {}
         self._logs: dict[str, list[FiringRecord]] = {}
-        self._followers = fanout.followers(namespace) if live else {}
         self._flushed = time.monotonic()
 
     def open(self, network: Network) -> None:
@@ -230,10 +229,6 @@ class Outlet:
         return Envelope(kind, stream, incarnation, seq, stamp, reason=reason)
 
     def record(self, record: FiringRecord) -> None:
-        """Writes the record down. Meanwhile those who wait for the messages that follow it wake up."""
-        if any(record.outputs):
-            for rouse in self._followers.get(record.operator, ()):
-                rouse()
         self.recent.add(record)
         if self._box is not None:  # ahead of its messages, to where it survives this process
             self._box.add(record)

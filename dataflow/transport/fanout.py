@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from dataflow.transport.codec import encode_head
 from dataflow.transport.envelope import Buffer, Envelope
@@ -56,15 +56,6 @@ class Fanout:
         self._sent[0] += 1
         self._sent[1] += size
         return len(takers)
-
-    def followers(self, namespace: str) -> dict[str, list[Callable[[], None]]]:
-        """Returns, by operator, what wakes the operators that take its streams; not the recorder, which is in no hurry."""
-        found: dict[str, list[Callable[[], None]]] = {}
-        for key, takers in self.takers.items():
-            operator = key.removeprefix(f"{namespace}/").partition("/")[0]
-            wakes = found.setdefault(operator, [])
-            wakes += [link.rouse for link, _ in takers if link.lossy and link.rouse not in wakes]
-        return found
 
     def _lend(
         self,

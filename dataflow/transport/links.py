@@ -71,7 +71,6 @@ class Outgoing:
     def __init__(self, ring: int, wake: int, board: int, most: tuple[int, int] | None) -> None:
         self._ring = RingWriter(ring, wake)
         self._words = self._ring.words
-        self.rouse, self.lossy = self._ring.rouse, most is not None
         self._cells = memoryview(mmap.mmap(board, BOARD_BYTES)).cast("Q")
         self._most = most
         self._reader = self._ring.reader()
@@ -212,8 +211,7 @@ class Incoming:
 
     def __init__(self, ring: int, wake: int, board: int, keys: Sequence[str], pools: PoolReader) -> None:
         self._ring = RingReader(ring, wake)
-        end = self._ring
-        self.arrived, self.sleep, self.awake, self.roused = end.arrived, end.sleep, end.awake, end.roused
+        self.arrived, self.sleep, self.awake = self._ring.arrived, self._ring.sleep, self._ring.awake
         self._board = Board(board)
         self._keys, self._pools = keys, pools
         self._pieces: dict[int, list[bytes]] = {}

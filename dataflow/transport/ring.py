@@ -1,10 +1,10 @@
 """A ring in shared memory from one process to another, with an eventfd that wakes the reader.
 
 One writer, one reader, each on one thread. Whoever starts both makes the memory (a memfd) and hands it down, so nothing
-else on the machine can write to it: what comes out of a ring comes from the process at its other end. Six words are
+else on the machine can write to it: what comes out of a ring comes from the process at its other end. Five words are
 shared, each with one writer: `head` and `tail` count the bytes ever written and read, `asleep` is set by a reader that
 is about to wait, `blocked` by a writer that found no room,
-`readers` counts the readers that there were, `roused` says that a frame is about to follow. A frame counts once `head` includes it, which is written
+`readers` counts the readers that there were. A frame counts once `head` includes it, which is written
 last; so a writer that is killed leaves whole frames, and its successor goes on with the same ring. A reader that takes
 the place of another skips what was meant for that one.
 
@@ -25,7 +25,7 @@ from collections.abc import Sequence
 
 CAPACITY = 1 << 20
 _HEADER = 4096
-_HEAD, _TAIL, _ASLEEP, _BLOCKED, READERS, _ROUSED = (64 * k // 8 for k in range(6))  # a cache line each
+_HEAD, _TAIL, _ASLEEP, _BLOCKED, READERS = (64 * k // 8 for k in range(5))  # a cache line each
 _FRAME = struct.Struct("<II")
 _ROUNDED = _FRAME.size + 7
 """What a frame takes of the ring is its content and this, without the last three bits: whole words, so that a head
@@ -76,7 +76,6 @@ class RingWriter(_End):
         super().__init__(descriptor)
         self._wake = wake
         self._head = self._words[_HEAD]
-        self._words[_ROUSED] = 0
         self.largest = self.capacity // 4 - _FRAME.size
         """Bytes of the largest frame that can pass, once there is room."""
 
@@ -92,14 +91,6 @@ class RingWriter(_End):
     def taken(self) -> int:
         """Returns how many bytes the reader has ever taken."""
         return int(self._words[_TAIL])
-
-    def rouse(self) -> None:
-        """Wakes a reader that waits: a frame follows at once. It is up when the frame is there, instead of then."""
-        words = self._words
-        if words[_ASLEEP]:
-            words[_ROUSED] = 1
-            words[_ASLEEP] = 0
-            os.eventfd_write(self._wake, 1)
 
     def put(self, channel: int, parts: Sequence[Bytes]) -> bool:
         """Writes one frame, on a numbered channel of this ring; False, and nothing, when there is no room for it now.
@@ -130,8 +121,6 @@ class RingWriter(_End):
         self._head = words[_HEAD] = head + skipped + needed
         with self._lock:  # a fence: see `_fence`
             pass
-        if words[_ROUSED]:
-            words[_ROUSED] = 0
         if words[_ASLEEP]:
             words[_ASLEEP] = 0
             os.eventfd_write(self._wake, 1)
@@ -194,10 +183,6 @@ class RingReader(_End):
             return True
         self._words[_ASLEEP] = 0
         return False
-
-    def roused(self) -> bool:
-        """Tells whether the writer has announced a frame that has not come yet."""
-        return bool(self._words[_ROUSED] and self._words[_HEAD] == self._tail)
 
     def awake(self) -> None:
         """Says that the wait is over."""
