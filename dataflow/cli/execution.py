@@ -100,7 +100,7 @@ def execute(
 ) -> None:
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.report import print_report, report_json
-    from dataflow.cli.viewing import attached_viewer, open_saved
+    from dataflow.cli.viewers import attached_viewer, open_saved
     from dataflow.supervision.report import RunFailed
 
     before = {file: _written(file) for file in (outputs.record, outputs.view_file) if file is not None}

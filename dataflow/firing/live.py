@@ -89,7 +89,7 @@ class LiveRunner(OperatorRunner):
         self._jumped: dict[str, int] = {}  # producer → incarnation since its clock jumped back
         self._changed: dict[str, Any] = {}
         self._told = True
-        """Whether the aligner may have something to decide: it was told something since it had not."""
+        """True when the aligner may have something to decide: it was told something since it had not."""
 
     # Counts
 

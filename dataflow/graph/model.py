@@ -369,7 +369,7 @@ class Graph:
 
 
 def _view_from_json(data: Mapping[str, Any]) -> View:
-    """What older recordings do not have is as it was: every panel, no saved layout."""
+    """Sections that older recordings lack are as they were: every panel, no saved layout."""
     return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""))
 
 

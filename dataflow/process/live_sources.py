@@ -44,7 +44,7 @@ class Reader:
         self.runner = runner
         self.unread = Handover()
         self.failure: OperatorFailure | None = None
-        """What went wrong on the thread, until somebody has dealt with it."""
+        """The failure of the thread, until somebody has dealt with it."""
         self.condemned: OperatorFailure | None = None
         """Why what it reads is of no use any more; it stops as soon as it can."""
         self.read_late = self.sent_late = 0.0

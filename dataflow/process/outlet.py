@@ -86,7 +86,7 @@ class Outlet:
         self._network: Network | None = None
         self._fanout = fanout
         self._once: dict[str, list[Envelope]] = {}
-        """What was said on static streams: a consumer that was started again gets it again."""
+        """The messages of static streams: a consumer that was started again gets it again."""
         self._held: list[tuple[str, Envelope | bytes, bool]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
         self._publishers: Mapping[str, StreamPublisher] = {}

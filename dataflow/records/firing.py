@@ -168,7 +168,7 @@ def encode_single(record: FiringRecord) -> bytes:
 
 _pack = msgpack.Packer(use_bin_type=True).pack
 _about: dict[tuple[str, int, tuple[str, ...], tuple[str, ...]], tuple[bytes, bytes]] = {}
-"""What batches of one record say before and after its index, by (operator, incarnation, inputs, their streams)."""
+"""The bytes of batches of one record before and after its index, by (operator, incarnation, inputs, their streams)."""
 
 
 def _describe(operator: str, incarnation: int, names: tuple[str, ...], streams: tuple[str, ...]) -> tuple[bytes, bytes]:

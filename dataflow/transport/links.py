@@ -216,7 +216,7 @@ class Incoming:
         self._keys, self._pools = keys, pools
         self._pieces: dict[int, list[bytes]] = {}
         self.messages = self.nbytes = self.unresolved = 0
-        """What was taken so far, and how much of it lies in memory that could not be opened."""
+        """The count taken so far, and how much of it lies in memory that could not be opened."""
 
     def take(self) -> list[tuple[str, Buffer]]:
         """Returns (key, payload) of what has arrived."""

@@ -28,7 +28,7 @@ _HEADER = 4096
 _HEAD, _TAIL, _ASLEEP, _BLOCKED, READERS = (64 * k // 8 for k in range(5))  # a cache line each
 _FRAME = struct.Struct("<II")
 _ROUNDED = _FRAME.size + 7
-"""What a frame takes of the ring is its content and this, without the last three bits: whole words, so that a head
+"""A frame takes its content and this of the ring, without the last three bits: whole words, so that a head
 never wraps."""
 _SKIP = 0xFFFFFFFF
 _REORDERS = platform.machine() not in ("x86_64", "AMD64")

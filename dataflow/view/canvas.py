@@ -21,7 +21,7 @@ NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
 
 Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor", "status"]
-"""Which views a type appears in. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
+"""The views in which a type appears. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,11 +1,28 @@
 """Sinks that score streams against ground truth."""
 
-from operators.evaluation.consistency_metrics import ConsistencyMetrics
-from operators.evaluation.depth_metrics import DepthMetrics
-from operators.evaluation.detection_metrics import DetectionMetrics
-from operators.evaluation.orientation_metrics import OrientationMetrics
-from operators.evaluation.segmentation_metrics import SegmentationMetrics
-from operators.evaluation.trajectory_metrics import TrajectoryMetrics
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from operators.evaluation.consistency_metrics import ConsistencyMetrics
+    from operators.evaluation.depth_metrics import DepthMetrics
+    from operators.evaluation.detection_metrics import DetectionMetrics
+    from operators.evaluation.orientation_metrics import OrientationMetrics
+    from operators.evaluation.segmentation_metrics import SegmentationMetrics
+    from operators.evaluation.trajectory_metrics import TrajectoryMetrics
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "consistency_metrics": ("ConsistencyMetrics",),
+            "depth_metrics": ("DepthMetrics",),
+            "detection_metrics": ("DetectionMetrics",),
+            "orientation_metrics": ("OrientationMetrics",),
+            "segmentation_metrics": ("SegmentationMetrics",),
+            "trajectory_metrics": ("TrajectoryMetrics",),
+        },
+    )
 
 __all__ = [
     "ConsistencyMetrics",

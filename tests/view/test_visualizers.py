@@ -38,7 +38,8 @@ from dataflow.messages import (
     scalar,
 )
 from dataflow.messages.declaration import Declaration, generic_type
-from dataflow.view import SceneState, ViewOptions, colors, visualize, visualizers
+from dataflow.view import SceneState, ViewOptions, colors, visualize
+from dataflow.view.canvas import visualizers
 from dataflow.view.layout import layout
 
 TYPES = [
