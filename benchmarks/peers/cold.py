@@ -51,6 +51,7 @@ class Pair:
     def __init__(self, size: int) -> None:
         import greenlet
         import roundtrip_operators
+
         from dataflow.process import live_sources
 
         self.hub = greenlet.getcurrent()

@@ -75,7 +75,7 @@ class Inbox:
             finally:
                 self._turn.acquire()
             if woken:
-                os.eventfd_read(self.wake)
+                self._forget_wakes()
         self._asleep = False
         for ring in self._incoming:
             ring.awake()
@@ -102,3 +102,9 @@ class Inbox:
             "received_bytes": sum(ring.nbytes for ring in self._incoming),
             "unresolved": sum(ring.unresolved for ring in self._incoming),
         }
+
+    def _forget_wakes(self) -> None:
+        try:
+            os.eventfd_read(self.wake)
+        except BlockingIOError:
+            return
