@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from dataflow.firing.absent import without_absent
 from dataflow.firing.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
 from dataflow.firing.failure import RAISED, OperatorFailure
 from dataflow.firing.log import FiringLog, unlisted
@@ -21,7 +22,7 @@ from dataflow.firing.restarts import Restarts
 from dataflow.firing.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
-from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 
 OWN_CLOCK = 1_000_000_000
@@ -225,7 +226,7 @@ class LiveRunner(OperatorRunner):
 
     def _fire(self, firing: Firing) -> None:
         if self.absent:
-            firing = self._without_the_absent(firing)
+            firing = without_absent(firing, self.node, self.absent)
         try:
             if (error := self._fault(firing)) is not None:
                 self._fail_on_purpose(firing, error)
@@ -239,22 +240,6 @@ class LiveRunner(OperatorRunner):
         failure = OperatorFailure(self.node.name, f"{firing.kind} at stamp {firing.stamp}", error)
         self._record(firing.kind, firing, time.time_ns(), (), failure.summary, injected=True)
         raise failure
-
-    def _without_the_absent(self, firing: Firing) -> Firing:
-        """Marks inputs stale whose producer is gone; drops what they still hold where the policy says so."""
-        gone = frozenset(
-            name
-            for name, port in self.spec.inputs.items()
-            if port.kind == "sampled" and not self.absent.isdisjoint(self.node.inputs.get(name, ()))
-        )
-        if not gone:
-            return firing
-        inputs = dict(firing.inputs)
-        if self.node.live.on_stale == "drop":
-            inputs |= {
-                name: None for name in gone if not self.spec.inputs[name].required and not _is_many(inputs, name)
-            }
-        return Firing(firing.stamp, firing.kind, firing.tick, inputs, firing.stale | gone, firing.late)
 
     def _start_again(self) -> None:
         """A fresh operator in the place of the failed one, with the parameters as they were last set."""
@@ -367,10 +352,6 @@ class LiveRunner(OperatorRunner):
 def _producer(stream: str) -> str:
     """The operator that emits a stream, by the stream's name."""
     return stream.rpartition("/")[0]
-
-
-def _is_many(inputs: Mapping[str, InputValue], name: str) -> bool:
-    return isinstance(inputs.get(name), Mapping)
 
 
 def _close_quietly(operator: Operator) -> None:
