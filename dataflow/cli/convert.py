@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
 
-Format = Literal["mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "csv", "parquet"]
+Format = Literal[
+    "mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "kitti-raw", "lerobot", "csv", "parquet"
+]
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 """Of formats that are one file; the others are folders."""
 
@@ -45,6 +47,10 @@ def convert(
     start: Start = None,
     end: End = None,
     clock: Clock = "auto",
+    action: Annotated[
+        str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
+    ] = None,
+    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = "",
     overwrite: Overwrite = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=" ", help="Show no progress.")] = False,
     json: Json = False,
@@ -53,7 +59,8 @@ def convert(
 
     Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
-    kept as they are. Datasets (tum, 7scenes, euroc, kitti) take one stream of a kind: --stream chooses among several.
+    kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --stream chooses among
+    several. Into lerobot, every image of the first camera is a frame, with the newest message of every other stream.
 
     Exit codes:
 
@@ -70,6 +77,8 @@ def convert(
       dataflow convert run.mcap folder --to 7scenes
       dataflow convert run.mcap folder --to euroc
       dataflow convert run.mcap folder --to kitti --stream camera/*
+      dataflow convert run.mcap folder --to kitti-raw
+      dataflow convert run.mcap folder --to lerobot --action cmd/twist
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
@@ -82,7 +91,9 @@ def convert(
             view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
             return
         with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            done = _export(material, output, to, overwrite, watch)
+            if to != "lerobot" and (action is not None or task):
+                raise fail("--action and --task are of --to lerobot")
+            done = _export(material, output, to, overwrite, watch, action, task)
     if json:
         print_json(done.as_json())
         return
@@ -135,7 +146,13 @@ def _opened(
 
 
 def _export(
-    material: Material, output: Path, to: str, overwrite: bool, watch: Callable[[int], None] | None
+    material: Material,
+    output: Path,
+    to: str,
+    overwrite: bool,
+    watch: Callable[[int], None] | None,
+    action: str | None,
+    task: str,
 ) -> Exported:
     from dataflow.interop.export.datasets import DATASETS
     from dataflow.interop.export.foxglove import export_foxglove
@@ -152,6 +169,10 @@ def _export(
             export_foxglove(material, output, done)
         case "ros2":
             export_ros2(material, output, done)
+        case "lerobot":
+            from dataflow.interop.export.lerobot import export_lerobot
+
+            export_lerobot(material, output, done, action=action, task=task)
         case "csv":
             export_csv(material, output, done)
         case "parquet":
