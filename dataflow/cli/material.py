@@ -1,4 +1,4 @@
-"""What the commands that edit recordings share: files, spans, progress, and what is printed in the end."""
+"""The common parts of commands that edit recordings: files, spans, progress, and the closing report."""
 
 from __future__ import annotations
 

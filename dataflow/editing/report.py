@@ -1,4 +1,4 @@
-"""What became of a recording that was edited."""
+"""The result of editing a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a pass over a bag finds of each topic: the times of its messages, and nothing of what they hold."""
+"""The findings of a pass over a bag, by topic: the times of its messages, and nothing of their contents."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ class FlightSink:
         self._ring.mkdir(parents=True)
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
-        """How much more than what is to be kept is there: from a state of every operator on."""
+        """The surplus over what is to be kept: from a state of every operator on."""
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
