@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -123,20 +123,24 @@ def _opened(
     path: Path, words: list[str] | None, start: float | None, end: float | None, clock: Literal["auto", "header", "log"]
 ) -> Iterator[Material]:
     from dataflow.interop.export.material import Material
+    from dataflow.recording.cutting import cut_of
     from dataflow.recording.layout import RECORDING
 
+    metadata: Mapping[str, Mapping[str, str]]
     with Material(path, clock=clock) as whole:
         names = [*whole.streams, *(t.name for t in whole.untouched)]
-        namespace = ""
+        namespace, metadata = "", {}
         if not whole.foreign:
             from dataflow.recording import Recording
 
             with Recording(path) as opened:
-                namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
+                metadata = opened.metadata
+                namespace = metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(words, names, namespace) if words else None
         firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
         firsts += [t.first for t in whole.untouched if t.first is not None]
-        first = min(firsts, default=0)
+        part = None if whole.foreign else cut_of(metadata)
+        first = min(firsts, default=0) if part is None or part.start is None else part.start
         if whole.clock:
             say(f"[dim]stamps: {escape(whole.clock)}[/]")
     begin = None if start is None else first + round(start * 1e9)

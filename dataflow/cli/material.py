@@ -1,4 +1,4 @@
-"""The common parts of commands that edit recordings: files, spans, progress, and the closing report."""
+"""Holds what the commands that edit recordings share: files, spans, progress, and what is printed in the end."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class Splitting:
 
 @dataclass(slots=True)
 class Tally:
-    """Progress so far: files, messages by stream, and by stream those missed since the first one."""
+    """Counts what was recorded so far: files, messages by stream, and by stream what was missed since the first one."""
 
     files: list[str] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)

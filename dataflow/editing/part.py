@@ -25,7 +25,7 @@ from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, resol
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """The part to be taken over: the span (ns, inclusive; None: not cut there), and streams (None: all).
+    """Names what is to be taken over: the span (ns, inclusive; None: not cut there), and streams (None: all).
 
     `bare`: exactly the messages of the span, without firing records.
     """
@@ -61,6 +61,8 @@ def write_part(origin: Origin, part: Part, out: Path, *, overwrite: bool = False
     done.bytes = out.stat().st_size
     if origin.file.torn:
         done.notes.append(f"{origin.path} has no proper end: what its writer had not stored when it died is missing")
+    if not origin.own and (left_out := origin.attachments()):
+        done.notes.append(f"attachments of {origin.path} are left out: {left_out}")
     done.notes += [f"{origin.path}: {note}" for note in origin.file.damage]
     return done
 

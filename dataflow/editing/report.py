@@ -1,4 +1,4 @@
-"""The result of editing a recording."""
+"""Reports what became of a recording that was edited."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The findings of a pass over a bag, by topic: the times of its messages, and nothing of their contents."""
+"""Finds in a pass over a bag, of each topic: the times of its messages, and nothing of what they hold."""
 
 from __future__ import annotations
 

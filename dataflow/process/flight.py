@@ -7,12 +7,14 @@ file said of operators that still matters (their parameters, how often they were
 from __future__ import annotations
 
 import json
+import queue
 import shutil
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.process.recorder import RecorderSink
 from dataflow.process.triggers import Triggers
-from dataflow.recording import LogLine, Recording
+from dataflow.recording import LogLine, Recording, RecordingError
 from dataflow.recording.layout import FLIGHT
 from dataflow.records.cuts import Held, cut_record
 from dataflow.records.firing import FiringRecord
@@ -35,6 +37,9 @@ PARTS = 6
 """Files into which the time to keep is divided."""
 MOST_REASONS = 100
 """Triggers that one recording names."""
+MOST_WAITING = 8
+"""Files that wait to be deleted, and spans that wait to be joined: then the recorder waits, so that the disk is
+bounded."""
 SHORTEST = 1_000_000_000
 """Event time of a file, at least (ns)."""
 
@@ -73,17 +78,17 @@ class FlightSink:
         self._ring.mkdir(parents=True)
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
-        """The surplus over what is to be kept: from a state of every operator on."""
+        """Tells how much more than what is to be kept is there: from a state of every operator on."""
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
-        self._prologue: dict[str, list[FiringRecord]] = {}
+        self._forgotten = False
+        self._work = _Work(graph)
         self._segments: deque[Segment] = deque()
         self._made = 0
         self._begun = 0
         self._triggers = Triggers(flight.when)
         self._wanted: Wanted | None = None
-        self._joining: threading.Thread | None = None
         self._kept: list[dict[str, Any]] = []
         self._refused = 0
         self._said_full = False
@@ -137,8 +142,7 @@ class FlightSink:
             self._keep(self._wanted, outcome=outcome)
         else:
             self._sink.close(outcome)
-        if self._joining is not None:
-            self._joining.join()
+        self._work.finish()
         shutil.rmtree(self._ring, ignore_errors=True)
         return {
             "path": str(self.folder),
@@ -153,7 +157,7 @@ class FlightSink:
     @property
     def ring_bytes(self) -> int:
         """Bytes of the ring's files."""
-        return sum(file.stat().st_size for file in self._ring.iterdir())
+        return sum(segment.path.stat().st_size for segment in self._segments)
 
     def _open(self) -> RecorderSink:
         """Begins the next file, with the newest message of every stream in front."""
@@ -172,8 +176,7 @@ class FlightSink:
     def _rotate(self, outcome: str = "goes on") -> None:
         self._sink.close(outcome)
         self._sink = self._open()
-        if self._joining is None or not self._joining.is_alive():
-            self._forget()
+        self._forget()
 
     def _forget(self) -> None:
         """Deletes the files that nobody can ask for any more."""
@@ -183,12 +186,8 @@ class FlightSink:
         while len(self._segments) > 2:
             if (self._segments[1].begin or 0) > start - self.slack and not self._is_full():
                 return
-            oldest = self._segments.popleft()
-            with Recording(oldest.path) as recording:
-                log = FiringLog.read(recording)
-                for operator in log.operators:
-                    self._prologue[operator] = folded([*self._prologue.get(operator, ()), *log.of(operator)])
-            oldest.path.unlink()
+            self._forgotten = True
+            self._work.forget(self._segments.popleft())
 
     def _is_full(self) -> bool:
         """Tells whether the ring takes more of the disk than it may; says so once."""
@@ -207,7 +206,7 @@ class FlightSink:
         if self._clock <= wanted.due:
             return False
         wanted.over = wanted.over or time.monotonic()
-        return time.monotonic() - wanted.over >= self._options["settle"]
+        return bool(time.monotonic() - wanted.over >= self._options["settle"])
 
     def _trigger(self, reason: dict[str, Any], stamp: int) -> None:
         """Asks to keep what was before and will be after `stamp`; what is asked for meanwhile becomes one."""
@@ -225,27 +224,18 @@ class FlightSink:
     def _keep(self, wanted: Wanted, outcome: str = "") -> None:
         """Closes the current file and joins what is wanted of all of them."""
         self._wanted = None
-        if self._joining is not None:
-            self._joining.join()
-        if outcome:
-            self._sink.close(outcome)
-        else:
-            self._sink.close("goes on")
+        self._sink.close(outcome or "goes on")
         segments = list(self._segments)
-        prologue = {operator: list(records) for operator, records in self._prologue.items()}
         if not outcome:
             self._sink = self._open()
-        whole_beginning = not self._prologue and (self._first or 0) >= wanted.start
+        whole_beginning = not self._forgotten and (self._first or 0) >= wanted.start
         to_the_end = outcome and self._clock <= wanted.due
         part = Part(None if whole_beginning else wanted.start, None if to_the_end else wanted.due)
         name = f"{self.graph.name}_{format_stamp(wanted.reasons[0]['stamp']).replace(':', '').partition('.')[0]}"
         out = self._free(name)
         one: dict[str, Any] = {"path": str(out), "reasons": wanted.reasons, "bytes": 0}
         self._kept.append(one)
-        self._joining = threading.Thread(
-            target=self._join, args=(segments, prologue, part, out, one), name="flight recorder", daemon=True
-        )
-        self._joining.start()
+        self._work.join(segments, part, out, one)
 
     def _free(self, name: str) -> Path:
         """A file name that is free, and that nothing kept before has."""
@@ -253,19 +243,54 @@ class FlightSink:
         numbered = (self.folder / f"{name}{f'_{k}' if k else ''}.mcap" for k in range(10_000))
         return next(path for path in numbered if not path.exists() and str(path) not in taken)
 
-    def _join(
-        self,
-        segments: list[Segment],
-        prologue: dict[str, list[FiringRecord]],
-        part: Part,
-        out: Path,
-        one: dict[str, Any],
-    ) -> None:
+
+class _Work:
+    """Deletes files and joins others, on a thread of its own, one after the other.
+
+    What deleted files said of operators is folded into a few records each.
+    """
+
+    def __init__(self, graph: Graph) -> None:
+        self._graph = graph
+        self._prologue: dict[str, list[FiringRecord]] = {}
+        self._asked: queue.Queue[Callable[[], None] | None] = queue.Queue(MOST_WAITING)
+        self._thread = threading.Thread(target=self._run, name="flight recorder", daemon=True)
+        self._thread.start()
+
+    def forget(self, segment: Segment) -> None:
+        """Deletes a file, when what was asked for before is done; waits where much is asked for already."""
+        self._asked.put(partial(self._forget, segment))
+
+    def join(self, segments: list[Segment], part: Part, out: Path, one: dict[str, Any]) -> None:
+        """Cuts a span out of some files into a recording; `one` is told how large it is, or what went wrong."""
+        self._asked.put(partial(self._join, segments, part, out, one))
+
+    def finish(self) -> None:
+        """Returns when everything is done."""
+        self._asked.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (act := self._asked.get()) is not None:
+            act()
+
+    def _forget(self, segment: Segment) -> None:
         try:
-            records = _records(segments, prologue)
+            with Recording(segment.path) as recording:
+                log = FiringLog.read(recording)
+                for operator in log.operators:
+                    self._prologue[operator] = folded([*self._prologue.get(operator, ()), *log.of(operator)])
+        except RecordingError as error:  # what follows it is not known then, which verification says
+            print(f"flight recorder: {error}", flush=True)
+        finally:
+            segment.path.unlink(missing_ok=True)
+
+    def _join(self, segments: list[Segment], part: Part, out: Path, one: dict[str, Any]) -> None:
+        try:
+            records = _records(segments, self._prologue)
             about = {FLIGHT: {"triggers": json.dumps(one["reasons"])}}
             files = [segment.path for segment in segments]
-            one["bytes"] = keep_span(files, records, self.graph, part, out, metadata=about).bytes
+            one["bytes"] = keep_span(files, records, self._graph, part, out, metadata=about).bytes
             print(f"flight recorder: kept {out}: {one['reasons'][0]['what']}", flush=True)
         except Exception as error:  # the run goes on; the failure is said, and stands in its report
             one["error"] = f"{type(error).__name__}: {error}"

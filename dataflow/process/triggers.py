@@ -1,4 +1,4 @@
-"""Triggers of the flight recorder: conditions over messages, events and how operators fare."""
+"""Triggers of a flight recorder: conditions over messages, events and how operators fare."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -9,6 +10,8 @@ from typing import Self
 
 import numpy as np
 import numpy.typing as npt
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from mcap.records import Channel
 
 from dataflow.messages import Odometry, Transforms
@@ -87,6 +90,14 @@ class Origin:
         times = [self.entries(c.id).times for c in self.of_kind(Kind.STREAM).values() if not self.is_static(c)]
         times = [t for t in times if len(t)]
         return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
+
+    def attachments(self) -> int:
+        """How many attachments the file's summary tells of: they are not copied."""
+        with self.path.open("rb") as file, contextlib.suppress(McapError):
+            summary = make_reader(file).get_summary()
+            if summary is not None and summary.statistics is not None:
+                return int(summary.statistics.attachment_count)
+        return 0
 
     def close(self) -> None:
         """Closes the file. Idempotent."""

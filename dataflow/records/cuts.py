@@ -1,4 +1,4 @@
-"""`cut` records: they stand in for firing records that were left out on purpose, in a part of a recording.
+"""Stands in for firing records that were left out on purpose, in a part of a recording: `cut` records.
 
 The detail of a `cut` record holds
 
@@ -37,7 +37,7 @@ class Held(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """The state in which an operator is taken up: its changed parameters, and its state (None: not known)."""
+    """Place where an operator is to be taken up: its changed parameters, and its state (None: not known)."""
 
     again: bool
     at_setup: Mapping[str, Any]

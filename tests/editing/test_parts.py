@@ -8,10 +8,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_parts import cut, messages
+from mcap.reader import make_reader
+from mcap.writer import Writer
 from tampering import tampered
 
 from dataflow.editing.part import Part, write_part
 from dataflow.editing.spans import records_of_span
+from dataflow.interop.opening import is_foreign
 from dataflow.recording import Recording
 from dataflow.recording.copying import Origin
 from dataflow.records.firing import CALLS, Emission, FiringRecord
@@ -181,3 +184,33 @@ def test_firings_keep_their_numbers(recorded: Path, tmp_path: Path) -> None:
         ]
         assert FiringLog.read(other).operators == FiringLog.read(one).operators
     assert calls[1].items() < calls[0].items()
+
+
+def test_another_programs_file_keeps_its_writer_its_latched_topics_and_its_times(tmp_path: Path) -> None:
+    """Bytes, publication times and schemas go over; an attachment does not, which is said."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="another program")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        moving, fixed = (writer.register_channel(t, "cdr", schema) for t in ("/said", "/tf_static"))
+        writer.add_message(fixed, 100, b"fixed", 90)
+        for k in range(10):
+            writer.add_message(moving, 1000 + k, b"%d" % k, 900 + k, k)
+        writer.add_attachment(1, 1, "notes", "text/plain", b"hello")
+        writer.finish()
+
+    with Origin(path) as origin:
+        done = write_part(origin, Part(1004, 1007), tmp_path / "part.mcap")
+
+    with (tmp_path / "part.mcap").open("rb") as file:
+        reader = make_reader(file)
+        found = [(c.topic, m.log_time, m.publish_time, m.sequence, m.data) for _, c, m in reader.iter_messages()]
+        header = reader.get_header()
+    assert found == [
+        ("/tf_static", 100, 90, 0, b"fixed"),
+        *(("/said", 1000 + k, 900 + k, k, b"%d" % k) for k in range(4, 8)),
+    ]
+    assert (header.profile, header.library) == ("ros2", "another program")
+    assert is_foreign(tmp_path / "part.mcap")
+    assert any("attachments" in note for note in done.notes)

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import os
+import pty
+import termios
+import threading
+
 import pytest
+import typer
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dataflow.cli.playback import pressed
+from dataflow.cli.playback import _steered, looped, pressed
 from dataflow.feeds.playback import ACTIONS, Playback
 
 
@@ -58,3 +64,41 @@ def test_an_unknown_action_is_refused() -> None:
 )
 def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     assert list(pressed(typed)) == meant
+
+
+def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+    done: list[str] = []
+    came = threading.Event()
+
+    class Steered:
+        def play(self, action: str) -> None:
+            done.append(action)
+
+        def stop(self) -> None:
+            done.append("stop")
+            came.set()
+
+    with os.fdopen(slave, "r") as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        before = termios.tcgetattr(terminal)
+        with _steered(Steered()):  # type: ignore[arg-type]
+            os.write(master, b" n\x1b[Cq")
+            assert came.wait(10)
+        after = termios.tcgetattr(terminal)
+    os.close(master)
+
+    assert done == ["toggle", "step", "step", "stop"]
+    assert after == before
+
+
+def test_passes_of_a_loop_are_compared(capsys: pytest.CaptureFixture[str]) -> None:
+    digests = iter([{"s": "a"}, {"s": "a"}, {"s": "b"}])
+
+    looped(2, lambda: next(digests))
+    assert "2 passes, the same digests in each" in capsys.readouterr().out
+
+    digests = iter([{"s": "a"}, {"s": "b"}])
+    with pytest.raises(typer.Exit) as ended:
+        looped(2, lambda: next(digests))
+    assert ended.value.exit_code == 1

@@ -1,4 +1,4 @@
-"""The common parts of dataset exports: streams by type, messages as one type, and the files of frames."""
+"""Holds what exports of datasets share: streams by type, messages as one type, and the files of frames."""
 
 from __future__ import annotations
 
