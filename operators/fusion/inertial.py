@@ -109,4 +109,5 @@ class InertialSensor:
         self._kept = [sample_of(row) for row in state["samples"]]
         self._first, self._last = (int(stamp) for stamp in state["stamps"])
         if (noise := state.get("noise")) is not None:
-            self._noise = Noise(*noise, self._config.gyro_walk, self._config.accel_walk)
+            gyro, accel = map(float, noise)
+            self._noise = Noise(gyro, accel, self._config.gyro_walk, self._config.accel_walk)
