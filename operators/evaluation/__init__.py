@@ -1,4 +1,4 @@
-"""Sinks that score streams against ground truth."""
+"""Scores streams against ground truth, and draws their errors."""
 
 from typing import TYPE_CHECKING
 
@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from operators.evaluation.scene_graph_metrics import SceneGraphMetrics
     from operators.evaluation.segmentation_metrics import SegmentationMetrics
     from operators.evaluation.trajectory_metrics import TrajectoryMetrics
+    from operators.evaluation.trajectory_plots import TrajectoryPlots
 else:
     __getattr__, __dir__ = lazily(
         __name__,
@@ -23,6 +24,7 @@ else:
             "scene_graph_metrics": ("SceneGraphMetrics",),
             "segmentation_metrics": ("SegmentationMetrics",),
             "trajectory_metrics": ("TrajectoryMetrics",),
+            "trajectory_plots": ("TrajectoryPlots",),
         },
     )
 
@@ -34,4 +36,5 @@ __all__ = [
     "SceneGraphMetrics",
     "SegmentationMetrics",
     "TrajectoryMetrics",
+    "TrajectoryPlots",
 ]
