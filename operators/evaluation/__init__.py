@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from operators.evaluation.depth_metrics import DepthMetrics
     from operators.evaluation.detection_metrics import DetectionMetrics
     from operators.evaluation.orientation_metrics import OrientationMetrics
+    from operators.evaluation.scene_graph_metrics import SceneGraphMetrics
     from operators.evaluation.segmentation_metrics import SegmentationMetrics
     from operators.evaluation.trajectory_metrics import TrajectoryMetrics
 else:
@@ -19,6 +20,7 @@ else:
             "depth_metrics": ("DepthMetrics",),
             "detection_metrics": ("DetectionMetrics",),
             "orientation_metrics": ("OrientationMetrics",),
+            "scene_graph_metrics": ("SceneGraphMetrics",),
             "segmentation_metrics": ("SegmentationMetrics",),
             "trajectory_metrics": ("TrajectoryMetrics",),
         },
@@ -29,6 +31,7 @@ __all__ = [
     "DepthMetrics",
     "DetectionMetrics",
     "OrientationMetrics",
+    "SceneGraphMetrics",
     "SegmentationMetrics",
     "TrajectoryMetrics",
 ]
