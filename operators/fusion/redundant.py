@@ -1,4 +1,4 @@
-"""What several sensors said last about the same thing, and how far they agree: begun alike by all that average them."""
+"""Last readings of several sensors of one thing, and how far they agree: the start of all operators that average them."""
 
 from __future__ import annotations
 
