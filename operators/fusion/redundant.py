@@ -1,4 +1,4 @@
-"""Last readings of several sensors of one thing, and how far they agree: the start of all operators that average them."""
+"""Last readings of several sensors of one thing, and how far they agree; all operators that average them use it."""
 
 from __future__ import annotations
 
