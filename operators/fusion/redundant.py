@@ -1,4 +1,4 @@
-"""What several sensors said last about the same thing, and how far they agree: begun alike by all that average them."""
+"""Keeps what several sensors said last about the same thing, and how far they agree, for all that average them."""
 
 from __future__ import annotations
 
