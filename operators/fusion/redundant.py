@@ -1,4 +1,4 @@
-"""Last readings of several sensors of one thing, and how far they agree; all operators that average them use it."""
+"""Keeps what several sensors said last about the same thing, and how far they agree, for all that average them."""
 
 from __future__ import annotations
 
@@ -47,5 +47,5 @@ class RedundantSensors(Generic[M]):
         return self.agreement.status(stamp, self.ignored)
 
     def summary(self) -> dict[str, float | int | str]:
-        ignored = {f"ignored, {reason}": count for reason, count in sorted(self.ignored.items())}
-        return {"two sensors contradicted each other": self.agreement.split, **ignored}
+        figures: dict[str, float | int | str] = {"two sensors contradicted each other": self.agreement.split}
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(self.ignored.items())}
