@@ -16,6 +16,7 @@ FOR_TESTS = {
 }
 CALLED_BY_OTHERS = {
     "get_next",  # onnxruntime asks a calibration reader
+    "list_commands",  # click asks a group
     "on_playback_control_request",  # Foxglove's server tells its listener
     "on_subscribe",
 }
