@@ -1,4 +1,4 @@
-"""What the commands that edit recordings share: files, spans, progress, and what is printed in the end."""
+"""Holds what the commands that edit recordings share: files, spans, progress, and what is printed in the end."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ def pressed(typed: bytes) -> Iterator[Pressed]:
 
 
 def keys(quiet: bool) -> Callable[[Supervisor], AbstractContextManager[None]] | None:
-    """What steers a replay by keys, where there is a terminal; None elsewhere."""
+    """Returns what steers a replay by keys, where there is a terminal; None elsewhere."""
     if quiet or not err.is_terminal or not sys.stdin.isatty():
         return None
     return _steered

@@ -36,7 +36,8 @@ FLUSH_EVERY = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Splitting:
-    """When a recording goes on in another file: after so many bytes, or so much event time (ns); None: never."""
+    """Limits of one file, after which a recording goes on in the next: after so many bytes, or so much event time (ns);
+    None: never."""
 
     size: int | None = None
     every: int | None = None
@@ -49,7 +50,7 @@ class Splitting:
 
 @dataclass(slots=True)
 class Tally:
-    """What was recorded so far: files, messages by stream, and by stream what was missed since the first one."""
+    """Counts what was recorded so far: files, messages by stream, and by stream what was missed since the first one."""
 
     files: list[str] = field(default_factory=list)
     messages: dict[str, int] = field(default_factory=dict)

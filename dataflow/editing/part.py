@@ -25,7 +25,7 @@ from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, resol
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What is to be taken over: the span (ns, inclusive; None: not cut there), and streams (None: all).
+    """Names what is to be taken over: the span (ns, inclusive; None: not cut there), and streams (None: all).
 
     `bare`: exactly the messages of the span, without firing records.
     """

@@ -35,7 +35,7 @@ class Loss:
 
 @dataclass(slots=True)
 class Recovered:
-    """What was saved into a file, and what is lost.
+    """Tells what was saved into a file, and what is lost.
 
     `torn`: the broken file had no proper end; `lost_bytes`: of the unfinished record there. `damage`: for people.
     """

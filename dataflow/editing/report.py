@@ -1,4 +1,4 @@
-"""What became of a recording that was edited."""
+"""Reports what became of a recording that was edited."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ MOST_STEPS = 1_000_000
 
 
 class Playback:
-    """Whether a feed may give its next step (all messages of one stamp)."""
+    """Decides whether a feed may give its next step (all messages of one stamp)."""
 
     def __init__(self, *, paused: bool = False) -> None:
         self.paused = paused

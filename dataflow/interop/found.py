@@ -1,4 +1,4 @@
-"""What a pass over a bag finds of each topic: the times of its messages, and nothing of what they hold."""
+"""Finds in a pass over a bag, of each topic: the times of its messages, and nothing of what they hold."""
 
 from __future__ import annotations
 

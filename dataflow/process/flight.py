@@ -62,7 +62,7 @@ class Wanted:
     due: int
     reasons: list[dict[str, Any]] = field(default_factory=list)
     over: float = 0.0
-    """When it was seen that it is over (s, steady); 0 until then."""
+    """Time (s, steady) at which it was seen to be over; 0 until then."""
 
 
 class FlightSink:
@@ -78,7 +78,7 @@ class FlightSink:
         self._ring.mkdir(parents=True)
         self.length = max(flight.keep // PARTS, SHORTEST)
         self.slack = 2 * (graph.record.snapshots or 0) + 2 * self.length
-        """How much more than what is to be kept is there: from a state of every operator on."""
+        """Tells how much more than what is to be kept is there: from a state of every operator on."""
         self._clock = 0
         self._first: int | None = None
         self._newest: dict[str, tuple[Message, int, int]] = {}
@@ -206,7 +206,7 @@ class FlightSink:
         if self._clock <= wanted.due:
             return False
         wanted.over = wanted.over or time.monotonic()
-        return time.monotonic() - wanted.over >= self._options["settle"]
+        return bool(time.monotonic() - wanted.over >= self._options["settle"])
 
     def _trigger(self, reason: dict[str, Any], stamp: int) -> None:
         """Asks to keep what was before and will be after `stamp`; what is asked for meanwhile becomes one."""

@@ -292,7 +292,7 @@ class OperatorProcess:
     def _deliver(self, stream: str, envelope: Envelope) -> None:
         """Gives an envelope to the operators that take its stream. What contradicts what they have seen is refused, in
         a live run."""
-        for runner in self.runners.taking(stream):
+        for runner in self.runners.consumers.get(stream, ()):
             try:
                 give(runner, stream, envelope)
             except StreamOrderError as error:

@@ -1,4 +1,4 @@
-"""What makes a flight recorder keep what was: conditions over messages, events and how operators fare."""
+"""Triggers of a flight recorder: conditions over messages, events and how operators fare."""
 
 from __future__ import annotations
 

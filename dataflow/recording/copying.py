@@ -92,7 +92,7 @@ class Origin:
         return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
 
     def attachments(self) -> int:
-        """How many attachments the file's summary tells of: they are not copied."""
+        """Counts the attachments that the file's summary tells of: they are not copied."""
         with self.path.open("rb") as file, contextlib.suppress(McapError):
             summary = make_reader(file).get_summary()
             if summary is not None and summary.statistics is not None:

@@ -10,7 +10,7 @@ from dataflow.recording.layout import CUT
 
 @dataclass(frozen=True, slots=True)
 class Cut:
-    """What a part was cut from: the file's name, and the span (stamps in ns, inclusive; None: not cut there).
+    """Names what a part was cut from: the file's name, and the span (stamps in ns, inclusive; None: not cut there).
 
     Messages before `start` and after `end` may be in it where firings in the span took them.
     """

@@ -1,4 +1,4 @@
-"""What stands in for firing records that were left out on purpose, in a part of a recording: `cut` records.
+"""Stands in for firing records that were left out on purpose, in a part of a recording: `cut` records.
 
 The detail of a `cut` record holds
 
@@ -37,7 +37,7 @@ class Held(NamedTuple):
 
 
 class Taken(NamedTuple):
-    """Where an operator is to be taken up: its changed parameters, and its state (None: not known)."""
+    """Place where an operator is to be taken up: its changed parameters, and its state (None: not known)."""
 
     again: bool
     at_setup: Mapping[str, Any]
@@ -65,7 +65,7 @@ def held_by(record: FiringRecord) -> Iterator[Held]:
 
 
 def taken_by(record: FiringRecord) -> Taken | None:
-    """Where a `cut` record takes an operator up; None where no calls were left out."""
+    """Returns where a `cut` record takes an operator up; None where no calls were left out."""
     detail = record.detail
     if "left_out" not in detail:
         return None

@@ -147,6 +147,9 @@ def encode_single(record: FiringRecord) -> bytes:
     key = record.operator, record.incarnation, tuple(record.inputs), tuple(streams)
     about = _about.get(key) or _describe(*key)
     stamp = record.stamp
+    outputs: list[tuple[int, int, bytes] | None] = []
+    for made in record.outputs:
+        outputs.append(None if made is None else (made.seq, made.stamp - stamp, made.digest))
     row = (
         _KIND_NUMBER[record.kind],
         stamp,
@@ -154,7 +157,7 @@ def encode_single(record: FiringRecord) -> bytes:
         refs,
         (),
         (),
-        [None if e is None else (e.seq, e.stamp - stamp, e.digest) for e in record.outputs],
+        outputs,
         0 if record.outcome == "ok" else 1,
         (),
         _NO_DETAIL,

@@ -45,9 +45,7 @@ def candidates(near: Sequence[Keyframe], others: Sequence[Keyframe], count: int,
     return [*near, *(rest[(turn * take + i) % len(rest)] for i in range(take))]
 
 
-def rough_points(
-    keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera
-) -> tuple[Points, NDArray[np.bool_]]:
+def rough_points(keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
     """Returns points (N, 3) of described pixels, and which are known: many lie on edges, where either depth may do."""
     surface = keyframe.surface
     inverse, (h, w) = surface.inverse_depth, surface.inverse_depth.shape

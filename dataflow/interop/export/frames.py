@@ -1,4 +1,4 @@
-"""What exports of datasets share: streams by type, messages as one type, and the files of frames."""
+"""Holds what exports of datasets share: streams by type, messages as one type, and the files of frames."""
 
 from __future__ import annotations
 

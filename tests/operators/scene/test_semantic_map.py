@@ -15,12 +15,16 @@ from dataflow.messages.geometry import yaw_of
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.box_overlap import upright_iou
-from operators.scene.cells import Cells, completed
+from operators.scene.cells import Cells
+from operators.scene.class_sizes import Usual
+from operators.scene.map_object import completed
 
 SECOND = 1_000_000_000
 CRATE: Solid = ((2.5, 0.5, 0.25), (0.5, 0.4, 0.5), 0.3, 0)
 OTHER: Solid = ((2.8, -0.8, 0.2), (0.4, 0.4, 0.4), 0.0, 0)
 AROUND = [((0.3 * np.sin(k), 0.9 * np.sin(0.7 * k), 1.0), 0.15 * np.sin(k)) for k in range(12)]
+
+BOOK = Usual((0.04, 0.17, 0.22), (0.3, 0.1, 0.1))
 
 View = tuple[Boxes3D, Clusters, PointCloud, Pose]
 
@@ -151,10 +155,10 @@ def test_two_plays_are_equal_and_a_restored_map_goes_on_the_same() -> None:
 def test_a_box_grows_away_from_the_viewer_by_what_is_usual() -> None:
     """The spine of a book in a shelf, seen along x: 4 cm wide, no depth."""
     seen = (np.array([2.0, 0, 1]), np.array([0.0, 0.04, 0.22]), 0.0)
-    center, size, _ = completed(seen, np.array([1.0, 0.0]), (0.04, 0.17))
+    center, size, _ = completed(seen, np.array([1.0, 0.0]), BOOK)
     np.testing.assert_allclose(size, [0.17, 0.04, 0.22])
     np.testing.assert_allclose(center, [2.085, 0, 1])
-    center, size, _ = completed(seen, np.array([0.0, 0.0]), (0.04, 0.17))
+    center, size, _ = completed(seen, np.array([0.0, 0.0]), BOOK)
     np.testing.assert_allclose(size, seen[1])
 
 
@@ -163,3 +167,42 @@ def test_voxels_that_are_seen_through_go() -> None:
     for _ in range(3):
         cells.carve(np.array([True, False]))
     assert cells.points.tolist() == [[1, 0, 0]]
+
+
+def with_images(solids: Sequence[Solid], count: int = 10) -> list[tuple[Any, ...]]:
+    """Views with the boxes of the image: arguments of `SemanticMap.process`."""
+    lifter = ObjectLifter()
+    lifter.setup()
+    made = []
+    for k in range(count):
+        position, yaw = AROUND[k % len(AROUND)]
+        pose = camera((k + 1) * SECOND // 5, position, yaw)
+        cloud, detections, masks = look(pose, solids, noise=0.004)
+        found = lifter.process(detections, cloud, INFO, segmentation=masks, pose=pose)
+        made.append((found["boxes"], found["clusters"], cloud, pose, None, found["images"], INFO))
+    return made
+
+
+def test_boxes_of_the_image_keep_neighbours_apart_and_a_restored_map_goes_on_the_same() -> None:
+    """Two crates that nearly touch, seen from the front: voxels alone cannot tell where one ends."""
+    pair: list[Solid] = [((2.5, y, 0.15), (0.3, 0.2, 0.3), 0.0, 0) for y in (0.0, 0.22)]
+    given = with_images(pair)
+    whole, restored = SemanticMap(), SemanticMap()
+    for operator in (whole, restored):
+        operator.setup()
+    outputs = [whole.process(*view) for view in given[:5]]
+    restored.restore(whole.snapshot())
+    for view in given[5:]:
+        outputs.append(whole.process(*view))
+        assert restored.process(*view)["objects"] == outputs[-1]["objects"]
+    message = outputs[-1]["objects"]
+    assert len(ids(message)) == 2
+    assert min(best_iou(message, solid) for solid in pair) > 0.5
+
+
+def test_images_of_another_camera_are_refused() -> None:
+    (view,) = with_images([CRATE], 1)
+    operator = SemanticMap()
+    operator.setup()
+    with pytest.raises(ValueError, match="images are of 320x240 pixels in 'camera', but image_info describes 320x240"):
+        operator.process(*view[:6], INFO.replace(frame="other"))
