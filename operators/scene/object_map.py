@@ -111,7 +111,7 @@ class ObjectMap:
         ranked = np.sort(ranges)
         counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
         first = ranked[int(np.argmax(counts))]
-        return each.points[(ranges >= first) & (ranges <= first + deep)]
+        return np.asarray(each.points[(ranges >= first) & (ranges <= first + deep)])
 
     def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
