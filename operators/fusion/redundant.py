@@ -47,10 +47,5 @@ class RedundantSensors(Generic[M]):
         return self.agreement.status(stamp, self.ignored)
 
     def summary(self) -> dict[str, float | int | str]:
-<<<<<<< HEAD
         figures: dict[str, float | int | str] = {"two sensors contradicted each other": self.agreement.split}
         return figures | {f"ignored, {reason}": count for reason, count in sorted(self.ignored.items())}
-=======
-        ignored = {f"ignored, {reason}": count for reason, count in sorted(self.ignored.items())}
-        return {"two sensors contradicted each other": self.agreement.split, **ignored}
->>>>>>> main
