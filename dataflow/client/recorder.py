@@ -36,8 +36,7 @@ FLUSH_EVERY = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Splitting:
-    """Limits of one file, after which a recording goes on in the next: after so many bytes, or so much event time (ns);
-    None: never."""
+    """Limits of one file: bytes, or event time (ns), after which a recording goes on in the next; None: no limit."""
 
     size: int | None = None
     every: int | None = None
