@@ -14,7 +14,7 @@ import os
 import struct
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from mcap.data_stream import RecordBuilder
@@ -50,6 +50,25 @@ def record_bytes(record: McapRecord) -> bytes:
     return bytes(builder.end())  # type: ignore[no-untyped-call]
 
 
+def _joined(records: Iterable[McapRecord]) -> bytes:
+    return b"".join(map(record_bytes, records))
+
+
+class _ChunkIndexes:
+    """Keeps the chunks' index records as they will lie in the file: a run of days has hundreds of thousands."""
+
+    def __init__(self) -> None:
+        self.records = bytearray()
+        self.count = 0
+        self.content_bytes = 0
+
+    def add(self, indexes: Iterable[ChunkIndex]) -> None:
+        for index in indexes:
+            self.records += record_bytes(index)
+            self.count += 1
+            self.content_bytes += index.uncompressed_size
+
+
 class ContainerWriter:
     """Writes one MCAP file. Not thread-safe.
 
@@ -74,7 +93,7 @@ class ContainerWriter:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._counts: dict[int, int] = {}
-        self._chunks: list[ChunkIndex] = []
+        self._chunks = _ChunkIndexes()
         self._metadata: list[MetadataIndex] = []
         self._records: Gathered | None = None
         self._messages: Gathered | None = None
@@ -192,7 +211,7 @@ class ContainerWriter:
             indexes.append(index)
             position += index.chunk_length + index.message_index_length
         self._append(*parts)
-        self._chunks += indexes
+        self._chunks.add(indexes)
         for chunk in gathered:
             self.first_time = chunk.first if self.first_time is None else min(self.first_time, chunk.first)
             self.last_time = max(self.last_time, chunk.last)
@@ -251,18 +270,17 @@ class ContainerWriter:
         self._position += written
 
     def _fail(self, error: OSError) -> None:
-        saved = sum(c.uncompressed_size for c in self._chunks)
         cut = "it ends with its last whole chunk"
         try:
             os.ftruncate(self._fd, self._position)
             os.lseek(self._fd, self._position, os.SEEK_SET)
         except OSError as second:
             cut = f"its torn end could not be cut off ({second.strerror}), readers skip it"
-        until = f", stamps up to {self.last_time}" if self._chunks else ""
+        until = f", stamps up to {self.last_time}" if self._chunks.count else ""
         self._failure = (
             f"writing {self.path} failed: {error.strerror or error}. Saved: {self._position} bytes on disk, "
-            f"{len(self._chunks)} chunks ({saved} bytes of messages{until}); the file is readable, {cut}. "
-            f"The {self._unsaved()} messages since then are lost. "
+            f"{self._chunks.count} chunks ({self._chunks.content_bytes} bytes of messages{until}); "
+            f"the file is readable, {cut}. The {self._unsaved()} messages since then are lost. "
             "Free some space or record to another disk."
         )
         raise RecordingError(self._failure) from error
@@ -271,19 +289,18 @@ class ContainerWriter:
         """Data end, summary, footer and magic, as they follow at the current position."""
         data_end = record_bytes(DataEnd(data_section_crc=0))
         summary_start = self._position + len(data_end)
-        groups: list[tuple[int, list[McapRecord]]] = [
-            (Opcode.SCHEMA, list(self._schemas)),
-            (Opcode.CHANNEL, list(self._channels)),
-            (Opcode.STATISTICS, [self._statistics()]),
-            (Opcode.CHUNK_INDEX, list(self._chunks)),
-            (Opcode.METADATA_INDEX, list(self._metadata)),
+        groups: list[tuple[int, bytes | bytearray]] = [
+            (Opcode.SCHEMA, _joined(self._schemas)),
+            (Opcode.CHANNEL, _joined(self._channels)),
+            (Opcode.STATISTICS, _joined([self._statistics()])),
+            (Opcode.CHUNK_INDEX, self._chunks.records),
+            (Opcode.METADATA_INDEX, _joined(self._metadata)),
         ]
         summary = bytearray()
         offsets = bytearray()
         for opcode, records in groups:
             start = len(summary)
-            for record in records:
-                summary += record_bytes(record)
+            summary += records
             if records:
                 offset = SummaryOffset(
                     group_opcode=opcode, group_start=summary_start + start, group_length=len(summary) - start
@@ -301,7 +318,7 @@ class ContainerWriter:
             attachment_count=0,
             channel_count=len(self._channels),
             channel_message_counts={c: n for c, n in self._counts.items() if n},
-            chunk_count=len(self._chunks),
+            chunk_count=self._chunks.count,
             message_count=sum(self._counts.values()),
             message_end_time=self.last_time,
             message_start_time=self.first_time or 0,

@@ -7,7 +7,7 @@ Verification, the completion of thin recordings and replays that begin in the mi
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from dataflow.feeds.log import LogFeed
@@ -53,15 +53,24 @@ class Unwatched:
 
 @dataclass(frozen=True, slots=True)
 class Feeding:
-    """Holds what is re-executed and what is read: operators in graph order, and the recorded streams that feed them."""
+    """Holds what is re-executed and what is read: operators in graph order, the recorded streams that feed them, and
+    those that are read besides and feed nobody."""
 
     operators: tuple[str, ...]
     streams: tuple[str, ...]
+    besides: tuple[str, ...] = ()
+
+    def reading(self, streams: Collection[str]) -> Feeding:
+        """The same, with `streams` read too."""
+        return replace(self, besides=tuple(sorted(set(streams).difference(self.streams))))
 
 
-def plan_feeding(recording: Recording, graph: Graph, operators: Collection[str]) -> Feeding:
+def plan_feeding(
+    recording: Recording, graph: Graph, operators: Collection[str], *, incomplete: Collection[str] = ()
+) -> Feeding:
     """Feeds operators from the recording wherever it holds what they take; else what makes it runs too.
 
+    `incomplete` streams are recorded, but lack messages that the recorded firings were given: they are made again.
     Raises `ReplayError` when a stream of a source or an external operator is needed and was not recorded.
     """
     chosen, streams = set(operators), set[str]()
@@ -70,7 +79,7 @@ def plan_feeding(recording: Recording, graph: Graph, operators: Collection[str])
         node = graph.nodes[left.pop()]
         for stream in {s for taken in node.inputs.values() for s in taken}:
             maker = graph.nodes[graph.streams[stream].node]
-            if stream in recording.streams:
+            if stream in recording.streams and stream not in incomplete:
                 check_type(recording, graph, stream)
                 streams.add(stream)
             elif maker.source or maker.external:
@@ -132,13 +141,14 @@ class Recomputation:
         for runner in self.runners.values():
             for stream in _streams_into(runner.node):
                 consumers.setdefault(stream, []).append(runner)
-        makers = {stream: graph.streams[stream].node for stream in feeding.streams}
+        reads = sorted({*feeding.streams, *feeding.besides})
+        makers = {stream: graph.streams[stream].node for stream in reads}
         self._feed = LogFeed(
             recording,
             makers,
-            _Outlet(consumers, self._ready, frozenset(), read or _nowhere, None),
+            _Outlet(consumers, self._ready, frozenset(feeding.besides), read or _nowhere, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
-            finals=final_stamps(recording, feeding.streams),
+            finals=final_stamps(recording, reads),
             start=None if begin is None else _first_stamp(log, graph, self.runners.values()),
             end=end,
         )

@@ -7,7 +7,7 @@ its run did (its writer was killed, the run failed), that is a *cut*: what lies 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 from dataflow.graph.model import Graph
@@ -87,6 +87,32 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
     accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome")
     return Ledger(accounts, not recording.torn and outcome == COMPLETE, recording.torn)
+
+
+def incomplete_streams(recording: Recording, graph: Graph, log: FiringLog, nodes: Iterable[str]) -> frozenset[str]:
+    """The recorded streams of operators among `nodes` that lack messages their firing records tell of.
+
+    A record is stored before its message, so a process that is killed leaves records of messages that went no further
+    than to its own operators. What took them can be repeated all the same: the records tell how to make them again.
+    """
+    incomplete: set[str] = set()
+    for node in (graph.nodes[name] for name in nodes):
+        if node.source or node.external:
+            continue
+        told = Counter(
+            stream
+            for record in log.of(node.name)
+            for stream, emission in zip(node.outputs.values(), record.outputs, strict=False)  # a failed call has none
+            if emission is not None and emission.seq != WITHHELD
+        )
+        incomplete.update(
+            stream
+            for stream, count in told.items()
+            if stream in recording.streams
+            and not graph.streams[stream].static
+            and count > sum(recording.counts(stream).values())
+        )
+    return frozenset(incomplete)
 
 
 def _account(

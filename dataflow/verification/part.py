@@ -22,13 +22,15 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     """Re-executes the operators of one part. Runs in a worker.
 
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
-    `records` and `batches` (see `letters.shared_records`), `begin` (stamp, or None), `tolerance`.
+    `incomplete` (recorded streams to be made again), `records` and `batches` (see `letters.shared_records`), `begin`
+    (stamp, or None), `tolerance`.
     The answer: `operators` (verifications), `comparisons`, `stored`, `digests` by stream, `work` by
     operator (see `OperatorCounts`), `wall` in seconds.
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"]) as recording:
-        feeding = _with(plan_feeding(recording, graph, request["operators"]), request["checks"])
+        feeding = plan_feeding(recording, graph, request["operators"], incomplete=request["incomplete"])
+        feeding = feeding.reading(request["checks"])
         log = _records(request, graph, feeding)
         comparer = Comparer(recording, graph, log, feeding.operators, request["tolerance"])
         checks = _checks(recording, graph, log, request)
@@ -72,7 +74,7 @@ def repeat_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"]) as recording:
-        feeding = plan_feeding(recording, graph, request["operators"])
+        feeding = plan_feeding(recording, graph, request["operators"], incomplete=request["incomplete"])
         log = _records(request, graph, feeding)
         work = Recomputation(recording, graph, feeding, log, made=_let_go, begin=request["begin"], watcher=board)
         results = work.results()
@@ -81,14 +83,10 @@ def repeat_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     return {v.operator: None if v.first is None else [v.first.incarnation, v.first.index, v.first.got] for v in asked}
 
 
-def _with(feeding: Feeding, checks: list[str]) -> Feeding:
-    return Feeding(feeding.operators, tuple(sorted({*feeding.streams, *checks})))
-
-
 def _records(request: Mapping[str, Any], graph: Graph, feeding: Feeding) -> FiringLog:
     """The firing records of the operators, and of those that made what they take."""
     taken = {s for name in feeding.operators for given in graph.nodes[name].inputs.values() for s in given}
-    makers = {graph.streams[stream].node for stream in taken.union(feeding.streams)}
+    makers = {graph.streams[stream].node for stream in taken.union(feeding.streams, feeding.besides)}
     return inherited_records(request["records"], request["batches"], makers.union(feeding.operators), request["path"])
 
 

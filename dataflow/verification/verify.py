@@ -24,7 +24,7 @@ from dataflow.supervision.report import OperatorCounts
 from dataflow.supervision.run import Watch
 from dataflow.verification import part, partition
 from dataflow.verification.compare import OutputComparison
-from dataflow.verification.ledger import COMPLETE, Ledger, read_ledger
+from dataflow.verification.ledger import COMPLETE, Ledger, incomplete_streams, read_ledger
 from dataflow.verification.letters import shared_records
 from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
@@ -42,6 +42,7 @@ class _Task:
     operators: tuple[str, ...]
     stood_in: tuple[str, ...]
     stand_ins: tuple[str, ...]
+    incomplete: frozenset[str]
     parts: tuple[partition.Part, ...]
     unchecked: tuple[str, ...]
     facts: tuple[tuple[str, str, str], ...]
@@ -66,8 +67,8 @@ def verify(
     """Re-executes a recording by its firing records and compares.
 
     `first`: verify that operator and what follows from it; `only`: that one alone. Every operator is fed from the
-    recording; where its inputs were not recorded, those that made them run with it. Operators marked `external` are
-    always taken from it. Stored messages are compared with the digests in the firing records, too.
+    recording; where its inputs were not recorded, or not wholly, those that made them run with it. Operators marked
+    `external` are always taken from it. Stored messages are compared with the digests in the firing records, too.
     `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, to see whether they
     differ alike.
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
@@ -92,6 +93,7 @@ def verify(
             "records": descriptor,
             "batches": batches,
             "begin": task.begin,
+            "incomplete": sorted(task.incomplete),
             "tolerance": tolerance,
         }
         calls = [
@@ -113,19 +115,22 @@ def _prepare(
 ) -> _Task:
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
-        chosen = _with_makers(recording, played, _chosen(played, first, only))
-        operators = tuple(name for name in played.nodes if name in chosen)
         log = FiringLog.read(recording)
+        told = [n for n in played.nodes if _accountable(recording, played, log, n)]
+        incomplete = incomplete_streams(recording, played, log, told)
+        held = recording.streams.keys() - incomplete
+        chosen = _with_makers(held, played, _chosen(played, first, only))
+        operators = tuple(name for name in played.nodes if name in chosen)
         require_records(recording, log, operators)
         require_ports(recording, played, log, operators)
-        plan_feeding(recording, played, operators)
+        plan_feeding(recording, played, operators, incomplete=incomplete)
         feeding = {
             played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
         } - chosen
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and _accountable(recording, played, log, n)]
         checks, unchecked = _checks(recording, played, log, [*operators, *stand_ins])
-        groups = partition.units(played, recording.streams, operators)
+        groups = partition.units(played, held, operators)
         work = {n: sum(r.duration + partition.PER_FIRING_NS for r in log.of(n)) for n in operators}
         jobs = jobs or partition.jobs_for(work, len(os.sched_getaffinity(0)))
         begin, last = _span(recording, start)
@@ -137,6 +142,7 @@ def _prepare(
             operators=operators,
             stood_in=tuple(name for name in played.nodes if name in feeding),
             stand_ins=tuple(stand_ins),
+            incomplete=incomplete,
             parts=tuple(partition.with_checks(played, partition.balanced(groups, work, jobs), checks)),
             unchecked=unchecked,
             facts=_differing_facts(recording.metadata, played),
@@ -338,13 +344,13 @@ def _chosen(graph: Graph, first: str | None, only: str | None) -> set[str]:
     return following & able
 
 
-def _with_makers(recording: Recording, graph: Graph, chosen: set[str]) -> set[str]:
-    """The operators with those that make what they take, as far as it was not recorded."""
+def _with_makers(held: Collection[str], graph: Graph, chosen: set[str]) -> set[str]:
+    """The operators with those that make what they take, as far as it is not held in the recording."""
     wanted, left = set(chosen), list(chosen)
     while left:
         for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
             maker = graph.nodes[graph.streams[stream].node]
-            if stream not in recording.streams and not (maker.source or maker.external or maker.name in wanted):
+            if stream not in held and not (maker.source or maker.external or maker.name in wanted):
                 wanted.add(maker.name)
                 left.append(maker.name)
     return wanted

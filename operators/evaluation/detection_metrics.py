@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from sys import intern
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,8 @@ def _view(message: Detections2D) -> tuple[str, int, int]:
 
 def _objects(message: Detections2D, ignored: NDArray[np.bool_]) -> _Objects:
     size = np.array([message.width, message.height], np.float64)
-    return _Objects(size, message.boxes.astype(np.float64), message.labels(), message.scores, ignored)
+    labels = tuple(map(intern, message.labels()))  # each message brings strings of its own, and all frames are kept
+    return _Objects(size, message.boxes.astype(np.float64), labels, message.scores.copy(), ignored)
 
 
 def _scored(found: _Objects, truth: _Objects) -> ScoredFrame:

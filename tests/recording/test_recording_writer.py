@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import errno
+import gc
 import os
 import resource
 import signal
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -334,3 +336,25 @@ def test_close_is_idempotent_and_ends_writing(tmp_path: Path, pose: Callable[...
     writer.close()
     with pytest.raises(RecordingError, match="closed"):
         writer.write("a", pose(1), seq=0)
+
+
+def test_the_index_of_a_long_run_takes_no_more_memory_than_its_bytes(tmp_path: Path, pose: Callable[..., Pose]) -> None:
+    streams = [f"s/{i}" for i in range(20)]
+
+    def chunks(writer: RecordingWriter, first: int, count: int) -> None:
+        for seq in range(first, first + count):
+            for stream in streams:
+                writer.write(stream, pose(1000 + seq), seq=seq)
+            writer.flush()
+
+    with RecordingWriter(tmp_path / "long.mcap", metadata={}) as writer:
+        for stream in streams:
+            writer.add_stream(stream, Pose)
+        chunks(writer, 0, 10)
+        tracemalloc.start()
+        before, _ = tracemalloc.get_traced_memory()
+        chunks(writer, 10, 200)
+        gc.collect()
+        after, _ = tracemalloc.get_traced_memory()
+        tracemalloc.stop()
+    assert (after - before) / 200 < 2 * (len(streams) * 10 + 100)  # an entry of the index: 10 bytes a channel, and more

@@ -141,14 +141,14 @@ def test_a_hole_before_the_cut_is_no_cut(recorded: Path, tmp_path: Path) -> None
         recorded,
         tmp_path / "hole.mcap",
         records=lambda r: r.kind != "finish",
-        stored=lambda stream, seq: stream != "test/mix/mixed" or seq != 15,
+        stored=lambda stream, seq: stream != "test/left/fast" or seq != 15,
         outcome="failed: on fire",
     )
 
-    smooth = of(verify(hole, only="smooth"), "smooth")
+    mix = of(verify(hole, only="mix"), "mix")
 
-    assert smooth.verdict == "unverifiable"
-    assert smooth.missing == "test/mix/mixed #15"
+    assert mix.verdict == "unverifiable"
+    assert mix.missing == "test/left/fast #15"
 
 
 def test_made_messages_that_the_recording_lacks_are_counted(recorded: Path, tmp_path: Path) -> None:

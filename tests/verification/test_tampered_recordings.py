@@ -104,6 +104,21 @@ def test_a_source_message_that_nobody_misses_is_noted_all_the_same(kept: Path, t
     assert (stream.stream, stream.first_missing) == ("kept/robot/odometry", (0, 74))
 
 
+@pytest.mark.parametrize("lost", [range(20, 24), range(70, 10**6)], ids=["middle", "last"])
+def test_messages_that_another_operator_took_and_that_are_not_stored_are_made_again(
+    kept: Path, tmp_path: Path, lost: range
+) -> None:
+    def drop(found: Recorded) -> Kept:
+        return [] if found.stream == "kept/look/seen" and found.seq in lost else as_it_is(found)
+
+    one = checked(tampered(kept, tmp_path / "t.mcap", messages=drop))
+
+    assert one.report is not None
+    found = {v.operator: v for v in one.report.operators}
+    assert found["look"].not_stored == len(range(lost.start, min(lost.stop, found["look"].outputs)))
+    assert all(v.verdict == "identical" and v.verified == v.firings for v in found.values()), one.as_json()
+
+
 def without(operator: str, first: int, last: int) -> Callable[[FiringRecord], bool]:
     return lambda record: record.operator != operator or not first <= record.index <= last
 
