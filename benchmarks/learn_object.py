@@ -11,8 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -35,6 +33,7 @@ from operators.sources.simulator.scene import Thing, World
 from operators.sources.simulator.shapes import Array, Material, Shape, at, box, ellipsoid, lathe, pose
 from operators.sources.simulator.truth import detections
 from operators.sources.simulator.worlds import make_world
+from operators.training.learning import learn as command
 
 OPTICS = Optics(640, 480, 544.0, 544.0, 319.5, 239.5)
 LEARNED, HELD_OUT = 71_000, 72_000
@@ -241,8 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for name in options.objects:
         learn, held_out = written(options.folder, name, options.views)
         out = options.folder / f"{name}.object.npz"
-        command = [sys.executable, "-m", "dataflow.cli.main", "learn", "object", name, str(learn), "--out", str(out)]
-        subprocess.run([*command, "--overwrite"], check=True, stdout=subprocess.DEVNULL)
+        command(["object", name, str(learn), "--out", str(out), "--overwrite"], standalone_mode=False)
         _, before = judged(held_out, started(CustomDetector(score_threshold=0.01)), name)
         new, after = judged(held_out, started(LearnedDetector(objects=[str(out)], score_threshold=0.01)), name)
         told = {k: round(v, 3) for k, v in new.items() if v is not None}

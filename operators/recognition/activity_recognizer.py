@@ -151,7 +151,7 @@ def _mattering(nodes: SceneGraph) -> tuple[list[Body], int]:
     labels = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
     rows = [k for k, label in enumerate(labels) if label in MATTERING and nodes.ids[k] > 0]
     finite = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
-    usable = finite & (nodes.sizes >= 0).all(axis=1)
+    usable = np.asarray(finite & (nodes.sizes >= 0).all(axis=1), bool)
     yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
     still = np.zeros(3)
     bodies = [

@@ -35,6 +35,30 @@ _UNSEEN = 0.15  # how much a moment out of sight counts
 _LEAST = 0.35
 
 
+_STILL = [ACTIVITIES.index(name) for name in ("standing", "sitting", "resting")]
+_SPEED = NAMES.index("speed, short")
+_MOVING = [
+    NAMES.index(name)
+    for name in (
+        *("speed, short", "speed, long", "rise, short", "rise, long", "way gone", "growth of the longer side"),
+        *("seat: closing", "seat: speed along", "table: closing", "drink: closing", "drink: speed"),
+    )
+]
+_SIDES = [NAMES.index("longer side"), NAMES.index("shorter side")]
+_GROWN = [NAMES.index("longer side over its least"), NAMES.index("shorter side over its least")]
+
+
+def _columns(group: str) -> tuple[list[int], NDArray[np.float32]]:
+    """Returns the features of what stands around, and what they are where there is nothing of the kind."""
+    columns = [k for k, name in enumerate(NAMES) if name.startswith(group)]
+    far = {"seat: away", "table: gap", "drink: gap", "drink: second gap"}
+    return columns, np.array([float(NAMES[k] in far) for k in columns], np.float32)
+
+
+_AROUND = [_columns(group) for group in ("seat", "table", "drink")]
+_AROUND.append(([NAMES.index("distance of the robot")], np.array([0.5], np.float32)))
+
+
 class ActivityTask:
     """Trains an ActivityNetwork on episodes: each as it is, and `variations` times as a tracker would have it."""
 
@@ -130,9 +154,42 @@ class ActivityTask:
         """A part of a track of `steps` at most, from anywhere: tracks begin at any time."""
         features, labels, weights = self._training[k]
         begin = int(rng.integers(max(1, len(labels) - self.steps // 2)))
-        rows = slice(begin, begin + self.steps)
-        jitter = rng.normal(0, 0.01, features[rows].shape).astype(np.float32)
-        return features[rows] + jitter, labels[rows], weights[rows]
+        rows = np.arange(begin, min(begin + self.steps, len(labels)))
+        rows, held = lingered(features[rows], labels[rows], rng)
+        rows = rows + begin
+        return varied(features[rows], held, rng), labels[rows], weights[rows]
+
+
+def lingered(
+    features: NDArray[np.float32], labels: NDArray[np.int64], rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Returns the rows of a track (T, F) with a pause at a still moment, at times, and which rows the pause added.
+
+    Simulated people never stand for long; others do.
+    """
+    rows = np.arange(len(labels))
+    still = np.flatnonzero(np.isin(labels, _STILL) & (features[:, _SPEED] < 0.15))
+    if not len(still) or rng.uniform() < 0.4:
+        return rows, np.zeros(len(rows), bool)
+    at, count = int(rng.choice(still)), int(rng.integers(3, 25))
+    held = np.zeros(len(rows) + count, bool)
+    held[at + 1 : at + 1 + count] = True
+    return np.concatenate([rows[: at + 1], np.full(count, at), rows[at + 1 :]]), held
+
+
+def varied(features: NDArray[np.float32], held: NDArray[np.bool_], rng: np.random.Generator) -> NDArray[np.float32]:
+    """Returns a part of a track as of somebody of other extents, at times without what stands around.
+
+    What tells an activity must not hang on a single group of features. Nothing moves in rows that are `held`.
+    """
+    found = features + rng.normal(0, 0.01, features.shape).astype(np.float32)
+    found[np.ix_(held, _MOVING)] = rng.normal(0, 0.01, (int(held.sum()), len(_MOVING)))
+    found[:, _SIDES] += rng.normal(0, 0.08, len(_SIDES)).astype(np.float32)
+    found[:, _GROWN] += np.abs(rng.normal(0, 0.05, len(_GROWN))).astype(np.float32)
+    for columns, nothing in _AROUND:
+        if rng.uniform() < 0.25:
+            found[:, columns] = nothing
+    return found
 
 
 def drawn(episode: Episode, rng: np.random.Generator, variations: int) -> list[Track]:

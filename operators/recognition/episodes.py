@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ class Episode:
     goals: NDArray[np.int64]
 
     def write(self, file: Path) -> None:
-        np.savez_compressed(file, **{k: np.asarray(v) for k, v in vars(self).items()})
+        arrays: dict[str, Any] = {name: np.asarray(value) for name, value in vars(self).items()}
+        np.savez_compressed(file, **arrays)
 
     @classmethod
     def read(cls, file: Path) -> Episode:

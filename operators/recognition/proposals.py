@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,24 +81,16 @@ def inner_maps(file: Path, strides: Sequence[int] = (4, 8, 16)) -> tuple[str, ..
 
     own = [int(s) for s in open_network(file, "detector").facts.get("strides", [])]
     model = onnx.load(str(file))
-    maker = {output: node for node in model.graph.node for output in node.output}
     names = []
     for stride in strides:
         if stride not in own:
             continue
         lateral = [n for n in model.graph.node if n.op_type == "Conv" and f"/lateral.{own.index(stride)}/" in n.name]
         if lateral:
-            names.append(_unquantized(lateral[0].input[0], maker))
+            names.append(lateral[0].input[0])
     if not names:
         raise NetworkFileError(f"{file} has no feature pyramid; take a network of `dataflow train detector` or `pair`")
     return tuple(names)
-
-
-def _unquantized(name: str, maker: dict[str, Any]) -> str:
-    """The value before it was rounded to 8 bits."""
-    while name in maker and maker[name].op_type in ("DequantizeLinear", "QuantizeLinear"):
-        name = maker[name].input[0]
-    return name
 
 
 def _pooled(map: F32, boxes: F32, size: tuple[int, int]) -> F32:

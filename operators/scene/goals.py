@@ -25,14 +25,15 @@ NAMES = (
     *(f"is a {kind}" for kind in KINDS),
     "is nowhere",
     *("away", "away at the stop", "farther than the nearest", "farther at the stop than the nearest"),
-    *("ahead at the stop", "to the right at the stop", "aside at the stop"),
-    *("closing", "cosine of the way", "speed", "brought nearer", "share of the way that was straight"),
+    *("ahead", "to the right", "aside", "ahead at the stop", "to the right at the stop", "aside at the stop"),
+    *("closing", "cosine of the way", "speed", "speed now", "brought nearer", "share of the way that was straight"),
     *("away from the last halt", "walked", "time since the halt", "candidates in reach"),
     *("height", "height of what carries it", "gap to the other furniture"),
 )
 COUNT = len(NAMES)
-_NOW = 0.6  # seconds over which the velocity is taken
-_BRAKING = 0.35  # seconds after which somebody who slows down stands
+_SPEEDS = [NAMES.index("speed"), NAMES.index("speed now")]
+_MEAN, _NOW = 0.6, 0.3  # seconds over which velocities are taken
+_BRAKING = 0.25  # seconds after which somebody who slows down stands
 _HALTED = 0.2  # m/s
 _FAR = 4.0
 REACH = 5.0  # metres up to which something is a candidate
@@ -150,7 +151,7 @@ class GoalPath:
             since = time - self._past[-1][0]
             step = math.hypot(x - self._past[-1][1], y - self._past[-1][2])
         self._past.append((time, x, y))
-        while len(self._past) > 2 and self._past[0][0] < time - _NOW - 1e-6:
+        while len(self._past) > 2 and self._past[0][0] < time - _MEAN - 1e-6:
             self._past.popleft()
         if self._speed() > _HALTED:
             self._moved = time
@@ -163,13 +164,14 @@ class GoalPath:
         """Returns (N + 1, COUNT), the last row for nowhere."""
         assert self._halt is not None
         time, x, y = self._past[-1]
-        vx, vy = self._velocity()
-        speed = math.hypot(vx, vy)
-        here, stop = np.array([x, y]), np.array([x + _BRAKING * vx, y + _BRAKING * vy])
+        vx, vy = self._velocity(_MEAN)
+        ux, uy = self._velocity(_NOW)
+        speed, now = math.hypot(vx, vy), math.hypot(ux, uy)
+        here, stop = np.array([x, y]), np.array([x + _BRAKING * ux, y + _BRAKING * uy])
         away, at_stop = (np.hypot(*(places.middles - p).T) for p in (here, stop))
         halt_time, halt = self._halt[0], np.array(self._halt[1:])
         from_halt = np.hypot(*(places.middles - halt).T)
-        ahead, right = places.before(stop)
+        before, before_stop = places.before(here), places.before(stop)
         toward = (places.middles - here) @ np.array([vx, vy]) / np.maximum(away, 0.1)
         near, near_stop = float(away.min(initial=_FAR)), float(at_stop.min(initial=_FAR))
         common = [min(self._walked, 5.0), min(time - halt_time, 8.0) / 8, float((at_stop < 1.0).sum()) / 4]
@@ -177,15 +179,16 @@ class GoalPath:
         rows[:-1, : len(KINDS)] = places.kinds
         rows[:-1, len(KINDS) + 1 : -6] = np.stack(
             [
-                away, at_stop, away - near, at_stop - near_stop, ahead, right, np.abs(right),
-                toward, toward / max(speed, 0.15), np.full(len(away), speed), from_halt - away,
-                (from_halt - away) / max(self._walked, 0.3), from_halt,
+                away, at_stop, away - near, at_stop - near_stop,
+                *before, np.abs(before[1]), *before_stop, np.abs(before_stop[1]),
+                toward, toward / max(speed, 0.15), np.full(len(away), speed), np.full(len(away), now),
+                from_halt - away, (from_halt - away) / max(self._walked, 0.3), from_halt,
             ],
             axis=1,
         )  # fmt: skip
         rows[:-1, -3:] = places.shape
         rows[-1, len(KINDS) : len(KINDS) + 3] = 1.0, near, near_stop
-        rows[-1, NAMES.index("speed")] = speed
+        rows[-1, _SPEEDS] = speed, now
         rows[:, -6:-3] = common
         return np.clip(rows, -_FAR, _FAR)
 
@@ -201,11 +204,12 @@ class GoalPath:
         self._walked = float(state["walked"])
         self._moved = -math.inf if state["moved"] is None else float(state["moved"])
 
-    def _velocity(self) -> tuple[float, float]:
-        """Returns the velocity of late, m/s: the newest half of the window tells most of one who slows down."""
+    def _velocity(self, seconds: float) -> tuple[float, float]:
+        """Returns the velocity, m/s, over the last seconds, by least squares over two places at least."""
         rows = np.array(self._past)
         if len(rows) < 2:
             return 0.0, 0.0
+        rows = rows[min(int(np.searchsorted(rows[:, 0], rows[-1, 0] - seconds - 1e-6)), len(rows) - 2) :]
         t = rows[:, 0] - rows[:, 0].mean()
         weight = float(t @ t)
         if weight < 1e-6:
@@ -214,7 +218,7 @@ class GoalPath:
         return vx, vy
 
     def _speed(self) -> float:
-        return math.hypot(*self._velocity())
+        return math.hypot(*self._velocity(_NOW))
 
 
 def _carrier(body: Body, furniture: Sequence[Body]) -> Body:

@@ -82,7 +82,8 @@ def learn_object(
     counted = f"{escape(name)} from {learned.images} images of {len(images)}"
     out_console.print(f"[green]{file}[/green]: {counted}", highlight=False, soft_wrap=True)
     out_console.print(
-        f"use it: `use: operators.recognition:LearnedDetector` with `params: {{objects: [{file}]}}`",
+        f"use it: `use: operators.recognition:LearnedDetector` with `params: {{objects: [{out}]}}`",
         highlight=False,
+        markup=False,
         soft_wrap=True,
     )

@@ -131,7 +131,7 @@ def test_what_varies_everywhere_does_not_tell_an_object() -> None:
     rng = np.random.default_rng(0)
 
     def vectors(count: int, second: float) -> np.ndarray:
-        return np.stack([rng.normal(0, 5, count), rng.normal(second, 0.1, count)], axis=1).astype(np.float32)
+        return np.stack([rng.normal(0, 1, count), rng.normal(second, 0.1, count)], axis=1).astype(np.float32)
 
     shown = [Shown(vectors(8, 1.0), vectors(60, 0.0)) for _ in range(5)]
     found = learn("thing", shown, "", ())
