@@ -42,7 +42,7 @@ _HOMES = {
     "run": "dataflow.api.runs",
     "verify": "dataflow.api.runs",
 }
-"""Where each public name lives."""
+"""The module of each public name."""
 
 __all__ = [
     "Graph",

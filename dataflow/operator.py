@@ -78,7 +78,7 @@ class Operator:
 
     spec: ClassVar[OperatorSpec]
     stateless: ClassVar[bool] = False
-    """What `process()` gives depends on its inputs alone, so re-execution may begin anywhere."""
+    """The outputs of `process()` depend on its inputs alone, so re-execution may begin anywhere."""
     external: ClassVar[bool] = False
     """Touches the world (an actuator, a network service): always recorded, never re-executed."""
     __generator: np.random.Generator | None = None

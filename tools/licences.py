@@ -15,7 +15,7 @@ from pathlib import Path
 from packaging.requirements import Requirement
 
 REPOSITORY = Path(__file__).resolve().parents[1]
-PARTS = ("", "notebook", "sim", "torch", "train")
+PARTS = ("", "foxglove", "notebook", "sim", "torch", "train")
 """The dependencies that users install: those of the package itself, and its extras but `dev`."""
 COPYLEFT = re.compile(r"\bA?GPL|(?<!Lesser )(?<!Library )General Public License", re.IGNORECASE)
 
@@ -51,7 +51,7 @@ NOTES = {
     "torch": "the usual wheel for Linux asks for NVIDIA's CUDA packages, which are proprietary and not listed here",
 }
 NOT_LISTED = ("cuda-", "nvidia-")
-"""How the names of packages begin that only some platforms' wheels of torch ask for."""
+"""Prefixes of the packages that only some platforms' wheels of torch ask for."""
 
 PAGE = """\
 # Licences

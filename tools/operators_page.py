@@ -41,6 +41,8 @@ A parameter that `changes while running` can be set with `dataflow param set`.
 """
 
 _KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
+LONGEST = 90
+"""Characters of a default that stand in the table as they are."""
 
 
 def markdown(catalogue: Catalogue) -> str:
@@ -108,9 +110,18 @@ def _meaning(doc: str, notes: list[str]) -> str:
 
 def _parameter(row: Mapping[str, Any]) -> str:
     unit = f" {row['unit']}" if row["unit"] else ""
-    default = "must be given" if row["required"] else f"`{_cell(json.dumps(row['default'], ensure_ascii=False))}`{unit}"
+    default = "must be given" if row["required"] else f"`{_cell(_short(row['default']))}`{unit}"
     meaning = _meaning(row["doc"], parameter_notes(row))
     return f"| `{row['name']}` | `{_cell(row['type'])}` | {default} | {meaning} |"
+
+
+def _short(default: Any) -> str:
+    """A default as JSON; of one that would fill its column, the first entry: `dataflow operators NAME` prints all."""
+    text = json.dumps(default, ensure_ascii=False)
+    if len(text) <= LONGEST or not isinstance(default, dict):
+        return text
+    name, value = next(iter(default.items()))
+    return f"{{{json.dumps(name)}: {json.dumps(value, ensure_ascii=False)}, …}}"
 
 
 def _cell(text: str) -> str:

@@ -11,14 +11,15 @@ import sys
 import traceback
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from rich import box
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
-from rich.table import Table
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 DIFFERENT = 1
 """Exit code: it ran, and the answer is no (streams differ, the graph has faults, a run failed)."""
@@ -191,6 +192,9 @@ def _about_a_file(details: str) -> bool:
 
 def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:
     """A table in the house style; the columns in `right` hold numbers. Text wraps, numbers never do."""
+    from rich import box
+    from rich.table import Table
+
     made = Table(title=title, title_justify="left", title_style="bold", box=box.SIMPLE_HEAD, pad_edge=False)
     for column in columns:
         number = column in right

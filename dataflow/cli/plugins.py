@@ -10,15 +10,19 @@ from __future__ import annotations
 import traceback
 from collections.abc import Mapping
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 from rich.markup import escape
 from typer.core import TyperGroup
 
 from dataflow.cli.arguments import FLAG
+from dataflow.cli.commands import Commands
 from dataflow.cli.output import COULD_NOT_RUN, err, fail, say, wants_traceback
+from dataflow.cli.values import take_plainly
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 GROUP = "dataflow.commands"
 PANEL = "Commands of other packages"
@@ -28,6 +32,8 @@ BROKEN_PANEL = "Commands that do not load"
 @cache
 def advertised() -> Mapping[str, EntryPoint]:
     """The commands that installed packages supply, by name, in alphabetical order."""
+    from importlib.metadata import entry_points
+
     return {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value))}
 
 
@@ -48,10 +54,11 @@ class CommandGroup(TyperGroup):
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
+        self.commands = Commands()
         self._added: set[str] = set()
 
     def list_commands(self, ctx: Any) -> list[str]:
-        present = super().list_commands(ctx)
+        present = list(self.commands)
         return [*present, *(name for name in advertised() if name not in present)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -64,6 +71,11 @@ class CommandGroup(TyperGroup):
             tidy(present, ctx)
         return present
 
+    def get_params(self, ctx: Any) -> list[Any]:
+        for param in (params := super().get_params(ctx)):
+            take_plainly(param)
+        return params
+
     def format_help(self, ctx: Any, formatter: Any) -> None:
         tidy(self, ctx)
         super().format_help(ctx, formatter)
@@ -73,7 +85,7 @@ class CommandGroup(TyperGroup):
                 say(f"[yellow]{value} supplies a command {name!r}, which is built in; it is left out[/]")
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        if args and args[0] not in self.list_commands(ctx):
+        if args and self.get_command(ctx, args[0]) is None:
             for name in advertised():  # so that they are suggested too
                 self.get_command(ctx, name)
         return super().resolve_command(ctx, args)
@@ -83,7 +95,9 @@ def tidy(command: Any, ctx: Any) -> None:
     """Makes the help of a command and its subcommands alike: no type beside flags, no options to install completion."""
     command.params = [p for p in command.params if p.name not in ("install_completion", "show_completion")]
     own = type(ctx)(command, help_option_names=ctx.help_option_names)
-    for param in (*command.params, command.get_help_option(own)):
+    helping = command.get_help_option(own)
+    take_plainly(helping)
+    for param in (*command.params, helping):
         if getattr(param, "is_bool_flag", False) and param.metavar is None and not param.secondary_opts:
             param.metavar = FLAG
     for inner in getattr(command, "commands", {}).values():
@@ -111,7 +125,7 @@ def _command(entry: EntryPoint) -> Any:
         raise TypeError(f"{entry.value} is {type(value).__name__}; expected a typer.Typer or a function")
     command = typer.main.get_command(app)
     command.name = entry.name
-    if getattr(command, "rich_help_panel", None) is None:
+    if not getattr(command, "rich_help_panel", None):  # of a single command a placeholder that is no name
         command.rich_help_panel = PANEL  # type: ignore[attr-defined]
     return command
 

@@ -5,6 +5,7 @@ Nothing else is imported here, so that Ctrl-C and a closed output are met in ord
 
 from __future__ import annotations
 
+import gc
 import io
 import os
 import signal
@@ -13,6 +14,8 @@ from types import FrameType
 
 COULD_NOT_RUN = 2
 INTERRUPTED = 130
+COLLECT_AFTER = 20_000
+"""Objects made between two searches for garbage: modules make many that stay, and 700 would cost a tenth of a start."""
 
 
 class OutputFailed(OSError):
@@ -45,6 +48,7 @@ def main() -> None:
     if interrupted is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)  # while importing there is nothing to put in order
     _occupy_standard_streams()
+    gc.set_threshold(COLLECT_AFTER)
     from dataflow.cli.main import main as call
 
     signal.signal(signal.SIGINT, interrupted)

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 ANSWER_WITHIN = 1.0
 """Seconds after which a process counts as silent."""
 CONNECT_WITHIN = 3.0
+FIRST_AFTER = 0.1
+"""Seconds over which the first table's rates are taken."""
 
 
 def top(
@@ -73,24 +75,27 @@ def top(
         err.print(Text(f"{found.name} has ended"))
 
 
-def _samples(found: RunningGraph, processes: Processes, every: float, *, latencies: bool = True) -> Iterator[Sample]:
-    """Samples of a running graph, the first after `every` seconds, until it ends; one at least."""
+def _samples(
+    found: RunningGraph, processes: Processes, first: float, every: float, *, latencies: bool = True
+) -> Iterator[Sample]:
+    """Samples of a running graph, after `first` seconds, then every so many, until it ends; one at least."""
     from dataflow.cli.board import Board
     from dataflow.client.attach import graph_of, still_runs
 
     board = Board(graph_of(found))
     board.update(processes.statuses(ANSWER_WITHIN), time.monotonic())
+    time.sleep(first)
     while True:
-        time.sleep(every)
         yield board.update(processes.statuses(ANSWER_WITHIN, firings=latencies), time.monotonic())
         if not still_runs(found):
             return
+        time.sleep(every)
 
 
 def _print_one(found: RunningGraph, processes: Processes, every: float, *, json: bool) -> None:
     from dataflow.cli.board import as_json, shown
 
-    sample = next(_samples(found, processes, every))
+    sample = next(_samples(found, processes, every, every))
     if json:
         print_json({"graph": found.name, **as_json(sample)})
     else:
@@ -105,7 +110,7 @@ def _follow(found: RunningGraph, processes: Processes, every: float) -> None:
 
     last: Any = None
     with Live(console=out, auto_refresh=False, transient=True) as live:
-        for sample in _samples(found, processes, every):
+        for sample in _samples(found, processes, min(FIRST_AFTER, every), every):
             last = shown(sample, found)
             live.update(last, refresh=True)
     if last is not None:
@@ -118,7 +123,7 @@ def _print_lines(found: RunningGraph, processes: Processes, every: float) -> Non
 
     printed: Sequence[str] = ()
     behind: Mapping[str, str] = {}
-    for sample in _samples(found, processes, every, latencies=False):
+    for sample in _samples(found, processes, every, every, latencies=False):
         if not printed:
             out.print(Text(heading(sample)), soft_wrap=True)
         printed = [line(row, sample, time.time() - found.started) for row in sample.rows]

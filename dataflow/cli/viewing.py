@@ -1,15 +1,11 @@
-"""`dataflow view`, and the viewers that `run` and `replay` start."""
+"""`dataflow view`: a recording, or a graph that runs."""
 
 from __future__ import annotations
 
 import importlib
-import os
-import subprocess
-import sys
-import threading
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,15 +20,13 @@ from dataflow.cli.output import DIFFERENT, err, fail, friendly_errors, out, plur
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
+    from dataflow.messages import Message
     from dataflow.recording import Recording
-    from dataflow.view import ViewerSink
+    from dataflow.transport import RunningGraph, TapClient
+    from dataflow.view import Target, ViewerSink
 
-READY_WITHIN = 20.0
-"""Seconds that a run waits for its viewer's process to be ready before it starts."""
 LOOK_EVERY = 0.25
 """Seconds between two looks at the log of the graph that is followed."""
-DRAW_WITHIN = 15.0
-"""Seconds that a viewer gets to draw the rest when its run has ended."""
 
 
 def view(
@@ -80,11 +74,11 @@ def view(
         if recording is not None:
             if graph is not None or wait:
                 raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
-            _view_recording(existing(recording, "a recording"), _sink(to, overwrite), streams, start, end)
+            _view_recording(existing(recording, "a recording"), _target(to, overwrite), streams, start, end)
         else:
             if start is not None or end is not None:
                 raise fail("--start and --end are about a recording; name one")
-            _view_running(_sink(to, overwrite), streams, graph, wait, until_end=until_end)
+            _view_running(_target(to, overwrite), streams, graph, wait, until_end=until_end)
 
 
 def _import(modules: Iterable[str]) -> None:
@@ -95,14 +89,20 @@ def _import(modules: Iterable[str]) -> None:
             raise fail(f"--import {name}: {type(error).__name__}: {error}") from error
 
 
-def _sink(to: str, overwrite: bool) -> ViewerSink:
-    from dataflow.view import Save, Spawn, ViewerSink, parse_target
+def _target(to: str, overwrite: bool) -> Target:
+    from dataflow.view import Save, Spawn, parse_target
 
     target = parse_target(to)
     if isinstance(target, Save):
         output_file(target.path, ".rrd", overwrite=overwrite, option="--to")
     if isinstance(target, Spawn):
         require_display()
+    return target
+
+
+def _sink(target: Target) -> ViewerSink:
+    from dataflow.view import ViewerSink
+
     return ViewerSink(target, report=lambda line: say(f"[yellow]{escape(line)}[/]"))
 
 
@@ -117,7 +117,7 @@ def require_display() -> None:
 
 
 def _view_recording(
-    path: Path, sink: ViewerSink, streams: list[str] | None, start: float | None, end: float | None
+    path: Path, target: Target, streams: list[str] | None, start: float | None, end: float | None
 ) -> None:
     from rich.progress import BarColumn, Progress, TextColumn
 
@@ -143,7 +143,7 @@ def _view_recording(
         begin, finish = window(whole, start, end, path)
         first, last = whole or (0, 0)
         first, last = begin or first, last if finish is None else min(finish, last)
-        with sink:
+        with _sink(target) as sink:
             with Progress(
                 TextColumn("drawing"), BarColumn(bar_width=24), TextColumn("{task.fields[note]}"), console=err,
                 transient=True, disable=not err.is_terminal,
@@ -159,7 +159,7 @@ def _view_recording(
                     opened, sink, chosen, begin, finish, graph=graph, progress=announcer.before(progress)
                 )
             announcer.announce()
-            if isinstance(sink.target, Serve):
+            if isinstance(target, Serve):
                 say(f"all {plural(handed, 'message')} sent; serving until Ctrl-C")
                 _until_interrupted()
             complete = sink.close(timeout=60.0)
@@ -199,58 +199,79 @@ class _Announcer:
         return announced
 
 
-def _view_running(
-    sink: ViewerSink, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool
+def _view_running(target: Target, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool) -> None:
+    from dataflow.client.attach import graph_of, tap
+
+    if wait:
+        importlib.import_module("dataflow.view.sink")  # takes long; done when the graph begins, which may be short
+    found = running_graph(name, wait)
+    running = graph_of(found)
+    chosen = chosen_streams(streams, running.streams, running.namespace)
+    with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
+        say(f"following {escape(running.name)} (process {found.pid})")
+        _draw_running(target, client, found, running, chosen, logs=not streams, until_end=until_end)
+
+
+def _draw_running(
+    target: Target,
+    client: TapClient,
+    found: RunningGraph,
+    running: Graph,
+    chosen: list[str],
+    *,
+    logs: bool,
+    until_end: bool,
 ) -> None:
-    from dataflow.client.attach import graph_of, still_runs, tap, types_of
-    from dataflow.messages import Alarm, Message, MessageError
+    """Draws the streams that were chosen until the graph ends, and what it logs with them."""
+    from dataflow.client.attach import still_runs
     from dataflow.names import logs_key
     from dataflow.recording import LogLine
     from dataflow.transport.log_file import LogFollower
     from dataflow.view import Serve, as_alarm
 
-    found = running_graph(name, wait)
-    running = graph_of(found)
-    chosen = chosen_streams(streams, running.streams, running.namespace)
-    shown = _showing(running, streams and chosen)
+    log_stream = logs_key(running.namespace)
+    with _sink(target) as sink, closing(LogFollower(found.pid)) as follower:
+        sink.open(_types(running, chosen, log_stream if logs else None), _showing(running, None if logs else chosen))
+        _Announcer(sink).announce()
+        clock, look_due = 0, 0.0
+        while True:
+            taken = client.take(timeout=0.5)
+            if logs and time.monotonic() >= look_due:
+                look_due = time.monotonic() + LOOK_EVERY
+                for value in follower.lines():
+                    sink.log(log_stream, as_alarm(LogLine.from_json(value), clock))
+            if taken is None:
+                if not still_runs(found):
+                    break
+                continue
+            envelope = taken.decode()
+            if envelope.message is not None:
+                clock = max(clock, envelope.message.stamp)
+                sink.log(taken.stream, envelope.message)
+        client.close()
+        if isinstance(target, Serve) and not until_end:
+            say("the graph has ended; still serving until Ctrl-C")
+            _until_interrupted()
+        complete = sink.close(timeout=60.0)
+    _report(sink, complete)
+
+
+def _types(running: Graph, chosen: list[str], logs: str | None) -> dict[str, type[Message]]:
+    """The class that each stream is drawn as; `logs`: the stream of the lines that are logged, if they are drawn."""
+    from dataflow.client.attach import types_of
+    from dataflow.messages import Alarm, Message, MessageError
+
     for stream in chosen:
         try:
             running.message_types(stream)  # with the module come the visualisers of its types
         except MessageError as error:
             say(f"[yellow]{escape(str(error))}; drawn by its fields[/]")
-    types = types_of(running)
+    class_of = types_of(running)
     first = {name: running.streams[name].types[0] for name in chosen}
     drawn: dict[str, type[Message]] = {
-        name: Message if schema == "Message" else types(schema) for name, schema in first.items()
+        name: Message if schema == "Message" else class_of(schema) for name, schema in first.items()
     }
-    logs = logs_key(running.namespace)
-    if not streams:
-        drawn[logs] = Alarm
-    with sink, closing(LogFollower(found.pid)) as follower:
-        sink.open(drawn, shown)
-        _Announcer(sink).announce()
-        say(f"following {escape(running.name)} (process {found.pid})")
-        with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
-            clock, look_due = 0, 0.0
-            while True:
-                taken = client.take(timeout=0.5)
-                if not streams and time.monotonic() >= look_due:
-                    look_due = time.monotonic() + LOOK_EVERY
-                    for value in follower.lines():
-                        sink.log(logs, as_alarm(LogLine.from_json(value), clock))
-                if taken is None:
-                    if not still_runs(found):
-                        break
-                    continue
-                envelope = taken.decode()
-                if envelope.message is not None:
-                    clock = max(clock, envelope.message.stamp)
-                    sink.log(taken.stream, envelope.message)
-        if isinstance(sink.target, Serve) and not until_end:
-            say("the graph has ended; still serving until Ctrl-C")
-            _until_interrupted()
-        complete = sink.close(timeout=60.0)
-    _report(sink, complete)
+    return drawn if logs is None else drawn | {logs: Alarm}
 
 
 def _report(sink: ViewerSink, complete: bool) -> None:
@@ -277,81 +298,3 @@ def _until_interrupted() -> None:
             time.sleep(1.0)
     except KeyboardInterrupt:
         return
-
-
-def open_saved(path: Path) -> None:
-    """Opens a saved viewer file in a window that stays; says so where there is no display."""
-    from dataflow.view import ViewerError
-    from dataflow.view.process import display_problem, start
-
-    if (problem := display_problem()) is not None:
-        say(f"{escape(str(path))} is not opened: {problem}; elsewhere, open it with: rerun {escape(path.name)}")
-        return
-    try:
-        start([str(path.resolve())], [], outlive=True)
-    except (ViewerError, OSError) as error:
-        say(f"[yellow]{escape(str(path))} is not opened: {escape(str(error))}[/]")
-        return
-    say(f"opening {escape(str(path))} in the viewer")
-
-
-@contextmanager
-def attached_viewer(target: str | None) -> Iterator[None]:
-    """While the block runs: a viewer's process that attaches to this process's graph as soon as it runs.
-
-    The block begins when that process is ready to attach, so that a short run is seen too. What the viewer says goes to
-    standard error. Its failure never ends the run.
-    """
-    if target is None:
-        yield
-        return
-    from dataflow.graph.search import import_path
-
-    say(f"[dim]starting the viewer ({target})[/]")
-    words = ["view", "--graph", str(os.getpid()), "--to", target, "--wait", "3600", "--until-end"]
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "dataflow.cli.main", *words],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        process_group=0,
-        env={**os.environ, "PYTHONPATH": import_path()},
-    )
-    ready, following = threading.Event(), threading.Event()
-    reader = threading.Thread(target=_relay, args=(process, ready, following), daemon=True)
-    reader.start()
-    ready.wait(READY_WITHIN)
-    try:
-        yield
-        if process.poll() is None and not following.is_set():
-            say("[yellow]the run ended before the viewer could follow it; for short runs use --view FILE.rrd[/]")
-    finally:
-        _end(process, following.is_set())
-        reader.join(timeout=2.0)
-
-
-def _relay(process: subprocess.Popen[str], ready: threading.Event, following: threading.Event) -> None:
-    assert process.stdout is not None
-    for line in process.stdout:
-        ready.set()
-        if line.startswith("following "):
-            following.set()
-        elif not line.startswith("waiting "):
-            err.print(f"[dim]viewer:[/] {escape(line.rstrip())}", soft_wrap=True)
-    ready.set()
-
-
-def _end(process: subprocess.Popen[str], following: bool) -> None:
-    """Lets the viewer draw the rest of a run that has ended; one that never saw it ends at once."""
-    if not following:
-        process.terminate()
-    try:
-        process.wait(timeout=DRAW_WITHIN)
-    except subprocess.TimeoutExpired:
-        process.terminate()
-        try:
-            process.wait(timeout=5.0)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait(timeout=5.0)

@@ -23,7 +23,7 @@ class _LoggedStream:
     node: str
     final: int
     promises: Sequence[int] | None = None
-    """How far it may be promised by the number of messages given; None where its clock never went back."""
+    """The frontier that may be promised, by the number of messages given; None where its clock never went back."""
     promised: int = NEVER
     ended: bool = False
     incarnation: int = 0

@@ -22,7 +22,7 @@ from dataflow.operator import Context, Operator, OutputError, Outputs, outputs_o
 from dataflow.sync import NEVER, Entry, Firing, InputValue
 
 Place = tuple[int, int]
-"""Where a call that is no firing lies: (incarnation, stamp)."""
+"""The place of a call that is no firing: (incarnation, stamp)."""
 
 
 class Calls:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import traceback
 
 RAISED = BaseException
-"""What an operator may raise: it has no right to end its process, whatever it derives its errors from."""
+"""The errors that an operator may raise: it has no right to end its process, whatever it derives its errors from."""
 MOST_OF_A_TRACEBACK = 20_000
 """Characters of a traceback that are kept."""
 

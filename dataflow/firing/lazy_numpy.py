@@ -23,7 +23,7 @@ class _SeedingLock:
     def __init__(self) -> None:
         self.pending: SupportsInt | None = None
         self.settled = 0
-        """How often somebody has drawn."""
+        """The number of draws so far."""
         self._lock = threading.RLock()
 
     def __enter__(self) -> None:

@@ -25,7 +25,7 @@ class AtWork:
     def __init__(self) -> None:
         self.begun = self.ended = 0
         self.fires = False
-        """Whether an operator of this process fires at all."""
+        """True when an operator of this process fires at all."""
         self.operator, self.stamp = "", 0
         """Of the last call that began: the operator, and its event time; 0 or less where it has none."""
 

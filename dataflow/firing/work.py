@@ -29,7 +29,7 @@ class Work:
     def __init__(self) -> None:
         self.cpu_ns = self.wall_ns = 0
         self.mean_ns = AT_FIRST
-        """How long (ns, wall time) the last calls have taken on average; long before there was any."""
+        """Average duration (ns, wall time) of the last calls; long before there was any."""
         self._cpu = self._wall = self._calls = 0
         self._exact = True
 

@@ -61,7 +61,7 @@ class GraphInput:
     patterns: tuple[Pattern, ...]
     type: type[Message] | None
     place: Place
-    """Where the nested graph declares it."""
+    """The place where the nested graph declares it."""
 
 
 @dataclass(slots=True)

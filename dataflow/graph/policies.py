@@ -14,7 +14,7 @@ from dataflow.operator import InputPort, OperatorSpec
 QUEUE_SIZE = 16
 """Undecided messages on each trigger stream, unless the graph says otherwise."""
 JOIN_WAIT = 100_000_000
-"""How long (ns) a join or merge fed by devices waits for each input, unless the graph says otherwise."""
+"""Time (ns) that a join or merge fed by devices waits for each input, unless the graph says otherwise."""
 
 _QUEUES: Mapping[str, QueuePolicy] = {"newest": "newest", "oldest": "oldest", "block": "block"}
 _STALE: Mapping[str, StalePolicy] = {"use": "use", "drop": "drop"}

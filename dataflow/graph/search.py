@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 FOLDERS: list[str] = []
-"""What was added to `sys.path`, in order."""
+"""The folders that were added to `sys.path`, in order."""
 
 
 def add_folder(folder: str | Path) -> None:

@@ -53,7 +53,7 @@ class Bag(Protocol):
     kind: str
     """Format for people, such as `ROS 2 bag (sqlite3)`."""
     notes: tuple[str, ...]
-    """What of the file is damaged or unusual, for people."""
+    """Damage and oddities of the file, for people."""
 
     @property
     def topics(self) -> Mapping[str, Topic]:

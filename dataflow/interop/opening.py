@@ -7,7 +7,6 @@ from pathlib import Path
 
 from dataflow.interop.bag import Bag, BagError
 from dataflow.interop.mcap_bag import McapBag
-from dataflow.interop.ros_bags import RosBag
 from dataflow.recording.container import MAGIC
 from dataflow.recording.index import McapFile
 from dataflow.recording.layout import RECORDING
@@ -31,9 +30,9 @@ def open_bag(path: Path) -> Bag:
     if head.startswith(MAGIC):
         return McapBag(path, [path])
     if head.startswith(ROS1_MAGIC):
-        return RosBag(_with_suffix(path, ".bag"))
+        return _ros_bag(_with_suffix(path, ".bag"))
     if head.startswith(SQLITE_MAGIC):
-        return RosBag(_with_suffix(path, ".db3"))
+        return _ros_bag(_with_suffix(path, ".db3"))
     begins = f"it begins with {head[:8].hex(' ')}" if head else "it is empty"
     raise BagError(
         f"{path} is not an MCAP file, nor another kind of bag: {begins}. Known are MCAP files, ROS 1 bags (.bag) and "
@@ -58,6 +57,12 @@ def is_foreign(path: Path) -> bool:
         file.close()
 
 
+def _ros_bag(path: Path) -> Bag:
+    from dataflow.interop.ros_bags import RosBag  # rosbags takes long to import, and most files are no such bags
+
+    return RosBag(path)
+
+
 def _head(path: Path) -> bytes:
     with path.open("rb") as file:
         return file.read(len(SQLITE_MAGIC))
@@ -75,12 +80,12 @@ def _open_folder(path: Path) -> Bag:
         compressed = sorted(path.glob("*.zstd"))
         if files[".mcap"] and not compressed:
             return McapBag(path, files[".mcap"])
-        return RosBag(path)
+        return _ros_bag(path)
     if files[".mcap"]:
         return McapBag(path, files[".mcap"])
     for suffix in (".db3", ".bag"):
         if len(files[suffix]) == 1:
-            return RosBag(files[suffix][0])
+            return _ros_bag(files[suffix][0])
         if files[suffix]:
             raise BagError(
                 f"{path} holds {len(files[suffix])} {suffix} files and no metadata.yaml that says how they belong "

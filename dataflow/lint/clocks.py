@@ -117,7 +117,7 @@ class _Seen:
         self._step = min(max(min(stream.period, reference.period) / 2, 0.002), 0.02)
 
     def _expected(self, offset: float, drift: float) -> tuple[F64, npt.NDArray[np.bool_]]:
-        """What the reference saw in the stream's intervals, and which of them it was there for."""
+        """The reference's rotation in the stream's intervals, and which of them it was there for."""
         begins = self._begins - offset - drift * (self._begins - self._middle)
         ends = self._ends - offset - drift * (self._ends - self._middle)
         there = (begins >= self._times[0]) & (ends <= self._times[-1])

@@ -9,7 +9,7 @@ from typing import Any
 from dataflow.transport import Incoming, Outgoing, PoolReader
 
 BACKLOG = (16, 8)
-"""How many windows of messages and of bytes may wait for operators that no source waits for."""
+"""The number of windows of messages and of bytes that may wait for operators that no source waits for."""
 
 
 @dataclass(frozen=True, slots=True)

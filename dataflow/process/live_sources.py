@@ -44,7 +44,7 @@ class Reader:
         self.runner = runner
         self.unread = Handover()
         self.failure: OperatorFailure | None = None
-        """What went wrong on the thread, until somebody has dealt with it."""
+        """The failure of the thread, until somebody has dealt with it."""
         self.condemned: OperatorFailure | None = None
         """Why what it reads is of no use any more; it stops as soon as it can."""
         self.read_late = self.sent_late = 0.0
@@ -84,8 +84,11 @@ class Reader:
                 return True
             if not runner.source.live and not self._paced(step_stamp(step)):
                 continue
-            for given in self._faults.apply(step, time.monotonic()):
-                self._hand_over(given)
+            if self._faults.begun:
+                for given in self._faults.apply(step, time.monotonic()):
+                    self._hand_over(given)
+            else:
+                self._hand_over(step)
             runner.check_draws()
         runner.close_stream()
         return False

@@ -9,6 +9,7 @@ from typing import Any
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.feeds.log import LogFeed
 from dataflow.feeds.numbering import gapless
+from dataflow.feeds.playable import PlayableStreams
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.live import LiveRunner
 from dataflow.firing.ports import Emitter
@@ -18,6 +19,7 @@ from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig, Resumed
+from dataflow.recording import Recording
 from dataflow.records.black_box import BlackBox, Reached
 from dataflow.sync import NEVER, Entry
 from dataflow.transport import Envelope, Kind
@@ -36,7 +38,7 @@ class Runners:
         """Those of them that have something to do."""
         self.consumers: dict[str, list[Runner]] = {}
         self.faults: dict[str, OperatorFaults] = {}
-        """What is done on purpose to the operators of a live run."""
+        """Faults made on purpose in the operators of a live run."""
 
     @property
     def all(self) -> list[Maker]:
@@ -58,16 +60,14 @@ class Runners:
 
 def give(runner: Runner, stream: str, envelope: Envelope) -> None:
     """Gives a runner what another process says on a stream. Raises `StreamOrderError` for what contradicts it."""
-    match envelope.kind:
-        case Kind.MESSAGE:
-            message = envelope.message
-            assert message is not None
-            digest = message.digest() if runner.paranoid else b""  # as it is before anybody can have written to it
-            runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, digest, stream))
-        case Kind.FRONTIER:
-            runner.advance(stream, envelope.stamp)
-        case Kind.END:
-            runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
+    message = envelope.message
+    if message is not None:
+        digest = message.digest() if runner.paranoid else b""  # as it is before anybody can have written to it
+        runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, digest, stream))
+    elif envelope.kind is Kind.FRONTIER:
+        runner.advance(stream, envelope.stamp)
+    elif envelope.kind is Kind.END:
+        runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
 
 
 def make_source(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitter) -> SourceRunner:
@@ -109,11 +109,9 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
     replay = config.replay
     if replay is None:
         return None
-    from dataflow.interop.streams import recorded_streams  # bags need libraries that no other run does
-
     nodes = {graph.streams[s].node for s in replay["streams"]}
     return LogFeed(
-        recorded_streams(Path(replay["path"]), replay["bag"]),
+        _played(Path(replay["path"]), replay["bag"]),
         {s: graph.streams[s].node for s in replay["streams"]},
         emitter,
         ports={n: tuple(graph.nodes[n].outputs.values()) for n in nodes},
@@ -122,6 +120,14 @@ def make_log(graph: Graph, config: ProcessConfig, emitter: Emitter) -> LogFeed |
         end=replay["end"],
         numbered=gapless,
     )
+
+
+def _played(path: Path, bag: dict[str, Any] | None) -> PlayableStreams:
+    if bag is None:
+        return Recording(path)
+    from dataflow.interop.streams import recorded_streams  # bags need libraries that no other run does
+
+    return recorded_streams(path, bag)
 
 
 def open_box(descriptor: int, config: ProcessConfig, graph: Graph) -> BlackBox:

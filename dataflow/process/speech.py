@@ -24,7 +24,7 @@ LEVEL_VARIABLE: Final = "DATAFLOW_LOG_LEVEL"
 LONGEST: Final = 16_384
 """Characters of a line; the rest is left out, and counted."""
 SOURCE_THREAD: Final = "source "
-"""What the names of threads begin with that read live sources, before the operator's name."""
+"""Prefix of the names of threads that read live sources, before the operator's name."""
 
 
 def install() -> None:

@@ -22,7 +22,7 @@ class Verdict:
     """Says what follows from one envelope."""
 
     taken: Envelope | None = None
-    """What to take in its place; None: it does not count."""
+    """The envelope to take in its place; None: it does not count."""
     gap: tuple[int, int] | None = None
     """The numbers that were lost before it: first and following."""
     damaged: str = ""

@@ -14,7 +14,7 @@ import numpy as np
 from dataflow.messages import Message, Odometry, Transforms
 
 VIEWER_ROOT = "tf#/"
-"""What Rerun's importer calls the frame of its root."""
+"""The name that Rerun's importer gives the frame of its root."""
 
 
 class FrameTree:

@@ -14,7 +14,7 @@ from mcap.exceptions import McapError
 from dataflow.recording.errors import DamagedError, RecordingError
 
 RECORD = struct.Struct("<BQ")
-"""What every record begins with: opcode, length of the rest."""
+"""The head of every record: opcode, length of the rest."""
 MAX_RECORD_BYTES = 2**28
 """Of a record that is neither a chunk nor a message: more than any graph, schema or index takes."""
 WINDOW_BYTES = 2**16

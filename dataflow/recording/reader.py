@@ -20,7 +20,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
 from dataflow.recording.json_columns import Values
-from dataflow.recording.layout import Kind
+from dataflow.recording.layout import FORMAT, RECORDING, Kind
 from dataflow.recording.logs import LogLine
 from dataflow.recording.ordering import NOWHERE, Row, Track, companions_of, in_file_order, merged, rows
 from dataflow.recording.streams import (
@@ -82,12 +82,13 @@ class Recording:
         self.path = Path(path)
         self._file = McapFile(self.path)
         try:
+            self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
+            _check_format(self.path, self.metadata)
             self._streams = StreamFinder(self._file).all()
         except BaseException:
             self._file.close()
             raise
         self.streams: Mapping[str, StreamInfo] = {name: s.info for name, s in self._streams.items()}
-        self.metadata: Mapping[str, Mapping[str, str]] = _merged(self._file.metadata)
 
     @property
     def torn(self) -> bool:
@@ -369,3 +370,15 @@ def _merged(records: list[tuple[str, dict[str, str]]]) -> dict[str, dict[str, st
     for name, mapping in records:
         merged.setdefault(name, {}).update(mapping)
     return merged
+
+
+def _check_format(path: Path, metadata: Mapping[str, Mapping[str, str]]) -> None:
+    """Raises `RecordingError` for a recording in a format that this version does not read. Other programs' files, which
+    name none, pass."""
+    ours = metadata.get(RECORDING, {})
+    found = ours.get("format", FORMAT)
+    if "namespace" in ours and found != FORMAT:
+        raise RecordingError(
+            f"{path} has recording format {found!r}, and this version reads format {FORMAT!r}: open it with a newer "
+            "robot-dataflow"
+        )

@@ -34,7 +34,7 @@ class $Class(Operator):
         return Number(stamp=image.stamp, value=value)
 
     def summary(self) -> dict[str, float]:
-        """What `dataflow run` prints at the end."""
+        """Figures that `dataflow run` prints at the end."""
         return {"darkest": self.darkest}
 ''')
 

@@ -42,7 +42,7 @@ class Health:
     restarts: int = 0
     note: str = ""
     drops: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    """What was dropped so far, by (input, reason); a source's input is ""."""
+    """Drops so far, by (input, reason); a source's input is ""."""
     waits: Mapping[tuple[str, str], int] = field(default_factory=dict)
     """Waits given up and messages that came late so far, by (input, "timeout" or "late")."""
 

@@ -79,7 +79,7 @@ class Quiescence(Part):
         """The last answer of each process since anything moved."""
         self._answers: dict[str, Mapping[str, Any]] = {}
         self.asked = False
-        """Whether a question is out."""
+        """True while a question is out."""
         self._proof = Proof(lost_after)
         self._round = 0
         self._asked_at = 0.0

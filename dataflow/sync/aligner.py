@@ -95,7 +95,7 @@ class Aligner:
         self._last_firing = NEVER
         self._finished = False
         self.paused = False
-        """Whether the last `poll` ended before all was decided, since it had dropped so many."""
+        """True when the last `poll` ended before all was decided, since it had dropped so many."""
 
     def begin_at(self, stamp: int) -> None:
         """Everything before `stamp` was decided elsewhere, ticks included. To be called before the first `push`;

@@ -15,7 +15,7 @@ class Batch:
     def __init__(self, spec: BatchSpec, lanes: Sequence[Lane], drop: DropEntry) -> None:
         self.name = spec.name
         self.late = False
-        """Whether the last batch holds a message that an earlier firing should have had."""
+        """True when the last batch holds a message that an earlier firing should have had."""
         self._max = spec.max
         self._max_age = spec.max_age
         self._lanes = tuple(lanes)

@@ -41,7 +41,7 @@ class Join:
         self.stamp: int | None = None
         """The first anchor not decided, or None."""
         self.ready = False
-        """Whether `stamp` has a partner on every other trigger."""
+        """True when `stamp` has a partner on every other trigger."""
         self.bound = NEVER
         """`stamp`, else the minimum of the trigger frontiers: no other firing lies at or below it."""
         self.decided = NEVER

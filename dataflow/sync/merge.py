@@ -22,7 +22,7 @@ class Merge:
         self.stamp: int | None = None
         """The first undecided trigger stamp, or None."""
         self.ready = False
-        """Whether all that belongs to `stamp` is known."""
+        """True when all that belongs to `stamp` is known."""
         self.bound = NEVER
         """The minimum of the trigger frontiers: no message is still to come at or below it."""
         self.decided = NEVER

@@ -33,7 +33,7 @@ class StreamPublisher:
         self._counted = counted
         self._blocked = blocked
         self.matched = False
-        """Whether anybody subscribes to the key."""
+        """True when anybody subscribes to the key."""
         self._matching = publisher.declare_matching_listener(zenoh.handlers.Callback(self._on_matching, indirect=False))
         status: Any = publisher.matching_status  # Zenoh's stubs call it a bool
         self.matched = bool(status.matching)

@@ -18,8 +18,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import psutil  # type: ignore[import-untyped]
-
 START_TOLERANCE = 1.0
 
 
@@ -89,7 +87,7 @@ def register(
         name,
         namespace,
         pid,
-        psutil.Process(pid).create_time(),
+        _born(pid),
         tuple(endpoints),
         started=time.time(),
         graph=dict(graph or {}),
@@ -138,17 +136,27 @@ def _read(path: Path) -> RunningGraph | None:
 def _lives(pid: int, process_started: float) -> bool:
     """Returns whether that very process still runs; a later process with the same id began at another time."""
     try:
-        process = psutil.Process(pid)
-        same = abs(process.create_time() - process_started) < START_TOLERANCE
-        return bool(same and process.status() != psutil.STATUS_ZOMBIE)
-    except psutil.NoSuchProcess:
+        return abs(_born(pid) - process_started) < START_TOLERANCE
+    except ProcessLookupError:
         return False
+
+
+def _born(pid: int) -> float:
+    """When a process began, in seconds since the epoch. Raises `ProcessLookupError` where none runs, or a zombie."""
+    try:
+        state, *rest = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+    except (FileNotFoundError, ProcessLookupError):
+        raise ProcessLookupError(pid) from None
+    if state == "Z":
+        raise ProcessLookupError(pid)
+    booted = next(line for line in Path("/proc/stat").read_text().splitlines() if line.startswith("btime "))
+    return int(booted.split()[1]) + int(rest[18]) / os.sysconf("SC_CLK_TCK")
 
 
 def is_abandoned(path: Path) -> bool:
     """Returns whether the process that a file or folder `<process>-...` belongs to is gone."""
     pid = path.name.partition("-")[0]
-    return pid.isdigit() and not psutil.pid_exists(int(pid))
+    return pid.isdigit() and not Path(f"/proc/{pid}").exists()
 
 
 def remove(path: Path) -> None:

@@ -38,7 +38,7 @@ PASSES = ("identical", "identical up to the cut", "within tolerance", "accepted"
 """The verdicts with which the gate lets pass."""
 
 Outcome = Mapping[str, Any]
-"""What an operator that differs made here: digests of its streams, how much differs, and the first difference."""
+"""The outcome of an operator that differs: digests of its streams, how much differs, and the first difference."""
 
 
 class BaselineError(ValueError):

@@ -3,12 +3,29 @@
 A viewer is an ordinary subscriber: `ViewerSink` draws what it is handed and can neither slow nor end a producer.
 """
 
-from dataflow.view.blueprint import blueprint
-from dataflow.view.canvas import Canvas, visualize, visualizer, visualizers
-from dataflow.view.playback import as_alarm, from_recording
-from dataflow.view.process import ViewerError
-from dataflow.view.scene import SceneState, ViewOptions
-from dataflow.view.sink import Connect, Save, Serve, SinkStatistics, Spawn, Target, ViewerSink, parse_target
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from dataflow.view.canvas import Canvas, visualize, visualizer
+    from dataflow.view.playback import as_alarm, from_recording
+    from dataflow.view.process import ViewerError
+    from dataflow.view.scene import SceneState, ViewOptions
+    from dataflow.view.sink import SinkStatistics, ViewerSink
+    from dataflow.view.targets import Connect, Save, Serve, Spawn, Target, parse_target
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "canvas": ("Canvas", "visualize", "visualizer"),
+            "playback": ("as_alarm", "from_recording"),
+            "process": ("ViewerError",),
+            "scene": ("SceneState", "ViewOptions"),
+            "sink": ("SinkStatistics", "ViewerSink"),
+            "targets": ("Connect", "Save", "Serve", "Spawn", "Target", "parse_target"),
+        },
+    )
 
 __all__ = [
     "Canvas",
@@ -23,10 +40,8 @@ __all__ = [
     "ViewerError",
     "ViewerSink",
     "as_alarm",
-    "blueprint",
     "from_recording",
     "parse_target",
     "visualize",
     "visualizer",
-    "visualizers",
 ]

@@ -3,7 +3,7 @@ class."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -21,7 +21,7 @@ NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
 
 Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor", "status"]
-"""Which views a type appears in. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
+"""The views in which a type appears. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,12 +126,6 @@ def visualizer(
         return function
 
     return register
-
-
-def visualizers() -> Mapping[type[Message], Visualizer]:
-    """Every registered visualiser by message class."""
-    _load()
-    return dict(_visualizers)
 
 
 def roles_of(message_type: type[Message]) -> tuple[Role, ...]:

@@ -16,7 +16,7 @@ TRUTH: RGB = (80, 200, 120)
 """Ground truth, wherever it is drawn."""
 
 NEUTRAL: RGB = (150, 155, 165)
-"""What has no class and no identity."""
+"""Colour of things without class and identity."""
 
 AXES: tuple[RGB, RGB, RGB] = ((235, 80, 80), (90, 200, 90), (90, 140, 250))
 """x, y and z."""

@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Self
-from urllib.parse import quote, urlsplit
+from urllib.parse import urlsplit
 
 import rerun as rr
 
@@ -29,68 +29,13 @@ from dataflow.view.canvas import visualize
 from dataflow.view.layout import layout
 from dataflow.view.process import LOOPBACK, ViewerError
 from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, SceneState, ViewOptions, entity_of
+from dataflow.view.targets import GRPC_PORT, Connect, Save, Serve, Spawn, Target
 
 SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
 
 FILE_OPTIONS = ViewOptions(jpeg_quality=75, depth_step=0.02, max_points=2_500, point_step=2.0**-7)
-"""What a file is to hold unless more is asked for: what can be seen, not what can be measured."""
-
-_GRPC_PORT = 9876
-_WEB_PORT = 9090
-
-
-@dataclass(frozen=True, slots=True)
-class Spawn:
-    """A window on this machine; it stays open when the program ends. Past `memory_limit` it forgets the oldest data."""
-
-    port: int = _GRPC_PORT
-    memory_limit: str = "2GB"
-
-
-@dataclass(frozen=True, slots=True)
-class Connect:
-    """A viewer that runs already, by its address: `rerun+http://127.0.0.1:9876/proxy`."""
-
-    url: str = f"rerun+http://{LOOPBACK}:{_GRPC_PORT}/proxy"
-
-
-@dataclass(frozen=True, slots=True)
-class Serve:
-    """A page for browsers on this machine, as long as the sink is open. Latecomers get what fits in `memory_limit`."""
-
-    web_port: int = _WEB_PORT
-    grpc_port: int = _GRPC_PORT
-    memory_limit: str = "1GB"
-
-    @property
-    def url(self) -> str:
-        """Returns what to open in the browser."""
-        data = quote(f"rerun+http://{LOOPBACK}:{self.grpc_port}/proxy", safe="")
-        return f"http://{LOOPBACK}:{self.web_port}/?url={data}"
-
-
-@dataclass(frozen=True, slots=True)
-class Save:
-    """A file that Rerun opens; an existing one is replaced."""
-
-    path: Path
-
-
-Target = Spawn | Connect | Serve | Save
-
-
-def parse_target(text: str) -> Target:
-    """`spawn`, `serve`, `rerun+http://host:port/proxy`, or a path that ends in `.rrd`. Raises `ViewerError`."""
-    if text in ("spawn", "serve"):
-        return Spawn() if text == "spawn" else Serve()
-    if text.startswith(("rerun://", "rerun+http://", "rerun+https://")):
-        return Connect(text)
-    if text.endswith(".rrd"):
-        return Save(Path(text))
-    raise ViewerError(
-        f"viewer {text!r}: expected spawn, serve, rerun+http://HOST:PORT/proxy, or a file name ending in .rrd"
-    )
+"""Contents of a file unless more is asked for: for looking, not for measuring."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -376,6 +321,6 @@ def _check_reachable(url: str) -> None:
     parts = urlsplit(url)
     if parts.path != "/proxy" or parts.hostname is None:
         raise ViewerError(f"viewer address {url!r}: expected rerun+http://HOST:PORT/proxy")
-    port = parts.port or _GRPC_PORT
+    port = parts.port or GRPC_PORT
     if not process.listening(port, parts.hostname, timeout=3.0):
         raise ViewerError(f"no viewer listens on {parts.hostname}:{port}; start one with `rerun --bind {LOOPBACK}`")

@@ -1,6 +1,6 @@
-"""Draws the pictures of docs/design.md as SVG: `python docs/images/draw.py`.
+"""Draws the pictures of docs/design.md and docs/concepts.md as SVG: `python docs/images/draw.py`.
 
-The picture of time is computed: the aligner that ships decides what it shows.
+The pictures of time and of arrival are computed: the aligner that ships decides what they show.
 """
 
 from __future__ import annotations
@@ -169,6 +169,54 @@ def time() -> str:
     return drawing.svg()
 
 
+# Arrival
+
+ORDERS: Mapping[str, tuple[tuple[str, int], ...]] = {
+    "as taken": (("image", 10), ("pose", 5), ("pose", 18), ("image", 20), ("pose", 28), ("image", 30), ("pose", 35)),
+    "images late": (("pose", 5), ("pose", 18), ("pose", 28), ("pose", 35), ("image", 10), ("image", 20), ("image", 30)),
+    "poses late": (("image", 10), ("image", 20), ("image", 30), ("pose", 5), ("pose", 18), ("pose", 28), ("pose", 35)),
+}
+"""The same messages (stream, ms) in three orders of arrival."""
+
+
+def decided(order: Iterable[tuple[str, int]]) -> list[tuple[int, Firing]]:
+    """The firings of an operator with images and a sampled pose, each with the number of the arrival that decides."""
+    aligner = Aligner(
+        AlignSpec(triggers=(TriggerSpec("image", ("image",)),), sampled=(SampledSpec("pose", ("pose",)),))
+    )
+    seqs = {"image": 0, "pose": 0}
+    found = []
+    for number, (stream, stamp) in enumerate(order):
+        aligner.push(stream, Entry(stamp * MS, seq=seqs[stream]))
+        seqs[stream] += 1
+        while (firing := aligner.poll()) is not None:
+            found.append((number, firing))
+    return found
+
+
+def arrival() -> str:
+    drawing = Drawing(1000, 430)
+    drawing.text(20, 30, "Arrival decides when a firing happens, never what it is given", size=17)
+    colors = {"image": BLUE, "pose": GREEN}
+    for row, (name, order) in enumerate(ORDERS.items()):
+        y = 62 + 122 * row
+        drawing.text(20, y + 20, name, size=14)
+        for number, (stream, stamp) in enumerate(order):
+            drawing.box(150 + 118 * number, y, 96, 30, colors[stream])
+            drawing.text(198 + 118 * number, y + 20, f"{stream} {stamp}", colors[stream], size=13, anchor="middle")
+        at = {number: [f for n, f in decided(order) if n == number] for number, _ in decided(order)}
+        for number, firings in at.items():
+            drawing.line(198 + 118 * number, y + 30, 198 + 118 * number, y + 52, arrow=True)
+            for k, firing in enumerate(firings):
+                given = dict(entries_of(firing))
+                words = f"t = {given['image']}: pose {given['pose']}"
+                drawing.box(146 + 118 * number, y + 54 + 30 * k, 104, 26, INK, fill="#eef2fb")
+                drawing.text(198 + 118 * number, y + 72 + 30 * k, words, size=12, anchor="middle")
+    drawing.line(150, 400, 970, 400, arrow=True)
+    drawing.text(970, 420, "arrival, in the order of the clock on the wall", size=12, anchor="end")
+    return drawing.svg()
+
+
 # One firing
 
 
@@ -246,7 +294,7 @@ def processes() -> str:
     return drawing.svg()
 
 
-PICTURES = {"time.svg": time, "firing.svg": firing, "processes.svg": processes}
+PICTURES = {"time.svg": time, "arrival.svg": arrival, "firing.svg": firing, "processes.svg": processes}
 
 if __name__ == "__main__":
     for name, draw in PICTURES.items():

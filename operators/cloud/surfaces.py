@@ -30,7 +30,7 @@ class Rules:
     wall_top: float
     """A wall is seen up to this height above the floor at least."""
     floor_memory: float
-    """How far the floor may be from where it was before."""
+    """Largest distance of the floor from where it was before."""
 
 
 @dataclass(frozen=True, eq=False)

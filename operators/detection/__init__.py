@@ -1,8 +1,23 @@
 """Operators that find objects in images."""
 
-from operators.detection.custom_detector import CustomDetector
-from operators.detection.onnx_detector import OnnxDetector
-from operators.detection.score_filter import ScoreFilter
-from operators.detection.torchvision_detector import TorchvisionDetector
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from operators.detection.custom_detector import CustomDetector
+    from operators.detection.onnx_detector import OnnxDetector
+    from operators.detection.score_filter import ScoreFilter
+    from operators.detection.torchvision_detector import TorchvisionDetector
+else:
+    __getattr__, __dir__ = lazily(
+        __name__,
+        {
+            "custom_detector": ("CustomDetector",),
+            "onnx_detector": ("OnnxDetector",),
+            "score_filter": ("ScoreFilter",),
+            "torchvision_detector": ("TorchvisionDetector",),
+        },
+    )
 
 __all__ = ["CustomDetector", "OnnxDetector", "ScoreFilter", "TorchvisionDetector"]

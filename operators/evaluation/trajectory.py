@@ -22,7 +22,7 @@ Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Indices of the first and of the second pose of each pair."""
 
 SPAN_TOLERANCE = 0.1
-"""How far the path between two poses may be from the span that is asked for, as a share of it."""
+"""Largest difference between the path of two poses and the span that is asked for, as a share of it."""
 
 
 @dataclass(eq=False)

@@ -15,7 +15,7 @@ from dataflow.messages.geometry import yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.agent_features import AGENTS, MATTERING, AgentWindow, Surroundings
-from operators.scene.relations import Body
+from operators.scene.bodies import Body
 from operators.weights import shipped
 
 UNKNOWN = "unknown"

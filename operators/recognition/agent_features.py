@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.relations import Body
+from operators.scene.bodies import Body
 
 Array = NDArray[np.float64]
 

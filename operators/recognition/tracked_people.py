@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from operators.recognition.agent_features import MATTERING
 from operators.recognition.episodes import Episode
-from operators.scene.relations import Body
+from operators.scene.bodies import Body
 
 Array = NDArray[np.float64]
 Rng = np.random.Generator

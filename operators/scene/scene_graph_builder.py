@@ -14,9 +14,10 @@ from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES, UNKNOWN
+from operators.scene.bodies import Body
 from operators.scene.goal_network import open_goal_network
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
-from operators.scene.relations import FLOOR, ROBOT, ROOM, Body, RelationRules
+from operators.scene.relations import FLOOR, ROBOT, ROOM, RelationRules
 from operators.weights import shipped
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from operators.sources.simulated_robot import SimulatedRobot
     from operators.sources.synthetic_rgbd import SyntheticRgbd
     from operators.sources.victoria_park import VictoriaPark
+    from operators.sources.video import VideoFile, Webcam
 else:  # most need a library of their own, which a graph without them need not load
     __getattr__, __dir__ = lazily(
         __name__,
@@ -43,6 +44,7 @@ else:  # most need a library of their own, which a graph without them need not l
             "simulated_robot": ("SimulatedRobot",),
             "synthetic_rgbd": ("SyntheticRgbd",),
             "victoria_park": ("VictoriaPark",),
+            "video": ("VideoFile", "Webcam"),
         },
     )
 
@@ -62,4 +64,6 @@ __all__ = [
     "SimulatedRobot",
     "SyntheticRgbd",
     "VictoriaPark",
+    "VideoFile",
+    "Webcam",
 ]

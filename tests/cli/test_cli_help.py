@@ -7,11 +7,10 @@ from pathlib import Path
 import pytest
 
 from dataflow.cli import main, plugins
+from dataflow.cli.commands import BUILT_IN, Command, Commands
 from dataflow.cli.main import app
 
-COMMANDS = sorted(
-    command.name or command.callback.__name__ for command in app.registered_commands if command.callback is not None
-)
+COMMANDS = sorted(each.called for each in BUILT_IN if isinstance(each, Command))
 
 
 def test_the_help_documents_the_exit_codes_and_lists_every_command(dataflow) -> None:
@@ -44,8 +43,8 @@ def test_every_command_has_examples_that_stay_on_lines_of_their_own(dataflow, mo
     examples = [line for line in lines[lines.index("Examples:") :] if line.startswith("dataflow ")]
     assert examples
     assert all(line.startswith(f"dataflow {command}") for line in examples)
-    documented = next(c for c in app.registered_commands if (c.name or c.callback.__name__) == command)
-    assert [line.strip() for line in documented.help.splitlines() if "dataflow " in line and line.startswith("  ")] == (
+    documented = Commands()[command].help
+    assert [line.strip() for line in documented.splitlines() if "dataflow " in line and line.startswith("  ")] == (
         examples
     )
 

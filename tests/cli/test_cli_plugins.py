@@ -25,6 +25,12 @@ def floor(times: int = 1):
 def lens():
     """Polish the lens."""
 
+shine = typer.Typer()
+
+@shine.command()
+def _shine():
+    """Make it shine."""
+
 def greet(name: str):
     """Greet somebody."""
     print(f"hello {name}")
@@ -35,6 +41,7 @@ ENTRIES = """\
 [dataflow.commands]
 polish = plugin_of_tests:polish
 greet = plugin_of_tests:greet
+shine = plugin_of_tests:shine
 number = plugin_of_tests:number
 absent = plugin_of_tests:absent
 raises = broken_plugin_of_tests:command
@@ -44,7 +51,7 @@ run = plugin_of_tests:greet
 
 @pytest.fixture
 def installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """A package with six entry points: two good, three broken, one that names a built-in command."""
+    """A package with seven entry points: three good, three broken, one that names a built-in command."""
     (tmp_path / "plugin_of_tests.py").write_text(MODULE)
     (tmp_path / "broken_plugin_of_tests.py").write_text("raise RuntimeError('no licence')\n")
     info = tmp_path / "polisher-1.0.dist-info"
@@ -99,3 +106,10 @@ def test_built_in_commands_neither_load_nor_yield_to_them(small: Path) -> None:
 @pytest.mark.usefixtures("installed")
 def test_a_misspelt_one_is_suggested() -> None:
     assert "Did you mean 'polish'" in CliRunner().invoke(app, ["polis"]).stderr
+
+
+@pytest.mark.usefixtures("installed")
+@pytest.mark.parametrize("command", ["polish", "greet", "shine"])
+def test_each_stands_among_the_commands_of_other_packages(command: str) -> None:
+    found = plugins.load(plugins.advertised()[command])
+    assert found.rich_help_panel == plugins.PANEL

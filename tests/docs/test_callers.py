@@ -14,7 +14,12 @@ FOR_TESTS = {
     "SPATIAL",  # the page about the simulator is held against it
     "TO_PROCESSES",  # the page about faults is held against it
 }
-CALLED_BY_OTHERS = {"get_next"}  # onnxruntime asks a calibration reader
+CALLED_BY_OTHERS = {
+    "get_next",  # onnxruntime asks a calibration reader
+    "list_commands",  # click asks a group
+    "on_playback_control_request",  # Foxglove's server tells its listener
+    "on_subscribe",
+}
 
 
 def definitions(nodes: list[ast.AST]) -> Iterator[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 OPENS_WITH_A_QUESTION = re.compile(r"(What|How|Where|Which|Whether)\b")
@@ -19,9 +20,21 @@ def public_docstrings(path: Path) -> Iterator[tuple[int, str]]:
             line, name = node.lineno, node.name
         else:
             continue
+        yield from attribute_docstrings(node)
         docstring = ast.get_docstring(node)
         if docstring and not (name.startswith("_") and not name.startswith("__")):
             yield line, docstring.splitlines()[0]
+
+
+def attribute_docstrings(
+    node: ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef,
+) -> Iterator[tuple[int, str]]:
+    """Yields line and first line of the texts that stand below assignments."""
+    for before, after in pairwise(node.body):
+        if isinstance(before, ast.Assign | ast.AnnAssign) and isinstance(after, ast.Expr):
+            value = after.value
+            if isinstance(value, ast.Constant) and isinstance(value.value, str):
+                yield after.lineno, value.value.splitlines()[0]
 
 
 def test_no_public_docstring_opens_with_a_question_word(repository: Path) -> None:

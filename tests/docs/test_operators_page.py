@@ -60,3 +60,8 @@ def test_declarations_cannot_break_the_tables() -> None:
         r"| `share` | `float \| None` | `null` m | kept |"
     ]
     assert "Fires on every message of cloud." in lines
+
+
+def test_a_default_that_would_fill_its_column_is_cut_to_its_first_entry(page: str) -> None:
+    (row,) = [line for line in page.splitlines() if line.startswith("| `color_camera` |")]
+    assert '| `{"rate": 10.0, …}` |' in row

@@ -1,4 +1,4 @@
-"""The pictures of the design page are what their script draws."""
+"""The drawn pictures of the pages are what their script draws."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import importlib.util
 from pathlib import Path
 
 
-def test_the_pictures_of_the_design_page_are_current(repository: Path) -> None:
+def test_the_drawn_pictures_are_current_and_shown(repository: Path) -> None:
     script = repository / "docs" / "images" / "draw.py"
     spec = importlib.util.spec_from_file_location("draw", script)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    page = (repository / "docs" / "design.md").read_text(encoding="utf-8")
+    pages = [(repository / "docs" / name).read_text(encoding="utf-8") for name in ("design.md", "concepts.md")]
     for name, draw in module.PICTURES.items():
         assert (script.parent / name).read_text(encoding="utf-8") == draw(), f"run {script.relative_to(repository)}"
-        assert f"(images/{name})" in page
+        assert any(f"(images/{name})" in page for page in pages)

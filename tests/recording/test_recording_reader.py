@@ -339,3 +339,26 @@ def test_foxglove_json_becomes_our_messages(data_dir: Path) -> None:
     assert all(isinstance(m, CompressedImage) and m.format == "png" for m in images) or images[0].format == "jpeg"
     assert calibration.K.ravel().tolist() == first["K"]
     assert calibration.distortion.tolist() == first["D"]
+
+
+def test_a_recording_of_a_newer_format_is_refused_with_what_to_do(
+    tmp_path: Path, pose: Callable[..., Pose], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "newer.mcap"
+    monkeypatch.setattr("dataflow.recording.writer.FORMAT", "2")
+    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
+        writer.add_stream("robot1/a/pose", Pose)
+        writer.write("robot1/a/pose", pose(1), seq=0)
+    with pytest.raises(RecordingError, match=r"format '2'.*reads format '1'.*newer"):
+        Recording(path)
+
+
+def test_a_file_of_another_program_may_have_metadata_of_that_name(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        writer.add_metadata("recording", {"format": "7"})
+        writer.finish()
+    with Recording(path) as recording:
+        assert recording.metadata["recording"] == {"format": "7"}

@@ -24,7 +24,7 @@ EXAMPLES = {
 
 def documented(repository: Path, name: str) -> bytes:
     text = (repository / "docs" / "wire-format.md").read_text()
-    found = re.search(rf"<!-- example: {name} -->\n```\n(.*?)```", text, re.DOTALL)
+    found = re.search(rf"<!-- example: {name} -->\n```text\n(.*?)```", text, re.DOTALL)
     assert found is not None, f"docs/wire-format.md has no example {name!r}"
     return bytes.fromhex(re.sub(r"^[0-9a-f]+:", "", found[1], flags=re.MULTILINE))
 

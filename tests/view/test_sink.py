@@ -32,11 +32,11 @@ from dataflow.view import (
     Spawn,
     ViewerError,
     ViewerSink,
-    blueprint,
     from_recording,
     parse_target,
     visualizer,
 )
+from dataflow.view.blueprint import blueprint
 from dataflow.view.frames import Rank
 from dataflow.view.scene import SceneState
 from dataflow.view.sink import Bounds

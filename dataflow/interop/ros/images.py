@@ -14,7 +14,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.pixels import as_depth, as_image, is_depth, stored_rows
 
 _DEPTH_HEADER = struct.Struct("<iff")
-"""What compressed_depth_image_transport puts before the PNG: format, and the quantisation parameters A and B."""
+"""The header that compressed_depth_image_transport puts before the PNG: format, quantisation parameters A and B."""
 _DEPTH_UNIT = 0.001
 _JPEG = b"\xff\xd8\xff"
 

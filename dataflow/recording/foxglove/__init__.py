@@ -64,4 +64,4 @@ FOXGLOVE_SCHEMAS: dict[type[Message], FoxgloveSchema] = {
         FoxgloveSchema(Alarm, Log, readings.encode_alarm, readings.decode_alarm),
     )
 }
-"""How the well-known types are written. Every other type is JSON."""
+"""The writers of the well-known types. Every other type is JSON."""

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from operators.scene.goal_network import open_goal_network
 from operators.scene.goals import COUNT, NAMES, NOWHERE, GoalInference, GoalPath, Places
-from operators.scene.relations import Body
+from operators.scene.bodies import Body
 from operators.weights import NetworkFileError, shipped
 
 STILL = np.zeros(3)

@@ -1,0 +1,145 @@
+"""`dataflow foxglove`: streams in Foxglove, live or from a recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.markup import escape
+from rich.text import Text
+
+from dataflow.cli.arguments import End, Start, chosen_streams, existing_recording, number, span, window
+from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
+
+if TYPE_CHECKING:
+    from dataflow.foxglove.server import FoxgloveServer
+    from dataflow.recording import Recorded
+
+PORT = 8765
+
+
+def foxglove(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="RECORDING", help="A recording (.mcap). Without one: the running graph."),
+    ] = None,
+    port: Annotated[int, typer.Option("--port", metavar="PORT", help="Where to listen; 0: a free one.")] = PORT,
+    host: Annotated[
+        str, typer.Option("--host", metavar="ADDRESS", help="The address to listen on; other machines need another.")
+    ] = "127.0.0.1",
+    streams: Annotated[
+        list[str] | None,
+        typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
+    ] = None,
+    speed: Annotated[
+        float,
+        typer.Option("--speed", metavar="FACTOR", parser=number(0.01, 100, "a factor of real time"), help="At first."),
+    ] = 1.0,
+    start: Start = None,
+    end: End = None,
+    graph: GraphName = None,
+    wait: Wait = 0.0,
+) -> None:
+    """Serve a running graph or a recording to Foxglove.
+
+    In Foxglove: Open connection, Foxglove WebSocket, and the address that is printed. Its playback bar plays the
+    recording: pause, speed, any place. Images, clouds, boxes, masks, tracks, trajectories, maps and the scene graph are
+    sent as Foxglove's own schemas; a client can never slow the graph.
+
+    Examples:
+
+      dataflow foxglove
+      dataflow foxglove run.mcap --start 5 --speed 0.5
+      dataflow foxglove --stream "camera/*" --port 9000
+    """
+    from dataflow.foxglove.server import FoxgloveError
+
+    with friendly_errors():
+        if not 0 <= port < 65536:
+            raise fail(f"--port {port}: expected 0 to 65535")
+        try:
+            if recording is not None:
+                if graph is not None or wait:
+                    raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
+                _play(existing_recording(recording), host, port, streams, speed, start, end)
+            else:
+                if start is not None or end is not None or speed != 1.0:
+                    raise fail("--start, --end and --speed are about a recording; name one")
+                _follow(host, port, streams, graph, wait)
+        except FoxgloveError as error:
+            raise fail(str(error)) from error
+
+
+def _play(
+    path: Path, host: str, port: int, words: list[str] | None, speed: float, start: float | None, end: float | None
+) -> None:
+    from dataflow.foxglove.player import Clock, play
+    from dataflow.foxglove.server import FoxgloveServer
+    from dataflow.recording import Recording
+    from dataflow.recording.layout import RECORDING
+
+    with Recording(path) as opened:
+        readable = [name for name, info in opened.streams.items() if info.message_type is not None]
+        namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
+        chosen = chosen_streams(words, readable, namespace)
+        whole = span(opened, chosen)
+        if whole is None:
+            raise fail(f"{path} holds no message of {', '.join(chosen) or 'a type that is known here'}")
+        begin, finish = window(whole, start, end, path)
+        clock = Clock(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
+        with FoxgloveServer(
+            path.name, namespace=namespace, host=host, port=port, controls=clock, span=(clock.first, clock.last)
+        ) as server:
+            _say_where(server)
+
+            def show(recorded: Recorded) -> None:
+                if recorded.stamp <= clock.last:
+                    server.show(recorded.stream, recorded.message)
+                    server.time(recorded.stamp)
+
+            def arrived() -> None:
+                server.playback(clock, did_seek=True)
+
+            def ended() -> None:
+                server.playback(clock, ended=True)
+                say("at its end; the playback bar of Foxglove goes back, Ctrl-C ends")
+
+            try:
+                play(opened, chosen, clock, show, arrived=arrived, ended=ended)
+            except KeyboardInterrupt:
+                say("ended")
+    out.print(f"shown: {plural(server.shown, 'message')}")
+
+
+def _follow(host: str, port: int, words: list[str] | None, name: str | None, wait: float) -> None:
+    from dataflow.client.attach import graph_of, still_runs, tap
+    from dataflow.foxglove.server import FoxgloveServer
+
+    found = running_graph(name, wait)
+    running = graph_of(found)
+    chosen = chosen_streams(words, running.streams, running.namespace)
+    with FoxgloveServer(running.name, namespace=running.namespace, host=host, port=port) as server:
+        _say_where(server)
+        say(f"following {escape(running.name)} (process {found.pid})")
+        clock = 0
+        try:
+            with tap(found, [f"/{stream}" for stream in chosen] if words else ["**"]) as client:
+                while (taken := client.take(timeout=0.5)) is not None or still_runs(found):
+                    message = None if taken is None else taken.decode().message
+                    if taken is None or message is None:
+                        continue
+                    server.show(taken.stream, message)
+                    if message.stamp > clock:
+                        clock = message.stamp
+                        server.time(clock)
+        except KeyboardInterrupt:
+            say("ended")
+        else:
+            say("the graph has ended")
+    out.print(f"shown: {plural(server.shown, 'message')}")
+
+
+def _say_where(server: FoxgloveServer) -> None:
+    err.print(Text(f"Foxglove: Open connection, Foxglove WebSocket, {server.address}"), soft_wrap=True)

@@ -1,0 +1,150 @@
+"""A WebSocket server that Foxglove connects to."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from dataflow.foxglove.drawing import Drawn, data_of, drawing_of, schema_of
+from dataflow.foxglove.topics import Topics
+from dataflow.messages import Message
+
+LOOPBACK = "127.0.0.1"
+BACKLOG = 256
+"""Messages that wait for a client that is slow; then its oldest are dropped. Nobody else waits."""
+
+
+class FoxgloveError(RuntimeError):
+    """The server cannot be started: says why, and what to do."""
+
+
+class Controls(Protocol):
+    """Is moved by the playback bar of Foxglove."""
+
+    def request(self, *, playing: bool, speed: float, seek: int | None) -> None:
+        """The state that a client asks for; `seek`: the stamp to go to."""
+
+    def state(self) -> tuple[bool, int, float]:
+        """Tells whether it plays, the stamp it is at, and its speed."""
+
+
+class FoxgloveServer:
+    """Shows messages to every Foxglove that is connected; one that is slow misses some. A context manager.
+
+    Listens on this machine alone unless `host` says otherwise; `port` 0 takes a free one. With `controls` and the
+    `span` of what they play (ns), Foxglove shows its playback bar. A panel that is opened later is given the newest
+    message at once. Raises `FoxgloveError`.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        *,
+        namespace: str = "",
+        host: str = LOOPBACK,
+        port: int = 8765,
+        controls: Controls | None = None,
+        span: tuple[int, int] | None = None,
+    ) -> None:
+        self._sdk = _sdk()
+        self._topics = Topics(namespace)
+        self._context = self._sdk.Context()
+        self._channels: dict[tuple[str, type[Message], Drawn | None], Any] = {}
+        self._newest: dict[int, tuple[Any, Message]] = {}
+        self._guard = threading.Lock()
+        self.shown = 0
+        capabilities = [self._sdk.Capability.Time]
+        try:
+            self._server = self._sdk.start_server(
+                name=name,
+                host=host,
+                port=port,
+                capabilities=capabilities,
+                server_listener=_Listener(self._sdk, self._again, controls),
+                context=self._context,
+                playback_time_range=span if controls is not None else None,
+                message_backlog_size=BACKLOG,
+            )
+        except (OSError, RuntimeError) as error:
+            raise FoxgloveError(f"cannot listen on {host}:{port}: {error}; another --port may be free") from error
+        self.address = f"ws://{host}:{self._server.port}"
+
+    def show(self, stream: str, message: Message) -> None:
+        """Sends a message, with the transforms that it implies, to whoever looks at its topic."""
+        for topic, shown in self._topics.of(stream, message):
+            key = (topic, type(shown), drawing_of(shown))
+            with self._guard:
+                channel = self._channels.get(key) or self._open(key, shown)
+                self._newest[channel.id()] = (channel, shown)
+            if channel.has_sinks():
+                channel.log(data_of(shown), log_time=max(shown.stamp, 0))
+        self.shown += 1
+
+    def time(self, stamp: int) -> None:
+        """Tells the clients which time it is."""
+        self._server.broadcast_time(max(stamp, 0))
+
+    def playback(self, controls: Controls, *, did_seek: bool = False, ended: bool = False) -> None:
+        """Tells the clients where the playback is."""
+        self._server.broadcast_playback_state(_state(self._sdk, controls, did_seek, ended, ""))
+
+    def close(self) -> None:
+        self._server.stop()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _open(self, key: tuple[str, type[Message], Drawn | None], message: Message) -> Any:
+        text, encoding = schema_of(message)
+        schema = self._sdk.Schema(name=text.name, encoding=text.encoding, data=text.data)
+        channel = self._sdk.Channel(key[0], schema=schema, message_encoding=encoding, context=self._context)
+        self._channels[key] = channel
+        return channel
+
+    def _again(self, channel_id: int) -> None:
+        """A client begins to look at a channel: it is given the newest message."""
+        with self._guard:
+            found = self._newest.get(channel_id)
+        if found is not None:
+            channel, message = found
+            channel.log(data_of(message), log_time=max(message.stamp, 0))
+
+
+class _Listener:
+    """Is told by the server, on its threads, what clients do."""
+
+    def __init__(self, sdk: Any, subscribed: Callable[[int], None], controls: Controls | None) -> None:
+        self._sdk, self._subscribed, self._controls = sdk, subscribed, controls
+
+    def on_subscribe(self, client: Any, channel: Any) -> None:
+        self._subscribed(channel.id)
+
+    def on_playback_control_request(self, request: Any) -> Any:
+        if self._controls is None:
+            return None
+        playing = request.playback_command == self._sdk.websocket.PlaybackCommand.Play
+        self._controls.request(playing=playing, speed=request.playback_speed, seek=request.seek_time)
+        return _state(self._sdk, self._controls, request.seek_time is not None, False, request.request_id)
+
+
+def _state(sdk: Any, controls: Controls, did_seek: bool, ended: bool, request: str) -> Any:
+    playing, stamp, speed = controls.state()
+    statuses = sdk.websocket.PlaybackStatus
+    status = statuses.Ended if ended else statuses.Playing if playing else statuses.Paused
+    return sdk.websocket.PlaybackState(status, max(stamp, 0), speed, did_seek, request)
+
+
+def _sdk() -> Any:
+    try:
+        import foxglove
+        import foxglove.websocket
+    except ImportError as error:
+        raise FoxgloveError('foxglove-sdk is not installed; it comes with: pip install -e ".[foxglove]"') from error
+    return foxglove
