@@ -27,11 +27,11 @@ from dataflow.messages import Activity, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from operators.recognition import ActivityRecognizer
 from operators.recognition.episodes import Episode
-from operators.recognition.goal_samples import ARRIVALS, UNDER_WAY
 from operators.scene import SceneGraphBuilder
 from operators.training.simulated_people import read_episodes, write_episodes
 
 SECOND = 1_000_000_000
+ARRIVALS, UNDER_WAY = ("sitting_down", "sitting", "reaching"), ("standing", "walking")
 CANDIDATES = ("chair", "table", "mug", "bottle", "door", "shelf")
 
 

@@ -15,10 +15,9 @@ from dataflow.messages.geometry import yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.agent_features import AGENTS, MATTERING, AgentWindow, Surroundings
+from operators.scene.agents import UNKNOWN
 from operators.scene.bodies import Body
 from operators.weights import shipped
-
-UNKNOWN = "unknown"
 
 
 @dataclass

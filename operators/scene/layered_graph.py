@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.agents import Motion, activity_of
+from operators.scene.agents import GoalInference, Motion, activity_of
 from operators.scene.bodies import Body, BoxPairs
-from operators.scene.goals import CARRIERS, SEATS, GoalInference, Places, Score
 from operators.scene.relations import FLOOR, ROBOT, ROOM, Hysteresis, Relation, RelationRules, relations_of
 
 Array = NDArray[np.float64]
@@ -26,7 +25,9 @@ class GraphSettings:
     smoothing: float = 0.4
     agents: tuple[str, ...] = ("person", "robot", "ball")
     goals: tuple[str, ...] = ("chair", "table", "mug", "bottle", "door", "shelf")
-    memory: float = 0.4
+    trust: float = 2.0
+    memory: float = 4.0
+    elsewhere: float = 2.5
     least_goal: float = 0.1
     rules: RelationRules = field(default_factory=RelationRules)
 
@@ -68,9 +69,8 @@ class LayeredGraph:
     activities and goals are inferred; `heads_for` is a relation of an agent to each likely goal, with its probability.
     """
 
-    def __init__(self, settings: GraphSettings, score: Score) -> None:
-        """`score` tells of candidates how likely they are goals."""
-        self._settings, self._score = settings, score
+    def __init__(self, settings: GraphSettings) -> None:
+        self._settings = settings
         self._hysteresis = Hysteresis(settings.begin, settings.end, settings.smoothing)
         self._motions: dict[int, Motion] = {}
         self._goals: dict[int, GoalInference] = {}
@@ -92,12 +92,7 @@ class LayeredGraph:
         vanished = self._known - ids
         self._forget(vanished)
         now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
-        persons = [b for b in bodies if b.agent and b.label == "person"]
-        places = Places.of(
-            [b for b in bodies if persons and b.label in s.goals],
-            [b for b in bodies if b.label in (*CARRIERS, *SEATS)],
-        )
-        goals = {b.id: self._goals_of(time, b, places, now) for b in persons}
+        goals = {b.id: self._goals_of(time, b, bodies, now) for b in bodies if b.agent and b.label == "person"}
         held, began, ended = self._hysteresis.update(stamp, now)
         for agent, likely in goals.items():
             sure = {i: p for i, p in likely.items() if i >= 0 and p >= s.least_goal}
@@ -130,12 +125,15 @@ class LayeredGraph:
         self._known = {int(i) for i in state["known"]}
 
     def _inference(self) -> GoalInference:
-        return GoalInference(self._score, self._settings.memory)
+        s = self._settings
+        return GoalInference(s.trust, s.memory, s.elsewhere)
 
-    def _goals_of(self, time: float, agent: Body, places: Places, now: Mapping[Relation, float]) -> dict[int, float]:
-        """Returns where an agent is probably going; who sits goes nowhere."""
-        likely = self._goals.setdefault(agent.id, self._inference()).update(time, agent, places)
-        return {} if any(s == agent.id and p == "sitting_on" for (s, p, _) in now) else likely
+    def _goals_of(
+        self, time: float, agent: Body, bodies: Sequence[Body], now: Mapping[Relation, float]
+    ) -> dict[int, float]:
+        taken = {o for (s, p, o) in now if s == agent.id and p == "sitting_on"}
+        wanted = [b for b in bodies if b.label in self._settings.goals and b.id not in taken]
+        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, wanted)
 
     def _act(self, stamp: int, agent: Body, held: Mapping[Relation, float], goals: Mapping[int, float]) -> Act:
         activity, score, object = activity_of(agent, self._motions[agent.id], held)

@@ -15,10 +15,8 @@ from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES, UNKNOWN
 from operators.scene.bodies import Body
-from operators.scene.goal_network import open_goal_network
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
 from operators.scene.relations import FLOOR, ROBOT, ROOM, RelationRules
-from operators.weights import shipped
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""
@@ -64,14 +62,10 @@ class SceneGraphBuilder(Operator):
     )
     fresh: float = Param(0.5, ge=0, doc="age up to which a recognised activity counts", unit="s")
 
-    goal_weights: str | None = Param(None, doc="network file of `dataflow train goals`; none means the shipped one")
-
     def setup(self) -> None:
-        """Raises ValueError for an end that is not below the beginning, FileNotFoundError or NetworkFileError."""
+        """Raises ValueError for an end that is not below the beginning."""
         if self.end >= self.begin:
             raise ValueError(f"end {self.end} must be below begin {self.begin}")
-        file = str(shipped("goals.onnx")) if self.goal_weights is None else self.goal_weights
-        self._score = open_goal_network(self.use_file(file))
         self._counts: Counter[str] = Counter()
         self._begin()
 
@@ -85,8 +79,7 @@ class SceneGraphBuilder(Operator):
                 agents=tuple(self.agents),
                 goals=tuple(self.goals),
                 rules=rules,
-            ),
-            self._score,
+            )
         )
         self._names: dict[int, str] = {}
 

@@ -44,12 +44,6 @@ def export_steps(network: nn.Module, examples: tuple[Tensor, ...], facts: Mappin
     _write(copy.deepcopy(network).cpu().eval(), examples, list(rows), outputs, rows | given, facts, file)
 
 
-def export_rows(network: nn.Module, width: int, facts: Mapping[str, Any], file: Path) -> None:
-    """Exports a network that gives one score (N,) for each row (N, width), any N."""
-    axes = {"rows": {0: "count"}, "scores": {0: "count"}}
-    _write(copy.deepcopy(network).eval(), (torch.zeros(2, width),), ["rows"], ["scores"], axes, facts, file)
-
-
 def _write(
     network: nn.Module,
     examples: tuple[Tensor, ...],

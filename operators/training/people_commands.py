@@ -1,4 +1,4 @@
-"""`dataflow train activity` and `train goals`: networks about people, trained on simulated worlds without images."""
+"""`dataflow train activity`: what people do, learned from simulated worlds without images."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by whic
 Processes = Annotated[int, typer.Option(min=1, help="Worlds made at once.")]
 Variations = Annotated[int, typer.Option(min=0, help="Times that a tracker's errors are drawn for each world.")]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes through the tracks.")]
-Batch = Annotated[int, typer.Option(min=1, help="Tracks, or moments of ways, a step.")]
+Batch = Annotated[int, typer.Option(min=1, help="Tracks a step.")]
 
 
 def train_activity(
@@ -30,14 +30,14 @@ def train_activity(
     validation: Chosen = 12,
     processes: Processes = 1,
     variations: Variations = 4,
-    epochs: Epochs = 16,
+    epochs: Epochs = 10,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("activity.onnx"),
     resume: Resume = False,
     overwrite: Overwrite = False,
     batch: Batch = 32,
     learning_rate: Rate = 3e-3,
     seed: Seed = 0,
-    evaluate_every: Every = 2,
+    evaluate_every: Every = 1,
     threads: Threads = 1,
     device: Device = "cpu",
     json: Json = False,
@@ -62,45 +62,6 @@ def train_activity(
         )  # fmt: skip
         outcome = run_task(task, settings, out, resume, json)
     report(outcome, "operators.recognition:ActivityRecognizer", json)
-
-
-def train_goals(
-    data: Folder,
-    worlds: Worlds = 100,
-    validation: Chosen = 12,
-    processes: Processes = 1,
-    variations: Variations = 2,
-    epochs: Epochs = 8,
-    out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("goals.onnx"),
-    resume: Resume = False,
-    overwrite: Overwrite = False,
-    batch: Batch = 128,
-    learning_rate: Rate = 3e-3,
-    seed: Seed = 0,
-    evaluate_every: Every = 1,
-    threads: Threads = 1,
-    device: Device = "cpu",
-    json: Json = False,
-) -> None:
-    """Train the goal network, which tells where people are going, on simulated worlds without images.
-
-    The score is the share of arrivals one second before which the true goal was first, the mean of true and tracked
-    boxes. `operators.scene:SceneGraphBuilder` takes the file as `goal_weights`.
-    """
-    with friendly():
-        keep_earlier(out, resume, overwrite)
-        from operators.recognition.goal_training import GoalTask
-        from operators.training.loop import Settings
-
-        training, choosing = _episodes(data, worlds, validation, processes, json)
-        task = GoalTask(training, choosing, seed=seed, variations=variations)
-        _tell(f"{task.samples} moments of {worlds} worlds to train on, {validation} worlds to choose by", json)
-        settings = Settings(
-            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=1, threads=threads,
-            device=device,
-        )  # fmt: skip
-        outcome = run_task(task, settings, out, resume, json)
-    report(outcome, "operators.scene:SceneGraphBuilder", json)
 
 
 def _episodes(

@@ -9,7 +9,6 @@ import numpy as np
 from operators.recognition.activity_samples import labels_of, right_within, tracked_sequences, true_sequences
 from operators.recognition.agent_features import COUNT
 from operators.recognition.episodes import Episode
-from operators.recognition.goal_samples import ways
 from operators.recognition.tracked_people import tracked_moments, true_moments
 
 CLASSES = ("standing", "walking", "sitting_down")
@@ -75,14 +74,6 @@ def test_features_are_finite_and_labels_trail_by_a_quarter_of_a_second() -> None
     assert labels[50] == CLASSES.index("standing")
     right = right_within(made, track, CLASSES, 0.5)
     assert right[46].tolist() == [True, True, False]
-
-
-def test_ways_end_at_their_goal() -> None:
-    made = episode()
-    (way,) = ways(made, true_moments(made, 2), [7])
-    assert all(each.ids[each.goal] == 5 for each in way)
-    assert way[0].ahead == 8.0
-    assert way[-1].ahead == 0.25
 
 
 def test_an_episode_is_read_as_it_was_written(tmp_path: Path) -> None:

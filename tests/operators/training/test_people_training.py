@@ -1,4 +1,4 @@
-"""Training of activities and goals by command, on made episodes; and episodes of simulated worlds."""
+"""Training of activities by command, on made episodes; and episodes of simulated worlds."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_score import macro_f1
 from operators.recognition.agent_features import COUNT
 from operators.recognition.episodes import Episode
-from operators.scene.goal_network import open_goal_network
-from operators.scene.goals import COUNT as DESCRIBED
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, worlds, write_episodes
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
@@ -77,28 +75,21 @@ def test_the_activity_network_is_trained_scored_and_written(folder: Path, tmp_pa
     np.testing.assert_allclose(alone[0], probabilities[0], rtol=1e-5)
 
 
-def test_the_goal_network_is_trained_scored_and_written(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "goals.onnx"
-    done = CliRunner().invoke(train, ["goals", str(folder), "--out", str(out), *WORDS, "--epochs", "3", "--json"])
-    assert done.exit_code == 0, done.output
-    assert json.loads(done.stdout)["scores"]["true"] >= 0
-    assert open_goal_network(out)(np.zeros((4, DESCRIBED), np.float32)).shape == (4,)
-
-
 def test_equal_seeds_give_equal_networks(folder: Path, tmp_path: Path) -> None:
-    files = [tmp_path / "a.onnx", tmp_path / "b.onnx"]
-    outputs = []
-    for file in files:
-        done = CliRunner().invoke(train, ["goals", str(folder), "--out", str(file), *WORDS, "--epochs", "1", "--json"])
+    answers = []
+    for file in (tmp_path / "a.onnx", tmp_path / "b.onnx"):
+        words = ["activity", str(folder), "--out", str(file), *WORDS, "--epochs", "1", "--json"]
+        done = CliRunner().invoke(train, words)
         assert done.exit_code == 0, done.output
-        outputs.append(open_goal_network(file)(np.ones((2, DESCRIBED), np.float32)).tobytes())
-    assert outputs[0] == outputs[1]
+        model = ActivityModel.open(file)
+        answers.append(model.step(np.ones((2, COUNT), np.float32), np.stack([model.fresh()] * 2))[0].tobytes())
+    assert answers[0] == answers[1]
 
 
 def test_an_earlier_network_is_not_lost(folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "goals.onnx"
+    out = tmp_path / "activity.onnx"
     out.write_bytes(b"mine")
-    done = CliRunner().invoke(train, ["goals", str(folder), "--out", str(out), *WORDS])
+    done = CliRunner().invoke(train, ["activity", str(folder), "--out", str(out), *WORDS])
     assert done.exit_code == 1
     assert out.read_bytes() == b"mine"
 
