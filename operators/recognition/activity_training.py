@@ -183,7 +183,9 @@ def varied(features: NDArray[np.float32], held: NDArray[np.bool_], rng: np.rando
     What tells an activity must not hang on a single group of features. Nothing moves in rows that are `held`.
     """
     found = features + rng.normal(0, 0.01, features.shape).astype(np.float32)
-    found[np.ix_(held, _MOVING)] = rng.normal(0, 0.01, (int(held.sum()), len(_MOVING)))
+    resting = found[held]
+    resting[:, _MOVING] = rng.normal(0, 0.01, (len(resting), len(_MOVING)))
+    found[held] = resting
     found[:, _SIDES] += rng.normal(0, 0.08, len(_SIDES)).astype(np.float32)
     found[:, _GROWN] += np.abs(rng.normal(0, 0.05, len(_GROWN))).astype(np.float32)
     for columns, nothing in _AROUND:

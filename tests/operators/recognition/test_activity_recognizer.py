@@ -59,7 +59,7 @@ def test_who_walks_and_then_stands_is_said_to() -> None:
     graphs = course(8, lambda t: [person(0.65 * min(t, 4.0), 0.0, length=0.8 if t < 4 else 0.35)])
     found = answers(graphs)
     assert set(found[4:15]) == {"walking"}
-    assert set(found[22:]) == {"standing"}
+    assert set(found[24:]) == {"standing"}
 
 
 def test_who_lowers_onto_a_chair_sits_down_and_then_sits_on_it() -> None:
