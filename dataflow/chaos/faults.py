@@ -63,7 +63,7 @@ class SourceFaults:
         self._shift = 0
         self._past: int | None = None
         self.begun = False
-        """Whether there ever was a fault: until then every step takes its own place."""
+        """True once there was a fault: until then every step takes its own place."""
 
     def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
         self.begun = True

@@ -74,7 +74,7 @@ def merge(
 
 
 def _prefixes(words: Sequence[str], recordings: Sequence[Path]) -> list[str]:
-    """What is put before the streams of each recording."""
+    """Prefixes of the streams of each recording."""
     from dataflow.graph.keys import key_fault
 
     found = [""] * len(recordings)

@@ -36,7 +36,8 @@ FLUSH_EVERY = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Splitting:
-    """When a recording goes on in another file: after so many bytes, or so much event time (ns); None: never."""
+    """Limits of one file, after which a recording goes on in the next: after so many bytes, or so much event time (ns);
+    None: never."""
 
     size: int | None = None
     every: int | None = None

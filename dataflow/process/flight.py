@@ -62,7 +62,7 @@ class Wanted:
     due: int
     reasons: list[dict[str, Any]] = field(default_factory=list)
     over: float = 0.0
-    """When it was seen that it is over (s, steady); 0 until then."""
+    """Time (s, steady) at which it was seen to be over; 0 until then."""
 
 
 class FlightSink:

@@ -109,4 +109,4 @@ class InertialSensor:
         self._kept = [sample_of(row) for row in state["samples"]]
         self._first, self._last = (int(stamp) for stamp in state["stamps"])
         if (noise := state.get("noise")) is not None:
-            self._noise = Noise(*noise, self._config.gyro_walk, self._config.accel_walk)
+            self._noise = Noise(noise[0], noise[1], self._config.gyro_walk, self._config.accel_walk)

@@ -32,7 +32,7 @@ class PoseFusion(Operator):
     moves fast, or with biases and delays, there is EkfFusion.
     """
 
-    estimates: In[Pose | Odometry | Imu] = In(many=True, doc="poses in `frame` with covariance; orientations")
+    estimates: In[Imu | Pose | Odometry] = In(many=True, doc="poses in `frame` with covariance; orientations")
     extrinsics: Sampled[Transforms] = Sampled(required=False, doc="where what the sensors pose is on the body")
     pose: Out[Pose] = Out(doc="the body in `frame`, once position and orientation are known")
     status: Out[Diagnostics] = Out(doc="which sensors agree; every second, and at once when one contradicts another")

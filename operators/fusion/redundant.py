@@ -1,4 +1,4 @@
-"""What several sensors said last about the same thing, and how far they agree: begun alike by all that average them."""
+"""Keeps what several sensors said last about the same thing, and how far they agree, for all that average them."""
 
 from __future__ import annotations
 
@@ -47,5 +47,5 @@ class RedundantSensors(Generic[M]):
         return self.agreement.status(stamp, self.ignored)
 
     def summary(self) -> dict[str, float | int | str]:
-        figures = {f"ignored, {reason}": count for reason, count in sorted(self.ignored.items())}
-        return {"two sensors contradicted each other": self.agreement.split} | figures
+        figures: dict[str, float | int | str] = {"two sensors contradicted each other": self.agreement.split}
+        return figures | {f"ignored, {reason}": count for reason, count in sorted(self.ignored.items())}

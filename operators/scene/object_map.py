@@ -111,7 +111,7 @@ class ObjectMap:
         ranked = np.sort(ranges)
         counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
         first = ranked[int(np.argmax(counts))]
-        return each.points[(ranges >= first) & (ranges <= first + deep)]
+        return np.asarray(each.points[(ranges >= first) & (ranges <= first + deep)])
 
     def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
@@ -152,8 +152,6 @@ class ObjectMap:
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
             object.cells = cells
-            object.form = -1
-            object.images = [] if each.image is None or not each.image.edges.any() else [each.image]
             object.fit(self._usual, self._heading, self._settings.range_noise)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
@@ -174,7 +172,7 @@ class ObjectMap:
             made.color = each.color
         made.view = _direction(eye, cells)
         made.center = cells.middle
-        if each.image is not None:
+        if each.image is not None and not self.is_mover(made):  # one view alone tells less than the points
             made.look(each.image)
         made.fit(self._usual, self._heading, self._settings.range_noise)
         self.objects[made.id] = made

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,32 +66,43 @@ def relations_of(
     things = [b for b in bodies if b.id not in (FLOOR, ROOM, ROBOT)]
     floor = next((b for b in bodies if b.id == FLOOR), None)
     held: set[int] = set()
-    pairs = _close_pairs(things, 1.5 + rules.above)
+    around = _pairs(things, [b for b in things if b.agent], 1.5 + rules.above, flat=False)
+    stacks = _pairs(things, things, 0.0, flat=True)
+    beside = _pairs(things, things, 1.2 * rules.near, flat=False)
     for person in things:
         if person.agent:
-            held |= _contact(found, person, [b for b in pairs[person.id] if not b.agent], things, boxes, rules)
+            held |= _contact(found, person, [b for b in around[person.id] if not b.agent], things, boxes, rules)
+    sitting = {s for s, p, _ in found if p == "sitting_on"}
     for body in things:
-        if body.id not in held and not any(s == body.id and p == "sitting_on" for s, p, _ in found):
-            _placed(found, body, pairs[body.id], floor, boxes, rules)
+        if body.id not in held and body.id not in sitting:
+            _placed(found, body, stacks[body.id], floor, boxes, rules)
+    seen: dict[int, list[float]] = {}
+    if T_world_robot is not None:
+        seen = {b.id: (T_world_robot[:3, :2].T @ b.center).tolist() for b in things}
     for first in things:
-        for second in pairs[first.id]:
+        for second in stacks[first.id]:
             _stacked(found, first, second, boxes, rules)
+        for second in beside[first.id]:
             if first.id < second.id:
-                _beside(found, first, second, T_world_robot, boxes, rules)
-            if first.agent:
+                _beside(found, first, second, seen, boxes, rules)
+        if first.agent:
+            for second in around[first.id]:
                 _moving(found, first, second, rules)
     if any(b.id == ROOM for b in bodies):
         found |= {(b.id, "part_of", ROOM): 1.0 for b in bodies if b.id == FLOOR}
     return found
 
 
-def _close_pairs(things: Sequence[Body], reach: float) -> dict[int, list[Body]]:
-    """Returns the other things whose spheres come within a reach of each thing's."""
-    centers = np.array([b.center for b in things]).reshape(-1, 3)
-    radii = np.array([float(np.linalg.norm(b.size)) / 2 for b in things])
+def _pairs(things: Sequence[Body], of: Sequence[Body], reach: float, *, flat: bool) -> dict[int, list[Body]]:
+    """Returns the other things whose spheres, or circles as seen from above, come within a reach of each one's."""
+    axes = 2 if flat else 3
+    centers = np.array([b.center[:axes] for b in things]).reshape(-1, axes)
+    radii = np.array([float(np.linalg.norm(b.size[:axes])) / 2 for b in things])
+    row = {b.id: k for k, b in enumerate(things)}
     close: dict[int, list[Body]] = {}
-    for k, body in enumerate(things):
-        apart = np.linalg.norm(centers - centers[k], axis=1) - radii - radii[k]
+    for body in of:
+        k = row[body.id]
+        apart = np.sqrt(((centers - centers[k]) ** 2).sum(axis=1)) - radii - radii[k]
         close[body.id] = [things[j] for j in np.flatnonzero(apart <= reach).tolist() if j != k]
     return close
 
@@ -145,19 +156,21 @@ def _beside(
     found: dict[Relation, float],
     first: Body,
     second: Body,
-    T_world_robot: Array | None,
+    seen: Mapping[int, Sequence[float]],
     boxes: BoxPairs,
     rules: RelationRules,
 ) -> None:
-    """Finds near, and of things near each other which is left of or in front of the other for the robot."""
+    """Finds near, and of things near each other which is left of or in front of the other.
+
+    `seen` are how far ahead and how far left each is for the robot; empty without one.
+    """
     apart = boxes.gap(first, second)
     if apart > 1.2 * rules.near:
         return
-    found[first.id, "near", second.id] = float(np.clip(1 - 0.5 * apart / rules.near, 0, 1))
-    if T_world_robot is None or apart > rules.near:
+    found[first.id, "near", second.id] = min(max(1 - 0.5 * apart / rules.near, 0.0), 1.0)
+    if not seen or apart > rules.near:
         return
-    offset = first.center - second.center
-    y, x = float(offset @ T_world_robot[:3, 1]), float(offset @ T_world_robot[:3, 0])
+    x, y = (a - b for a, b in zip(seen[first.id], seen[second.id], strict=True))
     larger, smaller = max(abs(x), abs(y)), min(abs(x), abs(y))
     if larger < rules.side:
         return

@@ -35,7 +35,7 @@ AGREE = (0.1, 0.05)  # metres and radians by which two sights of one surprise ma
 class GraphSettings:
     """Settings of a map; angles are of view: rotation plus baseline over depth, radians."""
 
-    spacing: float = 0.2  # between views of the map
+    spacing: float = 0.2  # between views of the map; half of that while it is searched for
     travel: float = 1.5  # along the way between two views that a loop may join
     beside: int = 2  # views compared with, of those a little before
     near: int = 2  # views compared with, of those that the map expects here
@@ -130,7 +130,7 @@ class VisualGraph:
         moved = 0.0
         if last is not None and not broken:
             moved = view_distance(last.T_odom, keyframe.T_world_camera, depth)
-            if moved < self._settings.spacing:
+            if moved < self._settings.spacing * (1.0 if self.located else 0.5):
                 return Added()
         before = self.graph.newest if last is not None else None
         new = Node(

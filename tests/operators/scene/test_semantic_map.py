@@ -167,3 +167,42 @@ def test_voxels_that_are_seen_through_go() -> None:
     for _ in range(3):
         cells.carve(np.array([True, False]))
     assert cells.points.tolist() == [[1, 0, 0]]
+
+
+def with_images(solids: Sequence[Solid], count: int = 10) -> list[tuple[Any, ...]]:
+    """Views with the boxes of the image: arguments of `SemanticMap.process`."""
+    lifter = ObjectLifter()
+    lifter.setup()
+    made = []
+    for k in range(count):
+        position, yaw = AROUND[k % len(AROUND)]
+        pose = camera((k + 1) * SECOND // 5, position, yaw)
+        cloud, detections, masks = look(pose, solids, noise=0.004)
+        found = lifter.process(detections, cloud, INFO, segmentation=masks, pose=pose)
+        made.append((found["boxes"], found["clusters"], cloud, pose, None, found["images"], INFO))
+    return made
+
+
+def test_boxes_of_the_image_keep_neighbours_apart_and_a_restored_map_goes_on_the_same() -> None:
+    """Two crates that nearly touch, seen from the front: voxels alone cannot tell where one ends."""
+    pair: list[Solid] = [((2.5, y, 0.15), (0.3, 0.2, 0.3), 0.0, 0) for y in (0.0, 0.22)]
+    given = with_images(pair)
+    whole, restored = SemanticMap(), SemanticMap()
+    for operator in (whole, restored):
+        operator.setup()
+    outputs = [whole.process(*view) for view in given[:5]]
+    restored.restore(whole.snapshot())
+    for view in given[5:]:
+        outputs.append(whole.process(*view))
+        assert restored.process(*view)["objects"] == outputs[-1]["objects"]
+    message = outputs[-1]["objects"]
+    assert len(ids(message)) == 2
+    assert min(best_iou(message, solid) for solid in pair) > 0.5
+
+
+def test_images_of_another_camera_are_refused() -> None:
+    (view,) = with_images([CRATE], 1)
+    operator = SemanticMap()
+    operator.setup()
+    with pytest.raises(ValueError, match="images are of 320x240 pixels in 'camera', but image_info describes 320x240"):
+        operator.process(*view[:6], INFO.replace(frame="other"))
