@@ -38,7 +38,7 @@ from operators.training.learning import learn as command
 OPTICS = Optics(640, 480, 544.0, 544.0, 319.5, 239.5)
 LEARNED, HELD_OUT = 71_000, 72_000
 """First seeds of the worlds to learn in and to judge by."""
-KINDS = ("office", "table_top", "corridor")
+KINDS, WITH_TABLES = ("office", "table_top", "corridor"), ("office", "table_top", "office")
 VISIBLE, PIXELS, IOU = 0.5, 300, 0.5
 
 
@@ -173,7 +173,8 @@ def written(folder: Path, name: str, count: int) -> tuple[Path, Path]:
         images: list[dict[str, Any]] = []
         annotations: list[dict[str, Any]] = []
         for k in range(worlds):
-            kind = KINDS[k] if part == "held_out" else "office"
+            kinds = KINDS if name in ON_FLOOR else WITH_TABLES
+            kind = kinds[k] if part == "held_out" else "office"
             for pixels, truth in views(name, kind, first + k, each):
                 file = f"{len(images):03d}.png"
                 cv2.imwrite(str(place / file), pixels[..., ::-1])
