@@ -19,7 +19,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from scene_graph import acts, macro_f1, majority, matched
+from scene_graph import acts, macro_f1, majority
 from semantic_map import mapped
 from sensed_worlds import KINDS, World, sensed
 
@@ -28,6 +28,7 @@ from dataflow.messages.geometry import quaternion_from_yaw
 from operators.recognition import ActivityRecognizer
 from operators.recognition.episodes import Episode
 from operators.scene import SceneGraphBuilder
+from operators.scene.scoring import match_nodes
 from operators.training.simulated_people import read_episodes, write_episodes
 
 SECOND = 1_000_000_000
@@ -86,13 +87,13 @@ def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
 
 
 def sensor_steps(world: World) -> Iterator[Step]:
-    _, nodes = mapped(world, true=False)
+    nodes = mapped(world, true=False)
     for frame, given in zip(world.frames, nodes, strict=True):
         view = set(frame.objects.ids[frame.objects.visible >= 0.3].tolist())
         said = zip(frame.activities.subjects.tolist(), frame.activities.goals, strict=True)
         goals = {i: int(g.rpartition(" ")[2]) if g.rpartition(" ")[2].isdigit() else -1 for i, g in said}
         truth = frame.scene
-        yield Step(given, frame.base, view, acts(frame.activities), goals, lambda g, t=truth: matched(g, t))
+        yield Step(given, frame.base, view, acts(frame.activities), goals, lambda g, t=truth: match_nodes(g, t))
 
 
 def figures_of(steps: list[Step]) -> Figures:
