@@ -1,6 +1,8 @@
-"""Operators that say what an image or an object is, and describe it by a vector."""
+"""Operators that say what an image or an object is, describe it by a vector, or say what an agent does."""
 
+from operators.recognition.activity_recognizer import ActivityRecognizer
 from operators.recognition.feature_extractor import FeatureExtractor
 from operators.recognition.image_classifier import ImageClassifier
+from operators.recognition.learned_detector import LearnedDetector
 
-__all__ = ["FeatureExtractor", "ImageClassifier"]
+__all__ = ["ActivityRecognizer", "FeatureExtractor", "ImageClassifier", "LearnedDetector"]

@@ -14,6 +14,7 @@ from operators.scene.relations import Relation
 
 Array = NDArray[np.float64]
 
+UNKNOWN = "unknown"
 ACTIVITIES = (
     "standing",
     "walking",
@@ -25,7 +26,7 @@ ACTIVITIES = (
     "rolling",
     "driving",
     "resting",
-    "unknown",
+    UNKNOWN,
 )
 _WINDOW = 1.0  # seconds of the past that tell how an agent moves
 _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
@@ -70,7 +71,7 @@ def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float])
     """Returns what an agent does, how sure that is, and the id of what it does it to, -1 for nothing."""
     speed = float(np.hypot(*motion.velocity()[:2]))
     if len(motion.past) < 3:
-        return "unknown", 0.3, -1
+        return UNKNOWN, 0.3, -1
     if body.label == "ball":
         return ("rolling", _sure(speed, _ROLLING), -1) if speed > _ROLLING else ("resting", _sure(_ROLLING, speed), -1)
     if body.label != "person":

@@ -13,7 +13,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
-from operators.scene.agents import ACTIVITIES
+from operators.scene.agents import ACTIVITIES, UNKNOWN
 from operators.scene.bodies import Body
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
 from operators.scene.relations import FLOOR, ROBOT, ROOM, RelationRules
@@ -29,7 +29,7 @@ class SceneGraphBuilder(Operator):
     boxes, scored, and begin and end with hysteresis: on, in, under, above, near, left_of and in_front_of (of things
     near each other, as the robot sees them), part_of, sitting_on, holding, facing, approaching, and heads_for, whose
     score is the probability that the agent is going there. supports, right_of and behind are inverses and asked for as
-    such. Activities come from motion and contact, or from a recogniser where one is given.
+    such. Activities come from a recogniser, or where there is none or it does not know, from motion and contact.
 
     Method: layers after Armeni et al., "3D scene graph", 2019, and Hughes et al., "Hydra", 2022; goals after Ramirez
     and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010.
@@ -41,7 +41,7 @@ class SceneGraphBuilder(Operator):
         required=False, doc="holds the transform between `robot_frame` and the frame that `robot` poses"
     )
     recognized: Sampled[Activity] = Sampled(
-        required=False, doc="activities of agents by another operator; these replace our own while they are fresh"
+        required=False, doc="activities of agents by ActivityRecognizer; known and fresh ones replace our own"
     )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
@@ -195,6 +195,8 @@ def _recognized(act: Act, recognized: Activity) -> Act:
         return act
     k = int(rows[0])
     name = recognized.class_names[recognized.class_ids[k]] if recognized.class_names else str(recognized.class_ids[k])
+    if name == UNKNOWN:
+        return act
     object = act.object if recognized.objects is None else int(recognized.objects[k])
     since = act.since if recognized.since is None else int(recognized.since[k])
     return Act(act.agent, name, float(recognized.scores[k]), object, since, act.goals)

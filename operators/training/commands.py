@@ -38,6 +38,7 @@ from operators.training.options import (
     Width,
     Workers,
 )
+from operators.training.people_commands import train_activity
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data
 
 __all__ = ["evaluate", "train"]
@@ -45,6 +46,7 @@ __all__ = ["evaluate", "train"]
 train = typer.Typer(
     name="train", help="Train the project's networks on your own data.", no_args_is_help=True, rich_markup_mode="rich"
 )
+train.command("activity")(train_activity)
 
 
 @train.command("detector")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from operators.training.files import whole
 from operators.weights.network_file import KEY
@@ -29,18 +29,42 @@ def export_network(
     Weights are stored as float16 and widened when the file is loaded; arithmetic is float32. The file appears whole or
     not at all. `facts` must be plain values.
     """
+    still = copy.deepcopy(network).cpu().eval()
+    _write(still, (torch.zeros(1, 3, size[1], size[0]),), ["image"], list(outputs), None, facts, file)
+
+
+def export_steps(network: nn.Module, examples: tuple[Tensor, ...], facts: Mapping[str, Any], file: Path) -> None:
+    """Exports one step of a recurrent network: (features, hidden, cell) → (probabilities, hidden, cell), any N.
+
+    Features are (N, F), states (L, N, W). Weights are stored as those of `export_network`.
+    """
+    rows = {"features": {0: "agents"}, "hidden": {1: "agents"}, "cell": {1: "agents"}}
+    outputs = ["probabilities", "next_hidden", "next_cell"]
+    given = {"probabilities": {0: "agents"}, "next_hidden": {1: "agents"}, "next_cell": {1: "agents"}}
+    _write(copy.deepcopy(network).cpu().eval(), examples, list(rows), outputs, rows | given, facts, file)
+
+
+def _write(
+    network: nn.Module,
+    examples: tuple[Tensor, ...],
+    inputs: list[str],
+    outputs: list[str],
+    axes: dict[str, dict[int, str]] | None,
+    facts: Mapping[str, Any],
+    file: Path,
+) -> None:
     import onnx  # heavy, and needed only here
 
-    still = copy.deepcopy(network).cpu().eval()
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as folder:
         # The exporter that needs no further package; its successor needs onnxscript.
         warnings.simplefilter("ignore")
         torch.onnx.export(
-            still,
-            (torch.zeros(1, 3, size[1], size[0]),),
+            network,
+            examples,
             Path(folder) / "network.onnx",
-            input_names=["image"],
-            output_names=list(outputs),
+            input_names=inputs,
+            output_names=outputs,
+            dynamic_axes=axes,
             opset_version=_OPSET,
             dynamo=False,
         )

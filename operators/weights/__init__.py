@@ -3,10 +3,11 @@
 from operators.weights.network_file import (
     Network,
     NetworkFileError,
+    facts_of,
     open_network,
     read_facts,
     shipped,
     training_seed,
 )
 
-__all__ = ["Network", "NetworkFileError", "open_network", "read_facts", "shipped", "training_seed"]
+__all__ = ["Network", "NetworkFileError", "facts_of", "open_network", "read_facts", "shipped", "training_seed"]

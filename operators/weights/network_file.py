@@ -56,7 +56,7 @@ def open_network(file: Path, kind: str) -> Network:
     Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`, `classifier`).
     """
     session = open_session(file)
-    facts = _facts(file, session)
+    facts = facts_of(file, session)
     if facts.get("kind") != kind:
         raise NetworkFileError(f"{file} is a {facts.get('kind')}; a {kind} is needed: `dataflow train {kind} DATA`")
     inputs = session.get_inputs()
@@ -71,7 +71,7 @@ def open_network(file: Path, kind: str) -> Network:
 
 def read_facts(file: Path) -> dict[str, Any]:
     """The metadata of a network file. Raises NetworkFileError."""
-    return _facts(file, open_session(file))
+    return facts_of(file, open_session(file))
 
 
 def training_seed(file: Path) -> int:
@@ -82,7 +82,11 @@ def training_seed(file: Path) -> int:
     return int(read_facts(file).get("seed", 0))
 
 
-def _facts(file: Path, session: onnxruntime.InferenceSession) -> dict[str, Any]:
+_IMAGES = ("kind", "classes", "width", "height")
+
+
+def facts_of(file: Path, session: onnxruntime.InferenceSession, needed: Sequence[str] = _IMAGES) -> dict[str, Any]:
+    """Returns the metadata of an opened network file. Raises NetworkFileError where it lacks what is needed."""
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:
         raise NetworkFileError(
@@ -93,7 +97,7 @@ def _facts(file: Path, session: onnxruntime.InferenceSession) -> dict[str, Any]:
         facts = json.loads(text)
     except json.JSONDecodeError as error:
         raise NetworkFileError(f"{file}: metadata {KEY!r} is not JSON: {error}") from None
-    missing = [k for k in ("kind", "classes", "width", "height") if not isinstance(facts, dict) or k not in facts]
+    missing = [k for k in needed if not isinstance(facts, dict) or k not in facts]
     if missing:
         raise NetworkFileError(f"{file}: metadata {KEY!r} lacks {', '.join(missing)}")
     return dict(facts)

@@ -1,0 +1,238 @@
+"""Activities and goals of people in simulated worlds: ours, rules and baselines, on true boxes and from sensors.
+
+    python benchmarks/activities.py true FOLDER [--first 600] [--worlds 10]
+    python benchmarks/activities.py sensors CACHE [--first 600] [--worlds 10] [--every 1]
+
+*true*: the simulator's boxes, 4 times a second for 45 s; FOLDER keeps them, nothing is rendered. *sensors*: the shipped
+detector and segmenter, depth and true camera poses give a map; CACHE keeps what the networks gave (sensed_worlds.py).
+An agent counts while it is in view, and from sensors where it is mapped (IoU 0.25). An activity is right that is true
+within half a second; `unknown` is wrong. A goal counts one second before an agent begins to sit down or to reach.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from scene_graph import acts, macro_f1, majority
+from semantic_map import mapped
+from sensed_worlds import KINDS, World, sensed
+
+from dataflow.messages import Activity, Odometry, Pose, SceneGraph
+from dataflow.messages.geometry import quaternion_from_yaw
+from operators.recognition import ActivityRecognizer
+from operators.recognition.episodes import Episode
+from operators.scene import SceneGraphBuilder
+from operators.scene.scoring import match_nodes
+from operators.training.simulated_people import read_episodes, write_episodes
+
+SECOND = 1_000_000_000
+ARRIVALS, UNDER_WAY = ("sitting_down", "sitting", "reaching"), ("standing", "walking")
+CANDIDATES = ("chair", "table", "mug", "bottle", "door", "shelf")
+
+
+@dataclass(frozen=True)
+class Step:
+    """One time: the nodes given, the robot, and the truth: what agents in view do, all activities and goals by id."""
+
+    nodes: SceneGraph
+    robot: Pose | Odometry
+    view: set[int]
+    doing: dict[int, str]
+    goals: dict[int, int]
+    match: Callable[[SceneGraph], dict[int, int]]
+
+
+@dataclass
+class Figures:
+    """Counts (true|said) by method, and for each arrival the first goal by method, and the lead in seconds."""
+
+    acts: dict[str, Counter[str]] = field(default_factory=dict)
+    goals: dict[str, list[bool]] = field(default_factory=lambda: {"ours": [], "nearest": [], "heading": []})
+    candidates: list[int] = field(default_factory=list)
+    leads: list[float] = field(default_factory=list)
+
+
+def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
+    names = tuple(dict.fromkeys(episode.labels))
+    ids = episode.ids.tolist()
+    for row in range(0, len(episode.times), stride):
+        boxes = episode.boxes[row].astype(np.float64)
+        nodes = SceneGraph(
+            stamp=round(episode.times[row] * 1e9),
+            frame="world",
+            class_names=names,
+            ids=episode.ids,
+            class_ids=[names.index(label) for label in episode.labels],
+            positions=boxes[:, :3],
+            sizes=boxes[:, 3:6],
+            orientations=quaternion_from_yaw(boxes[:, 6]),
+            subjects=np.zeros(0, np.int32),
+            objects=np.zeros(0, np.int32),
+        )
+        place = np.eye(4)
+        place[:2, 3] = episode.camera[row, :2, 3]
+        ahead = episode.camera[row, :2, 2] / np.linalg.norm(episode.camera[row, :2, 2])
+        place[:2, :2] = [[ahead[0], -ahead[1]], [ahead[1], ahead[0]]]
+        robot = Pose.from_matrix(place, stamp=nodes.stamp, frame="world", child_frame="base_link")
+        agents = episode.agents.tolist()
+        doing = dict(zip(agents, episode.activities[row], strict=True))
+        goals = dict(zip(agents, episode.goals[row].tolist(), strict=True))
+        yield Step(nodes, robot, set(agents), doing, goals, lambda _: {i: i for i in ids})
+
+
+def sensor_steps(world: World) -> Iterator[Step]:
+    nodes = mapped(world, true=False)
+    for frame, given in zip(world.frames, nodes, strict=True):
+        view = set(frame.objects.ids[frame.objects.visible >= 0.3].tolist())
+        said = zip(frame.activities.subjects.tolist(), frame.activities.goals, strict=True)
+        goals = {i: int(g.rpartition(" ")[2]) if g.rpartition(" ")[2].isdigit() else -1 for i, g in said}
+        truth = frame.scene
+        yield Step(given, frame.base, view, acts(frame.activities), goals, lambda g, t=truth: match_nodes(g, t))
+
+
+def figures_of(steps: list[Step]) -> Figures:
+    """Runs recogniser and builder over the steps, and the builder alone, whose rules are the baseline."""
+    recognizer, ours, rules = ActivityRecognizer(), SceneGraphBuilder(), SceneGraphBuilder()
+    for each in (recognizer, ours, rules):
+        each.setup()
+    said: dict[str, list[dict[int, str]]] = {"ours": [], "rules": []}
+    graphs, ofs = [], []
+    for step in steps:
+        recognized = recognizer.process(step.nodes, step.robot)
+        built = ours.process(step.nodes, step.robot, recognized=recognized)
+        of = step.match(built["graph"])
+        graphs.append(built["graph"])
+        ofs.append(of)
+        alone: Activity = rules.process(step.nodes, step.robot)["activities"]
+        for name, message in (("ours", built["activities"]), ("rules", alone)):
+            said[name].append({of[i]: a for i, a in acts(message).items() if i in of})
+    found = Figures({name: compared(steps, given) for name, given in said.items()})
+    arrivals(steps, graphs, ofs, found)
+    return found
+
+
+def compared(steps: list[Step], said: list[dict[int, str]]) -> Counter[str]:
+    counts: Counter[str] = Counter()
+    for step, given in zip(steps, said, strict=True):
+        around = [s.doing for s in steps if abs(s.nodes.stamp - step.nodes.stamp) <= SECOND // 2]
+        for agent, true in step.doing.items():
+            if agent in given and agent in step.view:
+                right = any(doing.get(agent) == given[agent] for doing in around)
+                counts[f"{true}|{true if right else given[agent]}"] += 1
+    return counts
+
+
+def arrivals(steps: list[Step], graphs: list[SceneGraph], ofs: list[dict[int, int]], found: Figures) -> None:
+    """Scores the goals of every arrival whose agent and goal are nodes a second before."""
+    for k in range(1, len(steps)):
+        for agent, doing in steps[k].doing.items():
+            goal = steps[k].goals.get(agent, -1)
+            early = [j for j in range(k) if steps[k].nodes.stamp - steps[j].nodes.stamp >= SECOND]
+            if doing not in ARRIVALS or steps[k - 1].doing.get(agent) not in UNDER_WAY or goal < 0 or not early:
+                continue
+            j = early[-1]
+            mine = {t: m for m, t in ofs[j].items()}
+            if agent not in mine or goal not in mine or agent not in steps[j].view:
+                continue
+            graph, me, aim = graphs[j], mine[agent], mine[goal]
+            ids, names = graph.ids.tolist(), [graph.class_names[c] for c in graph.class_ids.tolist()]
+            here = graph.positions[ids.index(me)][:2]
+            offsets = {i: graph.positions[n][:2] - here for n, i in enumerate(ids) if names[n] in CANDIDATES}
+            near = {i: o for i, o in offsets.items() if np.hypot(*o) < 5}
+            found.candidates.append(len(near))
+            found.goals["ours"].append(first(graph, me) == aim)
+            found.goals["nearest"].append(min(near, key=lambda i: float(np.hypot(*near[i])), default=-1) == aim)
+            old = graphs[max(j - 4, 0)]
+            way = here - old.positions[old.ids.tolist().index(me)][:2] if me in old.ids.tolist() else np.zeros(2)
+            ahead = {i: float(o @ way) / max(float(np.hypot(*o)), 1e-6) for i, o in near.items()}
+            found.goals["heading"].append(max(ahead, key=lambda i: ahead[i], default=-1) == aim)
+            since = k
+            while since > 0 and first(graphs[since - 1], me) == aim:
+                since -= 1
+            found.leads.append((steps[k].nodes.stamp - steps[since].nodes.stamp) / SECOND)
+
+
+def first(graph: SceneGraph, agent: int) -> int:
+    """Returns the likeliest goal of an agent, -1 for none."""
+    ids = graph.ids.tolist()
+    scores = [] if graph.relation_scores is None else graph.relation_scores.tolist()
+    heads = {ids[o]: scores[r] for r, (s, p, o) in enumerate(graph.relations()) if p == "heads_for" and ids[s] == agent}
+    return max(heads, key=lambda i: heads[i], default=-1)
+
+
+def report(rows: dict[str, Figures]) -> None:
+    for name in ("ours", "rules"):
+        values = [macro_f1(found.acts[name]) for found in rows.values()]
+        total: Counter[str] = sum((found.acts[name] for found in rows.values()), Counter())
+        print(f"activities, {name}: mean {np.mean(values):.3f}, worst {min(values):.3f}, pooled {macro_f1(total):.3f}")
+        if name == "ours":
+            print(f"activities, majority class: mean {np.mean([majority(f.acts[name]) for f in rows.values()]):.3f}")
+            print("   by class:", by_class(total), "\n   wrong:", {k: n for k, n in total.most_common() if differ(k)})
+    for name in ("ours", "nearest", "heading"):
+        right = [x for found in rows.values() for x in found.goals[name]]
+        worlds = [float(np.mean(found.goals[name])) for found in rows.values() if found.goals[name]]
+        if right:
+            print(f"goals, {name}: {np.mean(right):.3f} of {len(right)} arrivals, worst world {min(worlds):.2f}")
+    leads = [x for found in rows.values() for x in found.leads]
+    if leads:
+        many = [x for found in rows.values() for x in found.candidates]
+        print(f"goals: median lead {np.median(leads):.2f} s, candidates {min(many)} to {max(many)}")
+
+
+def differ(pair: str) -> bool:
+    true, said = pair.split("|")
+    return true != said
+
+
+def by_class(counts: Counter[str]) -> dict[str, float]:
+    names = sorted({key.split("|")[0] for key in counts})
+    found = {}
+    for name in names:
+        hit = counts[f"{name}|{name}"]
+        others = sum(n for key, n in counts.items() if differ(key) and name in key.split("|"))
+        found[name] = round(2 * hit / (2 * hit + others), 3)
+    return found
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("fed", choices=["true", "sensors"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--first", type=int, default=600)
+    parser.add_argument("--worlds", type=int, default=10)
+    parser.add_argument("--every", type=int, default=1, help="take every so many frames of the sensors")
+    parser.add_argument("--out", type=Path, help="JSON file for all counts")
+    options = parser.parse_args()
+    seeds = range(options.first, options.first + options.worlds)
+    rows: dict[str, Figures] = {}
+    for name, steps in (true_worlds if options.fed == "true" else sensed_steps)(seeds, options.folder, options.every):
+        rows[name] = figures_of(steps)
+        told = {n: round(macro_f1(c), 3) for n, c in rows[name].acts.items()}
+        print(name, told, {n: f"{sum(x)}/{len(x)}" for n, x in rows[name].goals.items()}, flush=True)
+        if options.out is not None:
+            options.out.write_text(json.dumps({n: vars(f) for n, f in rows.items()}))
+    report(rows)
+
+
+def true_worlds(seeds: range, folder: Path, _: int) -> Iterator[tuple[str, list[Step]]]:
+    chosen = [(KINDS[seed % len(KINDS)], seed, 3) for seed in seeds]
+    for _made in write_episodes(folder, chosen, 1):
+        pass
+    for episode in read_episodes(folder, chosen):
+        yield episode.name, list(true_steps(episode))
+
+
+def sensed_steps(seeds: range, folder: Path, every: int) -> Iterator[tuple[str, list[Step]]]:
+    for world in sensed(seeds, folder):
+        thinned = World(world.name, world.image_info, world.extrinsics, world.frames[::every])
+        yield world.name, list(sensor_steps(thinned))
+
+
+if __name__ == "__main__":
+    main()

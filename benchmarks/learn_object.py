@@ -1,0 +1,252 @@
+"""Objects learned from five images: found again in other places, and what that does to the classes known before.
+
+    python benchmarks/learn_object.py FOLDER [--objects cone suitcase teapot helmet] [--views 30]
+
+Each object is a shape that no network was trained on. It stands on floors or tables of simulated worlds; five images of
+one world are labelled, `dataflow learn object` learns from them, and images of other worlds judge: an object counts
+that is at least half visible, with 300 pixels or more; a box is right from IoU 0.5. FOLDER keeps the images.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from dataflow.messages import Detections2D, Image
+from dataflow.messages.geometry import invert
+from operators.detection import CustomDetector
+from operators.evaluation.detection_score import ScoredFrame, score_frames
+from operators.recognition import LearnedDetector
+from operators.sources.simulator.classes import THINGS
+from operators.sources.simulator.color import expose
+from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
+from operators.sources.simulator.optics import Optics
+from operators.sources.simulator.renderer import Renderer
+from operators.sources.simulator.scene import Thing, World
+from operators.sources.simulator.shapes import Array, Material, Shape, at, box, ellipsoid, lathe, pose
+from operators.sources.simulator.truth import detections
+from operators.sources.simulator.worlds import make_world
+from operators.training.learning import learn as command
+
+OPTICS = Optics(640, 480, 544.0, 544.0, 319.5, 239.5)
+LEARNED, HELD_OUT = 71_000, 72_000
+"""First seeds of the worlds to learn in and to judge by."""
+KINDS, WITH_TABLES = ("office", "table_top", "corridor"), ("office", "table_top", "office")
+VISIBLE, PIXELS, IOU = 0.5, 300, 0.5
+
+
+def cone() -> Shape:
+    """A traffic cone, 45 cm high: orange with a white band."""
+    orange, white = Material("plain", (0.9, 0.35, 0.08), tile=0.3), Material("plain", (0.92, 0.92, 0.9), tile=0.3)
+    low = at(lathe([(0.12, 0.0), (0.085, 0.14)], orange), z=0.03)
+    band = at(lathe([(0.085, 0.0), (0.055, 0.12)], white), z=0.17)
+    tip = at(lathe([(0.055, 0.0), (0.015, 0.16), (0.0, 0.161)], orange), z=0.29)
+    return box((0.3, 0.3, 0.03), orange, center=(0, 0, 0.015)) + low + band + tip
+
+
+def suitcase() -> Shape:
+    """A blue suitcase that stands on its long side, with straps and a handle."""
+    blue, black = Material("fabric", (0.16, 0.28, 0.6), tile=0.2), Material("plain", (0.1, 0.1, 0.11), tile=0.2)
+    shape = box((0.2, 0.55, 0.38), blue, center=(0, 0, 0.21))
+    for y in (-0.15, 0.15):
+        shape += box((0.21, 0.04, 0.39), black, center=(0, y, 0.21))
+        shape += box((0.03, 0.02, 0.06), black, center=(0, y / 2, 0.42))
+    return shape + box((0.03, 0.17, 0.03), black, center=(0, 0, 0.45))
+
+
+def teapot() -> Shape:
+    """A green teapot, 30 cm wide, with spout, handle and a golden lid."""
+    green, gold = Material("plain", (0.16, 0.47, 0.28), tile=0.2), Material("plain", (0.75, 0.6, 0.24), tile=0.2)
+    shape = at(ellipsoid(0.1, 0.1, 0.085, green), z=0.085)
+    shape += at(lathe([(0.06, 0.0), (0.02, 0.03), (0.0, 0.031)], gold), z=0.16)
+    shape += at(ellipsoid(0.018, 0.018, 0.018, gold), z=0.2) + at(ellipsoid(0.07, 0.022, 0.022, green), x=0.13, z=0.12)
+    return (
+        shape
+        + box((0.02, 0.02, 0.1), gold, center=(-0.14, 0, 0.1))
+        + box((0.06, 0.02, 0.02), gold, center=(-0.11, 0, 0.15))
+    )
+
+
+def helmet() -> Shape:
+    """A yellow safety helmet with a brim and a black stripe."""
+    yellow, black = Material("plain", (0.94, 0.8, 0.12), tile=0.3), Material("plain", (0.08, 0.08, 0.08), tile=0.3)
+    brim = at(lathe([(0.16, 0.0), (0.16, 0.015), (0.11, 0.03)], yellow), x=0.03)
+    return (
+        brim + at(ellipsoid(0.135, 0.115, 0.13, yellow), z=0.03) + box((0.22, 0.025, 0.02), black, center=(0, 0, 0.155))
+    )
+
+
+SHAPES: dict[str, Callable[[], Shape]] = {"cone": cone, "suitcase": suitcase, "teapot": teapot, "helmet": helmet}
+ON_FLOOR = ("cone", "suitcase")
+
+
+@dataclass(eq=False)
+class Put:
+    """Stands wherever it was last put."""
+
+    T: Array
+
+    def frame(self, t: float) -> Array:
+        return self.T
+
+    def parts(self, t: float) -> Array:
+        return self.T[None]
+
+
+def views(name: str, kind: str, seed: int, count: int) -> Iterator[tuple[np.ndarray, Detections2D]]:
+    """Yields images of one world with the object in another place in each, and the true boxes in them."""
+    rng = np.random.default_rng((seed, 5))
+    world = make_world(kind, seed, speed=0.5, hold=0.0, movers=True, people=2, tour=True)
+    id, put = 1 + max(thing.id for thing in world.things), Put(np.eye(4))
+    renderer = Renderer(replace(world, things=(*world.things, Thing(id, "box", (SHAPES[name](),), put))), seed)
+    made = 0
+    for attempt in range(12 * count):
+        if made == count:
+            return
+        put.T = placed(world, name in ON_FLOOR, rng)
+        camera = looking(world, put.T, rng)
+        if camera is None:
+            continue
+        renderer.at(0.25 * attempt + 0.01)
+        view = renderer.view(camera, OPTICS)
+        truth, _ = detections(
+            view,
+            renderer,
+            camera,
+            OPTICS,
+            0.0,
+            min_pixels=30,
+            shares=True,
+            stamp=0,
+            camera_frame="camera",
+            world_frame="w",
+        )
+        rows = np.flatnonzero(truth.ids == id)
+        if len(rows) and truth.visible[rows[0]] >= VISIBLE and truth.pixel_counts[rows[0]] >= PIXELS:
+            made += 1
+            noisy = expose(view.color, rng.uniform(0.8, 1.2)) + rng.normal(0, 2, view.color.shape)
+            ids = truth.class_ids.copy()
+            ids[rows[0]] = len(THINGS)
+            yield np.clip(noisy, 0, 255).astype(np.uint8), truth.replace(class_names=(*THINGS, name), class_ids=ids)
+
+
+def placed(world: World, floor: bool, rng: np.random.Generator) -> Array:
+    """Returns a place on the robot's way, which is free, or on a table."""
+    yaw = float(rng.uniform(-np.pi, np.pi))
+    if floor:
+        T = world.path.at([rng.uniform(0, world.path.period)]).T_world_base()[0]
+        x, y = T[:2, 3] + rng.uniform(-0.25, 0.25, 2)
+        return pose(float(x), float(y), 0.0, yaw)
+    tables = [thing.box(0.0) for thing in world.things if thing.label == "table"]
+    T, size = tables[int(rng.integers(len(tables)))]
+    x, y, z = (T @ np.array([*(rng.uniform(-0.35, 0.35, 2) * size[:2]), size[2] / 2, 1.0]))[:3]
+    return pose(float(x), float(y), float(z), yaw)
+
+
+def looking(world: World, T: Array, rng: np.random.Generator) -> Array | None:
+    """Returns a pose of the robot's camera on its way that looks at a place from 0.8 to 3.5 m, if there is one."""
+    times = rng.uniform(0, world.path.period, 300)
+    cameras = world.path.at(times).T_world_base() @ mounted(world.camera_mount) @ BODY_TO_OPTICAL
+    for camera in cameras:
+        x, y, z = (invert(camera) @ (T @ np.array([0, 0, 0.12, 1.0])))[:3]
+        if 0.8 < z < 3.5 and abs(x / z) < 0.52 and abs(y / z) < 0.38:
+            return np.asarray(camera)
+    return None
+
+
+def written(folder: Path, name: str, count: int) -> tuple[Path, Path]:
+    """Returns the folders to learn from and to judge by, in COCO format; they are made where they are lacking."""
+    made = []
+    for part, first, worlds, each in (("learn", LEARNED, 1, 5), ("held_out", HELD_OUT, 3, (count + 2) // 3)):
+        place = folder / name / part
+        made.append(place)
+        if (place / "annotations.json").is_file():
+            continue
+        place.mkdir(parents=True, exist_ok=True)
+        images: list[dict[str, Any]] = []
+        annotations: list[dict[str, Any]] = []
+        for k in range(worlds):
+            kinds = KINDS if name in ON_FLOOR else WITH_TABLES
+            kind = kinds[k] if part == "held_out" else "office"
+            for pixels, truth in views(name, kind, first + k, each):
+                file = f"{len(images):03d}.png"
+                cv2.imwrite(str(place / file), pixels[..., ::-1])
+                images.append({"id": len(images), "file_name": file, "width": 640, "height": 480})
+                for row in range(truth.count):
+                    x1, y1, x2, y2 = truth.boxes[row].tolist()
+                    clear = truth.visible[row] >= VISIBLE and truth.pixel_counts[row] >= PIXELS
+                    annotations.append(
+                        {
+                            "id": len(annotations), "image_id": len(images) - 1, "bbox": [x1, y1, x2 - x1, y2 - y1],
+                            "category_id": int(truth.class_ids[row]), "area": (x2 - x1) * (y2 - y1),
+                            "iscrowd": 0, "ignore": int(not clear),
+                        }
+                    )  # fmt: skip
+        categories = [{"id": k, "name": n} for k, n in enumerate((*THINGS, name))]
+        content = {"images": images, "categories": categories, "annotations": annotations}
+        (place / "annotations.json").write_text(json.dumps(content))
+    return made[0], made[1]
+
+
+def judged(folder: Path, detector: CustomDetector | LearnedDetector, name: str) -> tuple[dict[str, Any], float]:
+    """Returns the score of the new class, and the mean AP50 of the known ones."""
+    content = json.loads((folder / "annotations.json").read_text())
+    names = {c["id"]: c["name"] for c in content["categories"]}
+    frames = []
+    for image in content["images"]:
+        pixels = cv2.imread(str(folder / image["file_name"]), cv2.IMREAD_COLOR_RGB)
+        found = detector.process(Image(stamp=image["id"], frame="camera", data=pixels))
+        own = [a for a in content["annotations"] if a["image_id"] == image["id"]]
+        boxes = np.array([[x, y, x + w, y + h] for x, y, w, h in (a["bbox"] for a in own)], np.float64).reshape(-1, 4)
+        frames.append(
+            ScoredFrame(
+                boxes,
+                tuple(names[a["category_id"]] for a in own),
+                np.array([bool(a["ignore"]) for a in own]),
+                found.boxes.astype(np.float64),
+                found.labels(),
+                found.scores,
+            )
+        )
+    scores = score_frames(frames, (*THINGS, name), max_detections=100, iou=IOU, score_threshold=0.3)
+    new = scores[name]
+    known = [s.ap50 for n, s in scores.items() if n != name and s.ap50 is not None]
+    found_there = new.hits + new.false_alarms
+    return {
+        "recall": new.hits / max(new.truth, 1),
+        "precision": new.hits / found_there if found_there else float("nan"),
+        "ap50": new.ap50,
+        "objects": new.truth,
+    }, float(np.mean(known))
+
+
+def started(detector: CustomDetector | LearnedDetector) -> CustomDetector | LearnedDetector:
+    detector.setup()
+    return detector
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--objects", nargs="+", choices=list(SHAPES), default=list(SHAPES))
+    parser.add_argument("--views", type=int, default=30, help="held-out images of each object")
+    options = parser.parse_args(arguments)
+    for name in options.objects:
+        learn, held_out = written(options.folder, name, options.views)
+        out = options.folder / f"{name}.object.npz"
+        command(["object", name, str(learn), "--out", str(out), "--overwrite"], standalone_mode=False)
+        _, before = judged(held_out, started(CustomDetector(score_threshold=0.01)), name)
+        new, after = judged(held_out, started(LearnedDetector(objects=[str(out)], score_threshold=0.01)), name)
+        told = {k: round(v, 3) for k, v in new.items() if v is not None}
+        print(f"{name}: {told}, known classes AP50 {before:.4f} -> {after:.4f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,163 @@
+"""Activities of the agents of a scene as an operator."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Activity, Odometry, Pose, SceneGraph
+from dataflow.messages.geometry import yaw_of
+from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.recognition.activity_model import ActivityModel
+from operators.recognition.agent_features import AGENTS, MATTERING, AgentWindow, Surroundings
+from operators.scene.agents import UNKNOWN
+from operators.scene.bodies import Body
+from operators.weights import shipped
+
+
+@dataclass
+class _Agent:
+    """State of one agent: its recent past, the network's state (2, L, W), what it does and since when (ns)."""
+
+    window: AgentWindow
+    state: NDArray[np.float32]
+    activity: str
+    since: int
+
+
+class ActivityRecognizer(Operator):
+    """Says what each person, robot and ball of a scene does, by a recurrent network over motion and surroundings.
+
+    A vector of an agent's motion in the last 2.5 s, its extent and the seats, tables and drinks around it goes at each
+    graph into two LSTM layers, whose state is kept from graph to graph for as long as the agent is in the scene; the
+    network answers for a quarter of a second ago. `unknown` stands for what is too unsure, or too long out of sight.
+
+    Persons stand, walk, sit down, sit, stand up, reach or drink; balls roll or rest; robots drive or rest. Method:
+    Hochreiter and Schmidhuber, "Long short-term memory", 1997; trained on simulated people (`dataflow train activity`).
+    """
+
+    nodes: In[SceneGraph] = In(doc="objects with agents among them, 2 to 10 times a second; relations are not used")
+    robot: Sampled[Pose | Odometry] = Sampled(required=False, doc="the robot, in the frame of the nodes")
+    activities: Out[Activity] = Out(doc="a row an agent: activity, probabilities, what it is done to, since when")
+
+    weights: str | None = Param(None, doc="network file of `dataflow train activity`; none means the shipped one")
+    least: float = Param(0.35, ge=0, lt=1, live=True, doc="probability below which an activity is unknown")
+    memory: float = Param(1.5, ge=0, doc="time out of sight after which an activity is unknown", unit="s")
+
+    def setup(self) -> None:
+        """Opens the network. Raises FileNotFoundError or NetworkFileError."""
+        file = self.use_file(str(shipped("activity.onnx")) if self.weights is None else self.weights)
+        self._model = ActivityModel.open(file)
+        self._classes = (*self._model.classes, UNKNOWN)
+        self._counts: Counter[str] = Counter()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._agents: dict[int, _Agent] = {}
+        self._around = Surroundings()
+
+    def process(self, nodes: SceneGraph, robot: Pose | Odometry | None = None) -> Activity:
+        """Raises ValueError where the robot is in another frame than the nodes."""
+        if robot is not None and robot.frame != nodes.frame:
+            raise ValueError(f"the robot is in {robot.frame!r}, the nodes in {nodes.frame!r}")
+        bodies, unusable = _mattering(nodes)
+        seen = _seen(nodes)
+        time = nodes.stamp * 1e-9
+        self._around.update(time, bodies)
+        agents = sorted((b for b in bodies if b.label in AGENTS), key=lambda b: b.id)
+        self._agents = {b.id: self._agents.get(b.id) or self._fresh(nodes.stamp) for b in agents}
+        here = None if robot is None else robot.matrix()[:2, 3]
+        vectors = []
+        for body in agents:
+            window = self._agents[body.id].window
+            window.add(time, body)
+            vectors.append(window.vector(body, (nodes.stamp - seen[body.id]) * 1e-9, self._around, here))
+        self._counts.update({"graphs": 1, "agents": len(agents), "unusable nodes": unusable})
+        return self._answer(nodes.stamp, agents, vectors, seen)
+
+    def on_reset(self, input: str) -> None:
+        """The clock behind an input began anew: so do all agents."""
+        self._begin()
+
+    def snapshot(self) -> Mapping[str, Any]:
+        agents = [[i, a.window.snapshot(), a.state, a.activity, a.since] for i, a in self._agents.items()]
+        return {"agents": agents, "around": self._around.snapshot(), "counts": dict(self._counts)}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._begin()
+        self._around.restore(state["around"])
+        for id, window, network, activity, since in state["agents"]:
+            kept = AgentWindow()
+            kept.restore(window)
+            self._agents[int(id)] = _Agent(kept, np.array(network, np.float32), str(activity), int(since))
+        self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
+
+    def summary(self) -> Mapping[str, float | int]:
+        """Counts graphs, agents, answers that were unknown, and nodes that are not finite."""
+        return dict(self._counts)
+
+    def _fresh(self, stamp: int) -> _Agent:
+        return _Agent(AgentWindow(), self._model.fresh(), "", stamp)
+
+    def _answer(
+        self, stamp: int, agents: list[Body], vectors: list[NDArray[np.float32]], seen: Mapping[int, int]
+    ) -> Activity:
+        probabilities = np.zeros((len(agents), len(self._classes)), np.float32)
+        objects = np.full(len(agents), -1, np.int64)
+        if agents:
+            states = np.stack([self._agents[b.id].state for b in agents])
+            probabilities[:, :-1], states = self._model.step(np.stack(vectors), states)
+        chosen = []
+        for k, body in enumerate(agents):
+            agent, best = self._agents[body.id], int(probabilities[k].argmax())
+            agent.state = states[k]
+            sure = probabilities[k, best] >= self.least and stamp - seen[body.id] <= self.memory * 1e9
+            activity = self._classes[best] if sure else UNKNOWN
+            self._counts["unknown"] += not sure
+            if activity != agent.activity:
+                agent.activity, agent.since = activity, stamp
+            chosen.append(self._classes.index(activity))
+            objects[k] = self._around.object_of(activity, body)
+        rows = np.arange(len(agents))
+        probabilities = np.clip(probabilities, 0, 1)
+        unsure = 1 - probabilities.max(axis=1, initial=0.0)
+        known = np.array(chosen, np.int32) != len(self._classes) - 1
+        return Activity(
+            stamp=stamp,
+            class_names=self._classes,
+            subjects=np.array([b.id for b in agents], np.int64),
+            class_ids=np.array(chosen, np.int32),
+            scores=np.where(known, probabilities[rows, chosen], unsure).astype(np.float32),
+            probabilities=probabilities,
+            objects=objects,
+            since=np.array([self._agents[b.id].since for b in agents], np.int64),
+        )
+
+
+def _seen(nodes: SceneGraph) -> dict[int, int]:
+    """Returns when each node was last seen, ns; the graph's own stamp where it does not say."""
+    times = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
+    return dict(zip(nodes.ids.tolist(), times.tolist(), strict=True))
+
+
+def _mattering(nodes: SceneGraph) -> tuple[list[Body], int]:
+    """Returns the nodes that features are made of as upright bodies, and how many of these are not usable."""
+    labels = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
+    rows = [k for k, label in enumerate(labels) if label in MATTERING and nodes.ids[k] > 0]
+    finite = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
+    usable = np.asarray(finite & (nodes.sizes >= 0).all(axis=1), bool)
+    yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
+    still = np.zeros(3)
+    bodies = [
+        Body(
+            int(nodes.ids[k]), labels[k], nodes.positions[k], nodes.sizes[k], float(yaws[k]), still, labels[k] in AGENTS
+        )
+        for k in rows
+        if usable[k]
+    ]
+    return bodies, len(rows) - len(bodies)

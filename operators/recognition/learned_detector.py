@@ -1,0 +1,117 @@
+"""Detection of known and of newly learned objects with one network."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from dataflow.messages import Detections2D, Image
+from dataflow.operator import In, Operator, Out, Param
+from operators.detection.custom.decode import find_boxes
+from operators.detection.decode import Candidates
+from operators.detection.nms import class_wise_nms, intersection_over_union
+from operators.recognition.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
+from operators.recognition.proposals import F32, Glance, Trunk
+from operators.weights import shipped
+
+
+class LearnedDetector(Operator):
+    """Finds what CustomDetector finds, and objects that were learned from a few images by `dataflow learn object`.
+
+    The network's weakest boxes, whatever class it gives them, propose places; the vectors of its trunk there are set
+    against each learned prototype. Where a learned object is surer than a known class at the same place, it takes it;
+    all other boxes stay as they are. One run of the network serves both, on one CPU thread.
+
+    Method: Snell et al., "Prototypical networks for few-shot learning", 2017, on the features of a trained detector.
+    """
+
+    image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
+    detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score; learned classes last")
+
+    objects: list[str] = Param(doc="files of `dataflow learn object`, made with these weights")
+    weights: str | None = Param(None, doc="network file of `dataflow train detector`; none means the shipped one")
+    score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes of known classes below are dropped")
+    learned_threshold: float = Param(0.5, ge=0, le=1, live=True, doc="and those of learned ones")
+    nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
+    max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
+
+    def setup(self) -> None:
+        """Loads network and objects. Raises FileNotFoundError, NetworkFileError or LearnedObjectError."""
+        given = str(shipped("detector.onnx")) if self.weights is None else self.weights
+        file = self.use_file(given)
+        self._learned = [LearnedObject.read(self.use_file(name)) for name in self.objects]
+        if not self._learned:
+            raise LearnedObjectError("objects names no file: make one by `dataflow learn object NAME DATA`")
+        inner = self._learned[0].inner
+        for name, each in zip(self.objects, self._learned, strict=True):
+            if each.detector != self.files[given] or each.inner != inner:
+                raise LearnedObjectError(f"{name} was learned with another detector than {given}: learn it again")
+        self._trunk = Trunk(file, inner)
+        self._names = tuple(dict.fromkeys((*self._trunk.classes, *(each.name for each in self._learned))))
+        self._counts = {"images": 0, "learned objects": 0, "known boxes replaced": 0}
+
+    def process(self, image: Image) -> Detections2D:
+        pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
+        trunk = self._trunk
+        glance = trunk.look(pixels)
+        known = find_boxes(
+            glance.maps,
+            trunk.anchors,
+            trunk.strides,
+            len(trunk.classes),
+            self.score_threshold,
+            self.nms_iou,
+            self.max_detections,
+        )
+        learned = self._found(glance)
+        known = known.select(self._staying(known, learned))
+        boxes = np.concatenate([known.boxes, learned.boxes])
+        scores = np.concatenate([np.minimum(known.scores, np.float32(1)), learned.scores])
+        classes = np.concatenate([known.classes, learned.classes])
+        order = np.argsort(-scores, kind="stable")[: self.max_detections]
+        self._counts["images"] += 1
+        self._counts["learned objects"] += len(learned.scores)
+        return Detections2D(
+            stamp=image.stamp,
+            frame=image.frame,
+            width=image.width,
+            height=image.height,
+            class_names=self._names,
+            boxes=glance.fit.restore(boxes)[order],
+            scores=scores[order],
+            class_ids=classes[order],
+        )
+
+    def summary(self) -> Mapping[str, float | int]:
+        """Counts images, learned objects found, and boxes of known classes that gave way to them."""
+        return dict(self._counts)
+
+    def _found(self, glance: Glance) -> Candidates:
+        """Returns the learned objects in an image: for each class the surest of the boxes that overlap."""
+        proposed = self._trunk.propose(glance, LEAST, PROPOSALS)
+        described = self._trunk.describe(glance, proposed)
+        boxes, scores, classes = [proposed[:0]], [np.zeros(0, np.float32)], [np.zeros(0, np.int32)]
+        for each in self._learned:
+            sure = each.probability(described)
+            rows = np.flatnonzero(sure >= self.learned_threshold)
+            kept = rows[class_wise_nms(proposed[rows], sure[rows], np.zeros(len(rows), np.int32), 0.3)]
+            boxes.append(np.array([_settled(proposed[k], proposed, sure) for k in kept], np.float32).reshape(-1, 4))
+            scores.append(sure[kept])
+            classes.append(np.full(len(kept), self._names.index(each.name), np.int32))
+        return Candidates(np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes))
+
+    def _staying(self, known: Candidates, learned: Candidates) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+        """Returns the boxes of known classes at whose place no learned object is surer."""
+        stays = np.ones(len(known.scores), bool)
+        for box, score in zip(learned.boxes, learned.scores, strict=True):
+            stays &= (intersection_over_union(box, known.boxes) < 0.5) | (known.scores > score)
+        self._counts["known boxes replaced"] += int((~stays).sum())
+        return np.flatnonzero(stays)
+
+
+def _settled(box: F32, proposed: F32, sure: F32) -> F32:
+    """Returns the mean of the boxes at one place, weighted by how surely they show the object: a steadier outline."""
+    near = intersection_over_union(box, proposed) >= 0.6
+    weights = (sure * near).astype(np.float64)
+    return np.asarray(weights @ proposed / weights.sum(), np.float32)

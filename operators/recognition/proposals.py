@@ -1,0 +1,112 @@
+"""What a detector's network sees of an image: boxes around anything, and a vector that describes each."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.detection.custom.decode import decode_grid
+from operators.detection.fit import Fit
+from operators.detection.nms import class_wise_nms
+from operators.inference import open_session
+from operators.weights import NetworkFileError, open_network
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+F32 = NDArray[np.float32]
+_GRID, _SAMPLES = 2, 3  # parts of a box, and points in each, along a side
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """An image as the network sees it: the grid's raw maps, the trunk's maps (C, H, W), and how it was fitted in."""
+
+    maps: Sequence[F32]
+    trunk: Sequence[F32]
+    fit: Fit
+
+
+class Trunk:
+    """A detector's network whose inner maps are given as well; on one CPU thread.
+
+    `inner` names the values that come out beside the detector's outputs (`inner_maps` finds them). Raises
+    FileNotFoundError or NetworkFileError.
+    """
+
+    def __init__(self, file: Path, inner: Sequence[str]) -> None:
+        network = open_network(file, "detector")
+        self.classes, self.size, self.inner = network.classes, network.size, tuple(inner)
+        self.anchors = np.array(network.facts.get("anchors", []), np.float32)
+        self.strides = [int(s) for s in network.facts.get("strides", [])]
+        if self.anchors.ndim != 3 or len(self.anchors) != len(self.strides):
+            raise NetworkFileError(f"{file}: its metadata must hold anchors (levels, anchors, 2) and their strides")
+        self._session: onnxruntime.InferenceSession = open_session(file, reveal=self.inner)
+
+    def look(self, pixels: NDArray[np.uint8]) -> Glance:
+        """Runs the network on an image (H, W, 3), RGB."""
+        fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self.size)
+        tensor = np.ascontiguousarray(fit.apply(pixels).transpose(2, 0, 1)[None], np.float32)
+        tensor /= np.float32(255)
+        found = self._session.run(None, {self._session.get_inputs()[0].name: tensor})
+        known = len(self.strides)
+        return Glance(found[:known], [each[0] for each in found[known:]], fit)
+
+    def propose(self, glance: Glance, threshold: float, most: int) -> F32:
+        """Returns boxes (N, 4) in the network's pixels around anything, whatever its class, by falling score."""
+        found = decode_grid(glance.maps, self.anchors, self.strides, len(self.classes), threshold)
+        found = found.select(np.argsort(-found.scores, kind="stable")[: 20 * most])
+        kept = class_wise_nms(found.boxes, found.scores, np.zeros_like(found.classes), 0.7)[:most]
+        return found.boxes[kept]
+
+    def describe(self, glance: Glance, boxes: F32) -> F32:
+        """Returns (N, D): each trunk map averaged over the four quarters of each box (N, 4), of length 1 a map."""
+        parts = [_pooled(each, boxes, self.size) for each in glance.trunk]
+        return np.concatenate(
+            [part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-6) for part in parts], 1
+        )
+
+
+def inner_maps(file: Path, strides: Sequence[int] = (4, 8, 16)) -> tuple[str, ...]:
+    """Names the trunk's maps of these strides in a network of `dataflow train detector` or `pair`.
+
+    Needs the package onnx. Raises NetworkFileError where the network has none.
+    """
+    import onnx
+
+    own = [int(s) for s in open_network(file, "detector").facts.get("strides", [])]
+    model = onnx.load(str(file))
+    names = []
+    for stride in strides:
+        if stride not in own:
+            continue
+        lateral = [n for n in model.graph.node if n.op_type == "Conv" and f"/lateral.{own.index(stride)}/" in n.name]
+        if lateral:
+            names.append(lateral[0].input[0])
+    if not names:
+        raise NetworkFileError(f"{file} has no feature pyramid; take a network of `dataflow train detector` or `pair`")
+    return tuple(names)
+
+
+def _pooled(map: F32, boxes: F32, size: tuple[int, int]) -> F32:
+    """Returns (N, C · 4): means over the quarters of boxes in the network's pixels, by bilinear samples."""
+    channels, height, width = map.shape
+    count = _GRID * _SAMPLES
+    shares = ((np.arange(count) + 0.5) / count).astype(np.float32)
+    x = (boxes[:, :1] + shares * (boxes[:, 2:3] - boxes[:, :1])) * (width / size[0]) - 0.5
+    y = (boxes[:, 1:2] + shares * (boxes[:, 3:4] - boxes[:, 1:2])) * (height / size[1]) - 0.5
+    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+    left, top = np.minimum(x.astype(int), width - 2), np.minimum(y.astype(int), height - 2)
+    u, v = (x - left)[:, None, :, None], (y - top)[:, :, None, None]
+    cells = map.transpose(1, 2, 0)
+    rows, columns = top[:, :, None], left[:, None, :]
+    upper = (1 - u) * cells[rows, columns] + u * cells[rows, columns + 1]
+    lower = (1 - u) * cells[rows + 1, columns] + u * cells[rows + 1, columns + 1]
+    sampled = (1 - v) * upper + v * lower
+    quarters = sampled.reshape(len(boxes), _GRID, _SAMPLES, _GRID, _SAMPLES, channels).mean(axis=(2, 4))
+    return np.asarray(quarters.reshape(len(boxes), -1), np.float32)

@@ -1,0 +1,89 @@
+"""`dataflow learn`: new classes of objects from a few labelled images, usable at once."""
+
+from __future__ import annotations
+
+import json as jsonlib
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from operators.training.console import Data, Json, friendly, out_console
+
+learn = typer.Typer(
+    name="learn", help="Learn new things from a few examples.", no_args_is_help=True, rich_markup_mode="rich"
+)
+
+
+@learn.callback()
+def _learn() -> None:
+    """Learn new things from a few examples."""
+
+
+@learn.command("object")
+def learn_object(
+    name: Annotated[str, typer.Argument(help="The class to learn, as the labels name it.", show_default=False)],
+    data: Data,
+    out: Annotated[Path | None, typer.Option(help="The file to write. Default: NAME.object.npz.")] = None,
+    background: Annotated[
+        Path | None, typer.Option(help="Folder of images without the object: what it is not to be taken for.")
+    ] = None,
+    weights: Annotated[
+        Path | None, typer.Option(help="Network file of `dataflow train detector`. Default: the shipped detector.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file if it is there.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Decides how boxes are varied.")] = 0,
+    json: Json = False,
+) -> None:
+    """Learn a class of objects from about five labelled images (COCO or YOLO format), in seconds.
+
+    The file holds a prototype in the feature space of the detector's network.
+    `operators.recognition:LearnedDetector` takes it in `objects` and finds known and learned classes.
+    """
+    out = Path(f"{name}.object.npz") if out is None else out
+    with friendly():
+        if out.exists() and not overwrite:
+            raise FileExistsError(f"{out} exists already: give --overwrite or another --out")
+        import hashlib
+
+        import numpy as np
+
+        from operators.detection.custom.dataset import IMAGE_SUFFIXES, LabelledImage, read_detection_data
+        from operators.recognition.learned_object import learn as fitted
+        from operators.recognition.learned_object import shown_in
+        from operators.recognition.proposals import Trunk, inner_maps
+        from operators.weights import shipped
+
+        detector = shipped("detector.onnx") if weights is None else weights
+        read = read_detection_data(data, seed).only([name])
+        images = list({image.file: image for image in (*read.training, *read.validation)}.values())
+        nothing = np.zeros((0, 4), np.float32), np.zeros(0, np.int32), np.zeros(0, np.bool_)
+        if background is not None:
+            files = sorted(f for f in background.rglob("*") if f.suffix.lower() in IMAGE_SUFFIXES)
+            if not files:
+                raise FileNotFoundError(f"{background} holds no image ({', '.join(sorted(IMAGE_SUFFIXES))})")
+            images += [LabelledImage(file, *nothing) for file in files]
+        inner = inner_maps(detector)
+        trunk = Trunk(detector, inner)
+        shown = []
+        for k, image in enumerate(images):
+            pixels = image.read()
+            extent = np.array([pixels.shape[1], pixels.shape[0]] * 2, np.float32)
+            shown.append(
+                shown_in(trunk, pixels, image.boxes[~image.ignored] * extent, np.random.default_rng((seed, k)))
+            )
+        learned = fitted(name, shown, hashlib.sha256(detector.read_bytes()).hexdigest(), inner)
+        learned.write(out)
+    if json:
+        typer.echo(jsonlib.dumps({"object": name, "file": str(out), "images": learned.images}))
+        return
+    file = escape(str(out))
+    counted = f"{escape(name)} from {learned.images} images of {len(images)}"
+    out_console.print(f"[green]{file}[/green]: {counted}", highlight=False, soft_wrap=True)
+    out_console.print(
+        f"use it: `use: operators.recognition:LearnedDetector` with `params: {{objects: [{out}]}}`",
+        highlight=False,
+        markup=False,
+        soft_wrap=True,
+    )

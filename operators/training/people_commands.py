@@ -1,0 +1,83 @@
+"""`dataflow train activity`: what people do, learned from simulated worlds without images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.progress import track
+
+from operators.training.console import Json, err_console, friendly
+from operators.training.options import Device, Every, Overwrite, Rate, Resume, Seed, Threads
+from operators.training.running import keep_earlier, report, run_task
+
+if TYPE_CHECKING:
+    from operators.recognition.episodes import Episode
+
+Folder = Annotated[Path, typer.Argument(help="Folder of episodes; those that it lacks are made.", show_default=False)]
+Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
+Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
+Processes = Annotated[int, typer.Option(min=1, help="Worlds made at once.")]
+Variations = Annotated[int, typer.Option(min=0, help="Times that a tracker's errors are drawn for each world.")]
+Epochs = Annotated[int, typer.Option(min=1, help="Passes through the tracks.")]
+Batch = Annotated[int, typer.Option(min=1, help="Tracks a step.")]
+
+
+def train_activity(
+    data: Folder,
+    worlds: Worlds = 40,
+    validation: Chosen = 12,
+    processes: Processes = 1,
+    variations: Variations = 4,
+    epochs: Epochs = 10,
+    out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("activity.onnx"),
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    batch: Batch = 32,
+    learning_rate: Rate = 3e-3,
+    seed: Seed = 0,
+    evaluate_every: Every = 1,
+    threads: Threads = 1,
+    device: Device = "cpu",
+    json: Json = False,
+) -> None:
+    """Train the activity network, two LSTM layers, on people of simulated worlds.
+
+    No image is rendered: true boxes go through a seeded model of a tracker in space. The score is the macro-F1 at 0.5 s
+    tolerance, the mean of true and tracked boxes. `operators.recognition:ActivityRecognizer` takes the file as
+    `weights`.
+    """
+    with friendly():
+        keep_earlier(out, resume, overwrite)
+        from operators.recognition.activity_training import ActivityTask
+        from operators.training.loop import Settings
+
+        training, choosing = _episodes(data, worlds, validation, processes, json)
+        task = ActivityTask(training, choosing, seed=seed, variations=variations)
+        _tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=1, threads=threads,
+            device=device,
+        )  # fmt: skip
+        outcome = run_task(task, settings, out, resume, json)
+    report(outcome, "operators.recognition:ActivityRecognizer", json)
+
+
+def _episodes(
+    folder: Path, training: int, validation: int, processes: int, quiet: bool
+) -> tuple[list[Episode], list[Episode]]:
+    """Makes the episodes that a folder lacks, and reads all."""
+    from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, worlds, write_episodes
+
+    parts = worlds(TRAINING, training), worlds(VALIDATION, validation)
+    made = write_episodes(folder, [*parts[0], *parts[1]], processes)
+    total = training + validation
+    for _ in made if quiet else track(made, total=total, description="worlds", console=err_console):
+        pass
+    return read_episodes(folder, parts[0]), read_episodes(folder, parts[1])
+
+
+def _tell(text: str, quiet: bool) -> None:
+    if not quiet:
+        err_console.print(text, highlight=False, markup=False, soft_wrap=True)

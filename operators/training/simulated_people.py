@@ -1,0 +1,94 @@
+"""Episodes of people and other movers in simulated worlds, as true boxes over time: no image is rendered.
+
+Each world is drawn from a seed of its own and driven through; what a tracker would see of it is made of these by
+`operators.recognition.tracked_people`.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.recognition.episodes import Episode
+from operators.sources.simulator.drive import Drive
+from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
+from operators.sources.simulator.scene import Thing
+from operators.sources.simulator.worlds import make_world
+
+TRAINING, VALIDATION, HELD_OUT = 40_000, 45_000, 50_000
+"""First seeds of the worlds to train on, to choose by, and to report on."""
+KINDS = ("office", "table_top", "corridor", "yard")
+RATE, SECONDS = 8.0, 45.0
+_SPEED = 0.5  # m/s, of the robot; as SimulatedRobot drives
+_GOAL = re.compile(r"(?:sit down (?:at|on)|drink from) \w+ (\d+)$")
+
+
+def watched(kind: str, seed: int, people: int, *, rate: float = RATE, seconds: float = SECONDS) -> Episode:
+    """Returns what happens in a world: boxes of all objects, activities, goals, and where the robot's camera is."""
+    world = make_world(kind, seed, speed=_SPEED, hold=0.0, movers=True, people=people, tour=True)
+    times = np.arange(round(seconds * rate)) / rate
+    things = list(world.objects())
+    boxes = np.array([[_row(thing, t) for thing in things] for t in times])
+    doings = [world.doings(float(t)) for t in times]
+    agents = [d.thing for d in doings[0]]
+    camera = Drive(world.path).poses(times) @ mounted(world.camera_mount) @ BODY_TO_OPTICAL
+    return Episode(
+        name=f"{kind} {seed}",
+        times=times,
+        ids=np.array([thing.id for thing in things]),
+        labels=tuple(thing.label for thing in things),
+        boxes=boxes.astype(np.float32),
+        camera=camera,
+        agents=np.array(agents),
+        activities=tuple(tuple(d.activity for d in now) for now in doings),
+        goals=np.array([[_goal(d.goal) for d in now] for now in doings]),
+    )
+
+
+def worlds(first: int, count: int) -> list[tuple[str, int, int]]:
+    """Returns `count` worlds (kind, seed, people), kinds and numbers of people in turn."""
+    return [(KINDS[k % len(KINDS)], first + k, (3, 3, 4, 2)[(k // len(KINDS)) % 4]) for k in range(count)]
+
+
+def write_episodes(folder: Path, chosen: Sequence[tuple[str, int, int]], processes: int) -> Iterator[int]:
+    """Writes an episode of each world that the folder lacks; yields how many are made after each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    lacking = [world for world in chosen if not _file(folder, *world).is_file()]
+    if not lacking:
+        return
+    with multiprocessing.get_context("spawn").Pool(processes) as pool:
+        for k, _ in enumerate(pool.imap(partial(_write, folder), lacking)):
+            yield k + 1
+
+
+def read_episodes(folder: Path, chosen: Sequence[tuple[str, int, int]]) -> list[Episode]:
+    """Returns the episodes of these worlds. Raises FileNotFoundError for one that is not there."""
+    return [Episode.read(_file(folder, *world)) for world in chosen]
+
+
+def _write(folder: Path, world: tuple[str, int, int]) -> None:
+    file = _file(folder, *world)
+    unfinished = file.with_suffix(".partial.npz")
+    watched(*world).write(unfinished)
+    unfinished.replace(file)
+
+
+def _file(folder: Path, kind: str, seed: int, people: int) -> Path:
+    return folder / f"{kind}_{seed}_{people}.npz"
+
+
+def _row(thing: Thing, t: float) -> NDArray[np.float64]:
+    """Centre, full size and heading (7,) of a thing's box."""
+    T, size = thing.box(float(t))
+    return np.array([*T[:3, 3], *size, np.arctan2(T[1, 0], T[0, 0])])
+
+
+def _goal(text: str) -> int:
+    found = _GOAL.match(text)
+    return -1 if found is None else int(found[1])

@@ -1,0 +1,34 @@
+"""A classifier that the training command made of pictures of three shapes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import pytest
+from made_pictures import SHAPES, picture
+from typer.testing import CliRunner
+
+
+@pytest.fixture(scope="session")
+def shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("shapes")
+    for label, shape in enumerate(SHAPES):
+        (folder / shape).mkdir()
+        for i in range(24):
+            cv2.imwrite(str(folder / shape / f"{i:02d}.png"), picture(shape, 100 * label + i)[..., ::-1])
+    return folder
+
+
+@pytest.fixture(scope="session")
+def classifier(shapes: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Returns what the command makes of the shapes in a few epochs."""
+    pytest.importorskip("torch", reason="training needs the extra [train]")
+    from operators.training.commands import train
+
+    out = tmp_path_factory.mktemp("trained") / "shapes.onnx"
+    words = ["classifier", str(shapes), "--out", str(out), "--size", "64x64", "--epochs", "14", "--variation", "0.3"]
+    done = CliRunner().invoke(train, [*words, "--threads", "1", "--workers", "1", "--evaluate-every", "7"])
+    assert done.exit_code == 0, done.output
+    assert "operators.recognition:ImageClassifier" in done.output
+    return out

@@ -1,0 +1,116 @@
+"""Training of activities by command, on made episodes; and episodes of simulated worlds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from operators.recognition.activity_model import ActivityModel
+from operators.recognition.activity_score import macro_f1
+from operators.recognition.agent_features import COUNT
+from operators.recognition.episodes import Episode
+from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, worlds, write_episodes
+
+pytest.importorskip("torch", reason="training needs the extra [train]")
+
+from operators.training.commands import train
+
+
+def made(seed: int) -> Episode:
+    """Somebody walks to one of two chairs, stands for a second, sits down and sits."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(10 * 8) / 8
+    goal = int(rng.integers(2))
+    chairs = np.array([[3.0, -1.5], [3.0, 1.5]])
+    way = (chairs[goal] - [0.5, 0]) * np.clip(times / 5, 0, 1)[:, None]
+    sunk = np.clip((times - 6) / 1.7, 0, 1)
+    boxes = np.zeros((len(times), 3, 7), np.float32)
+    boxes[:, 0] = (0, 0, 0, 0.4, 0.5, 0, 0)
+    boxes[:, 0, :2] = way
+    boxes[:, 0, 5] = 1.7 - 0.4 * sunk
+    boxes[:, 0, 2] = boxes[:, 0, 5] / 2
+    for k, (x, y) in enumerate(chairs):
+        boxes[:, 1 + k] = (x, y, 0.45, 0.5, 0.5, 0.9, 0)
+    names = ("walking", "standing", "sitting_down", "sitting")
+    said = tuple((names[int(np.searchsorted([5, 6, 7.7], t, side="right"))],) for t in times)
+    camera = np.tile(np.eye(4), (len(times), 1, 1))
+    camera[:, :3, :3] = np.stack([[0, -1, 0], [0, 0, -1], [1, 0, 0]], axis=1)
+    camera[:, :3, 3] = (-3.0, 0.0, 1.0)
+    return Episode(
+        f"made {seed}", times, np.array([7, 5, 6]), ("person", "chair", "chair"), boxes, camera, np.array([7]), said,
+        np.full((len(times), 1), 5 + goal),
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of episodes that lacks none, so that no world is made."""
+    folder = tmp_path_factory.mktemp("people")
+    for kind, seed, people in (*worlds(TRAINING, 3), *worlds(VALIDATION, 1)):
+        made(seed).write(folder / f"{kind}_{seed}_{people}.npz")
+    return folder
+
+
+WORDS = ["--worlds", "3", "--validation", "1", "--variations", "1"]
+
+
+def test_the_activity_network_is_trained_scored_and_written(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "activity.onnx"
+    words = ["activity", str(folder), "--out", str(out), *WORDS, "--epochs", "2", "--json"]
+    done = CliRunner().invoke(train, words)
+    assert done.exit_code == 0, done.output
+    told = json.loads(done.stdout)
+    assert 0 <= told["scores"]["score"] <= 1
+    assert len(told["history"]) == 2
+    model = ActivityModel.open(out)
+    features = np.zeros((3, COUNT), np.float32)
+    probabilities, states = model.step(features, np.stack([model.fresh()] * 3))
+    np.testing.assert_allclose(probabilities.sum(axis=1), 1, rtol=1e-5)
+    assert states.shape == (3, 2, model.layers, model.width)
+    alone, _ = model.step(features[:1], model.fresh()[None])
+    np.testing.assert_allclose(alone[0], probabilities[0], rtol=1e-5)
+
+
+def test_equal_seeds_give_equal_networks(folder: Path, tmp_path: Path) -> None:
+    answers = []
+    for file in (tmp_path / "a.onnx", tmp_path / "b.onnx"):
+        words = ["activity", str(folder), "--out", str(file), *WORDS, "--epochs", "1", "--json"]
+        done = CliRunner().invoke(train, words)
+        assert done.exit_code == 0, done.output
+        model = ActivityModel.open(file)
+        answers.append(model.step(np.ones((2, COUNT), np.float32), np.stack([model.fresh()] * 2))[0].tobytes())
+    assert answers[0] == answers[1]
+
+
+def test_an_earlier_network_is_not_lost(folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "activity.onnx"
+    out.write_bytes(b"mine")
+    done = CliRunner().invoke(train, ["activity", str(folder), "--out", str(out), *WORDS])
+    assert done.exit_code == 1
+    assert out.read_bytes() == b"mine"
+
+
+def test_a_simulated_world_gives_boxes_activities_and_goals() -> None:
+    episode = watched("table_top", 40_001, 3, rate=2.0, seconds=3.0)
+    assert episode.boxes.shape == (6, len(episode.ids), 7)
+    assert np.isfinite(episode.boxes).all()
+    assert set(episode.agents.tolist()) <= set(episode.ids.tolist())
+    assert len(episode.activities[0]) == len(episode.agents)
+    goals = set(episode.goals.ravel().tolist()) - {-1}
+    assert goals <= set(episode.ids.tolist())
+    assert any(label == "person" for label in episode.labels)
+
+
+def test_episodes_that_are_there_are_not_made_again(folder: Path) -> None:
+    assert list(write_episodes(folder, worlds(TRAINING, 3), 1)) == []
+    assert [e.name for e in read_episodes(folder, worlds(TRAINING, 2))] == ["made 40000", "made 40001"]
+
+
+def test_unknown_is_a_miss_and_false_for_no_class() -> None:
+    assert macro_f1(["a", "a", "b", "b"], ["a", "unknown", "b", "b"]) == pytest.approx((2 / 3 + 1) / 2)
+    assert macro_f1(["a", "b"], ["a", "a"]) == pytest.approx((2 / 3) / 2)
+    assert macro_f1([], []) == 0
