@@ -1,4 +1,4 @@
-"""What of an agent's recent past and surroundings tells what it does: one vector for each moment."""
+"""Features of an agent: what of its recent past and surroundings tells what it does: one vector for each moment."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happened in a room, as boxes over time: the truth that activities and goals are learned from."""
+"""Episodes in a room, as boxes over time: the truth that activities and goals are learned from."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from operators.inference import ModelError
 from operators.recognition.proposals import F32, Trunk
 
 PROPOSALS, LEAST = 120, 0.004
-"""How many boxes around anything an image gives, and the detector's score from which."""
+"""Counts: boxes around anything that an image gives, and the detector's score from which."""
 _ALIKE, _APART = 0.65, 0.3  # overlap from which a box shows the object, and up to which it shows something else
 _SHRINKAGE = 0.3
 _WIDTH = 0.08  # of the score, over which a resemblance becomes sure
@@ -85,7 +85,7 @@ class LearnedObject:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What one image gives: vectors of the object (P, D) and of everything else (Q, D)."""
+    """Holds what one image gives: vectors of the object (P, D) and of everything else (Q, D)."""
 
     object: F32
     others: F32

@@ -1,4 +1,4 @@
-"""What a detector's network sees of an image: boxes around anything, and a vector that describes each."""
+"""Proposals by a detector's network: boxes around anything, and a vector that describes each."""
 
 from __future__ import annotations
 

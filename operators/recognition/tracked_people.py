@@ -1,4 +1,4 @@
-"""What a tracker in space makes of true boxes: a seeded model of jitter, misses, cut views and lost objects."""
+"""Tracks as a tracker in space makes them of true boxes: a seeded model of jitter, misses, cut views and lost objects."""
 
 from __future__ import annotations
 
