@@ -1,4 +1,4 @@
-"""Features of an agent: what of its recent past and surroundings tells what it does: one vector for each moment."""
+"""Features of an agent, one vector for each moment: what of its recent past and surroundings tells what it does."""
 
 from __future__ import annotations
 

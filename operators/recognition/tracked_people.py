@@ -1,4 +1,4 @@
-"""Tracks as a tracker in space makes them of true boxes: a seeded model of jitter, misses, cut views and lost objects."""
+"""Tracks as a tracker in space makes them of true boxes: seeded jitter, misses, cut views and lost objects."""
 
 from __future__ import annotations
 
