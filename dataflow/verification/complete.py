@@ -30,7 +30,7 @@ from dataflow.sync import Entry
 from dataflow.verification.board import Board
 from dataflow.verification.ledger import read_ledger
 from dataflow.verification.processes import Call, call_workers
-from dataflow.verification.verify import require_records
+from dataflow.verification.task import require_records
 
 
 @dataclass(frozen=True, slots=True)
