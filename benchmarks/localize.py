@@ -2,6 +2,7 @@
 
     python benchmarks/localize.py run office:21-24 table_top:21-24 yard:21-24     worlds and seeds, from and up to
     python benchmarks/localize.py degrade office:21                               a lidar that is knocked
+    python benchmarks/localize.py ambiguous corridor:15-18                        a world that looks the same twice
     python benchmarks/localize.py time                                            1,000 particles, no adaptation
     python benchmarks/localize.py map office 7 office_7.yaml                      saves a true map
 
@@ -140,6 +141,26 @@ def degrade(worlds: list[str]) -> None:
                 print(round(status.stamp * 1e-9), "s:", dict(zip(status.names, status.messages, strict=True)))
 
 
+def ambiguous(worlds: list[str]) -> None:
+    """Shares of 30 s in which the robot is said to be somewhere, rightly or wrongly, or to be in one of two places."""
+    for entry in worlds:
+        world, _, seeds = entry.partition(":")
+        first, _, stop = seeds.partition("-")
+        for seed in range(int(first), int(stop or int(first) + 1)):
+            static, streams = drive(world, seed, seconds=30, kidnaps=())
+            for name in ("lidar", "both"):
+                played, operator = localized(static, streams, SENSORS[name], modality_particles=0)
+                rows = errors(played["pose"], streams["true_base"])
+                total = len(streams["wheel_odometry"])
+                wrong = int((rows[:, 1] > 0.5).sum())
+                words = {word: n for word, n in operator.summary().items() if word.startswith("poses ")}
+                print(
+                    f"{world} {seed} {name}: right {(len(rows) - wrong) / total:.0%}, wrong {wrong / total:.0%}, "
+                    f"ambiguous {words.get('poses ambiguous', 0) / total:.0%}; {words}",  # type: ignore[operator]
+                    flush=True,
+                )
+
+
 def measure() -> None:
     """Time of single updates with 1,000 particles, in one thread."""
     from operators.localization.monte_carlo import MonteCarlo
@@ -166,7 +187,7 @@ def measure() -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["run", "degrade", "time", "map"])
+    parser.add_argument("what", choices=["run", "degrade", "ambiguous", "time", "map"])
     parser.add_argument("words", nargs="*")
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -178,7 +199,7 @@ def main() -> None:
     elif arguments.what == "time":
         measure()
     else:
-        (run if arguments.what == "run" else degrade)(arguments.words)
+        {"run": run, "degrade": degrade, "ambiguous": ambiguous}[arguments.what](arguments.words)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Scene graphs of simulated worlds against truth: relations, activities, goals; from sensors and fed with true nodes.
 
-    python benchmarks/scene_graph.py CACHE [--first 600] [--worlds 10] [--every 2]
+    python benchmarks/scene_graph.py CACHE [--first 600] [--worlds 10] [--every 1]
 
 From sensors: the shipped detector and segmenter, depth, true camera poses, `SemanticMap`, `SceneGraphBuilder`; no other
 truth goes in. The map at the end is scored as by semantic_map.py. Relations are scored at every second of the last half
@@ -17,68 +17,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from semantic_map import IOU, countable, mapped, scored, solids
+from semantic_map import mapped, scored, seen
 from sensed_worlds import Frame, World, sensed
 
 from dataflow.messages import Activity, SceneGraph
 from operators.scene import SceneGraphBuilder
-from operators.scene.box_overlap import upright_iou
+from operators.scene.scoring import PREDICATES, RelationScore, match_nodes
 
-PREDICATES = ("on", "in", "sitting_on", "holding", "near", "left_of", "in_front_of")
 ARRIVALS = ("sitting_down", "sitting", "reaching")
-
-
-def matched(nodes: SceneGraph, truth: SceneGraph) -> dict[int, int]:
-    """Returns the true id of each of our nodes that is an object of its class by IoU; the floor is the floor."""
-    mine, true = (solids(g.positions, g.sizes, g.orientations) for g in (nodes, truth))
-    names, labels = ([g.class_names[c] for c in g.class_ids.tolist()] for g in (truth, nodes))
-    rows = sorted(
-        (
-            (upright_iou(true[t], mine[m]), t, m)
-            for t in range(truth.count)
-            for m in range(nodes.count)
-            if names[t] == labels[m] and truth.ids[t] > 0 and np.abs(true[t][0] - mine[m][0]).max() < 2
-        ),
-        reverse=True,
-    )
-    of: dict[int, int] = {}
-    used: set[int] = set()
-    for value, t, m in rows:
-        if value >= IOU and int(truth.ids[t]) not in used and int(nodes.ids[m]) not in of:
-            of[int(nodes.ids[m])] = int(truth.ids[t])
-            used.add(int(truth.ids[t]))
-    return of | {0: 0}
-
-
-def triples(graph: SceneGraph) -> set[tuple[int, str, int]]:
-    ids = graph.ids.tolist()
-    return {(ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES}
-
-
-def ordered(triple: tuple[int, str, int]) -> tuple[int, str, int]:
-    s, p, o = triple
-    return (min(s, o), p, max(s, o)) if p == "near" else triple
-
-
-def compare(graph: SceneGraph, truth: SceneGraph, of: dict[int, int], must: set[int], counts: Counter[str]) -> None:
-    """Counts hits, misses and false ones by predicate, of mapped pairs and over all that count."""
-    known, ours = set(of.values()), triples(graph)
-    true = {ordered(t) for t in triples(truth)}
-    mine = {ordered((of[s], p, of[o])) for s, p, o in ours if s in of and o in of}
-    for triple in mine | {t for t in true if t[0] in known and t[2] in known}:
-        kind = "hit" if triple in mine and triple in true else "false" if triple in mine else "miss"
-        counts[f"mapped {kind} {triple[1]}"] += 1
-    counts["all hit"] += len(mine & true)
-    counts["all false"] += len([t for t in ours if not (t[0] in of and t[2] in of)]) + len(mine - true)
-    counts["all miss"] += len([t for t in true - mine if {t[0], t[2]} <= must | {0}])
-
-
-def f1(counts: Counter[str], scope: str, predicate: str = "") -> float:
-    hit, false, miss = (
-        sum(n for k, n in counts.items() if k.startswith(f"{scope} {kind}") and k.endswith(predicate))
-        for kind in ("hit", "false", "miss")
-    )
-    return 2 * hit / max(2 * hit + false + miss, 1)
 
 
 def acts(message: Activity) -> dict[int, str]:
@@ -155,23 +101,24 @@ def run(world: World, every: int, *, true: bool) -> dict[str, Any]:
     if true:
         nodes = [f.scene for f in frames]
     else:
-        objects, nodes = mapped(World(world.name, world.image_info, world.extrinsics, frames), true=False)
-        figures = {k: v for k, v in scored(world, objects[-1]).items() if k != "match"}
-    must = countable(world)
-    counts: Counter[str] = Counter()
+        nodes = mapped(World(world.name, world.image_info, world.extrinsics, frames), true=False)
+        score = scored(world, nodes[-1])
+        figures = {"recall": score.recall, "precision": score.precision, "doubles": len(score.doubles)}
+    must = seen(world).countable()
+    relations = RelationScore()
     made, graphs = [], []
     for k, (frame, node) in enumerate(zip(frames, nodes, strict=True)):
         out = builder.process(node, frame.base)
         graphs.append(out["graph"])
         late = k >= len(frames) // 2
-        of = {i: i for i in node.ids.tolist()} if true else matched(out["graph"], frame.scene)
+        of = {i: i for i in node.ids.tolist()} if true else match_nodes(out["graph"], frame.scene)
         made.append((out["activities"], of))
         if late and k % max(1, round(len(frames) / 50)) == 0:
-            compare(out["graph"], frame.scene, of, must if not true else set(of), counts)
+            relations.add(out["graph"], frame.scene, of, must if not true else set(of))
     return figures | {
-        "relations": counts,
-        "f1 mapped": f1(counts, "mapped"),
-        "f1 all": f1(counts, "all"),
+        "relations": relations.counts,
+        "f1 mapped": relations.f1("mapped"),
+        "f1 all": relations.f1("all"),
         "acts": compare_acts(world, frames, made),
         "goals": goals(frames, graphs) if true else {},
     }
@@ -182,7 +129,7 @@ def main() -> None:
     parser.add_argument("cache", type=Path)
     parser.add_argument("--first", type=int, default=600)
     parser.add_argument("--worlds", type=int, default=10)
-    parser.add_argument("--every", type=int, default=2, help="take every so many frames of the sensors")
+    parser.add_argument("--every", type=int, default=1, help="take every so many frames of the sensors")
     parser.add_argument("--fed", choices=["true", "sensors", "both"], default="both")
     parser.add_argument("--out", type=Path, help="JSON file for all figures")
     options = parser.parse_args()
@@ -202,8 +149,10 @@ def main() -> None:
             values = [r[key] for r in found if key in r]
             if values:
                 print(f"{fed} {key}: mean {np.mean(values):.3f}, worst {min(values):.3f}")
-        total: Counter[str] = sum((r["relations"] for r in found), Counter())
-        print(f"{fed} by predicate:", {p: round(f1(total, "mapped", f" {p}"), 3) for p in PREDICATES})
+        total = RelationScore()
+        for row in found:
+            total.counts.update(row["relations"])
+        print(f"{fed} by predicate:", {p: round(total.f1("mapped", f" {p}"), 3) for p in PREDICATES})
         said: Counter[str] = sum((r["acts"] for r in found), Counter())
         print(f"{fed} activities: macro-F1 {macro_f1(said):.3f} pooled; majority {majority(said):.3f}; {dict(said)}")
         for name in ("ours", "nearest", "heading"):

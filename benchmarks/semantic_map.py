@@ -11,27 +11,25 @@ view in the last 2 s.
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from sensed_worlds import World, sensed
 
-from dataflow.messages import Boxes3D, Detections2D, SceneGraph, SegmentationMap
-from dataflow.messages.geometry import yaw_of
+from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
 from operators.scene import ObjectLifter, SemanticMap
-from operators.scene.box_overlap import upright_iou
+from operators.scene.scoring import MOVERS, NodeScore, PlainlySeen, score_nodes
 
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5
 
 
-def mapped(world: World, *, true: bool, **params: Any) -> tuple[list[Boxes3D], list[SceneGraph]]:
-    """Returns the map after each frame, as boxes and as nodes."""
+def mapped(world: World, *, true: bool, **params: Any) -> list[SceneGraph]:
+    """Returns the map after each frame."""
     lifter, known = ObjectLifter(), SemanticMap(**params)
     lifter.setup()
     known.setup()
-    maps, nodes = [], []
+    nodes: list[SceneGraph] = []
     for frame in world.frames:
         detections: Detections2D = frame.objects if true else frame.detections
         masks: SegmentationMap = frame.masks if true else frame.segmentation
@@ -39,10 +37,17 @@ def mapped(world: World, *, true: bool, **params: Any) -> tuple[list[Boxes3D], l
             enough = (frame.objects.visible >= 0.2) & (frame.objects.pixel_counts >= 100)
             detections = chosen(frame.objects, enough)
         found = lifter.process(detections, frame.cloud, world.image_info, world.extrinsics, masks, frame.camera)
-        made = known.process(found["boxes"], found["clusters"], frame.cloud, frame.camera)
-        maps.append(made["objects"])
+        made = known.process(
+            found["boxes"],
+            found["clusters"],
+            frame.cloud,
+            frame.camera,
+            world.extrinsics,
+            found["images"],
+            world.image_info,
+        )
         nodes.append(made["nodes"])
-    return maps, nodes
+    return nodes
 
 
 def chosen(objects: Detections2D, rows: Any) -> Detections2D:
@@ -58,76 +63,20 @@ def chosen(objects: Detections2D, rows: Any) -> Detections2D:
     )
 
 
-def countable(world: World) -> set[int]:
-    seen: Counter[int] = Counter()
+def seen(world: World) -> PlainlySeen:
+    counts = PlainlySeen(VISIBLE, PIXELS, IMAGES)
     for frame in world.frames:
-        clear = (frame.objects.visible >= VISIBLE) & (frame.objects.pixel_counts >= PIXELS)
-        seen.update(frame.objects.ids[clear].tolist())
-    return {i for i, n in seen.items() if n >= IMAGES}
+        counts.add(frame.objects)
+    return counts
 
 
-def solids(centers: Any, sizes: Any, orientations: Any) -> list[tuple[Any, Any, float]]:
-    yaws = yaw_of(orientations) if len(centers) else np.zeros(0)
-    return list(zip(np.asarray(centers), np.asarray(sizes), yaws.tolist(), strict=True))
-
-
-def scored(world: World, known: Boxes3D) -> dict[str, Any]:
-    """Matches the map with the truth at its end, class by class, best overlap first."""
-    truth, counts = world.frames[-1].scene, countable(world)
-    last_view = {i: f.objects.stamp for f in world.frames for i in f.objects.ids.tolist()}
-    names = [truth.class_names[c] for c in truth.class_ids.tolist()]
-    movers = {"person", "robot", "ball"}
-    rows = [k for k in range(truth.count) if truth.ids[k] > 0]
+def scored(world: World, nodes: SceneGraph) -> NodeScore:
+    """Scores a map at the end of the drive; movers count that were in view in the last 2 s."""
+    truth, counts = world.frames[-1].scene, seen(world)
+    names = dict(zip(truth.ids.tolist(), (truth.class_names[c] for c in truth.class_ids), strict=True))
     recent = truth.stamp - 2_000_000_000
-    must = {
-        k
-        for k in rows
-        if int(truth.ids[k]) in counts and (names[k] not in movers or last_view[int(truth.ids[k])] >= recent)
-    }
-    true = solids(truth.positions, truth.sizes, truth.orientations)
-    mine = solids(known.centers, known.sizes, known.orientations)
-    labels = known.labels()
-    pairs = sorted(
-        ((upright_iou(true[t], mine[m]), t, m) for t in rows for m in range(known.count) if names[t] == labels[m]),
-        reverse=True,
-    )
-    of_truth: dict[int, int] = {}
-    of_mine: dict[int, int] = {}
-    for value, t, m in pairs:
-        if value >= IOU and t not in of_truth and m not in of_mine:
-            of_truth[t], of_mine[m] = m, t
-    doubles, wrong, ignored = [], [], 0
-    for m in range(known.count):
-        if m in of_mine:
-            continue
-        best = max(((upright_iou(true[t], mine[m]), t) for t in rows if names[t] == labels[m]), default=(0.0, -1))
-        gaps = [(float(np.linalg.norm(true[t][0] - mine[m][0])), t) for t in rows if names[t] == labels[m]]
-        gap, nearest = min(gaps, default=(9.0, -1))
-        if (
-            gap < 0.5 * float(mine[m][1].max()) + 0.2
-            and nearest >= 0
-            and nearest not in must
-            and nearest not in of_truth
-        ):
-            ignored += 1
-        elif gap < 0.5 and nearest in of_truth:
-            doubles.append((labels[m], round(best[0], 2)))
-        else:
-            wrong.append((labels[m], int(known.ids[m]), round(best[0], 2), round(gap, 2)))
-    hits = sum(t in of_truth for t in must)
-    counted = len([m for m, t in of_mine.items() if t in must])
-    false = len(doubles) + len(wrong)
-    return {
-        "must": len(must),
-        "recall": hits / max(len(must), 1),
-        "precision": counted / max(counted + false, 1),
-        "doubles": doubles,
-        "wrong": wrong,
-        "missed": [(names[t], int(truth.ids[t])) for t in sorted(must) if t not in of_truth],
-        "ious": [value for value, t, m in pairs if of_truth.get(t) == m],
-        "match": {int(known.ids[m]): int(truth.ids[t]) for m, t in of_mine.items()},
-        "ignored": ignored,
-    }
+    must = {i for i in counts.countable() if i in names and (names[i] not in MOVERS or counts.last[i] >= recent)}
+    return score_nodes(nodes, truth, must, IOU)
 
 
 def main() -> None:
@@ -140,19 +89,19 @@ def main() -> None:
     figures: dict[bool, list[Any]] = {True: [], False: []}
     for world in sensed(range(options.first, options.first + options.worlds), options.cache):
         for true in (True, False):
-            result = scored(world, mapped(world, true=true)[0][-1])
+            result = scored(world, mapped(world, true=true)[-1])
             figures[true].append(result)
             print(
-                f"{world.name} {'truth-fed' if true else 'sensors'}: {result['must']} objects, "
-                f"recall {result['recall']:.2f}, precision {result['precision']:.2f}, "
-                f"doubles {len(result['doubles'])}, IoU {np.mean(result['ious']):.2f}",
+                f"{world.name} {'truth-fed' if true else 'sensors'}: {result.must} objects, "
+                f"recall {result.recall:.2f}, precision {result.precision:.2f}, "
+                f"doubles {len(result.doubles)}, IoU {np.mean(result.ious):.2f}",
                 flush=True,
             )
             if options.verbose:
-                print("   missed", result["missed"], "\n   wrong", result["wrong"], "\n   doubles", result["doubles"])
+                print("   missed", result.missed, "\n   wrong", result.wrong, "\n   doubles", result.doubles)
     for true, rows in figures.items():
         for key in ("recall", "precision"):
-            values = [r[key] for r in rows]
+            values = [getattr(r, key) for r in rows]
             print(f"{'truth-fed' if true else 'sensors'} {key}: mean {np.mean(values):.3f}, worst {min(values):.3f}")
 
 

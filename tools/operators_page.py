@@ -84,10 +84,15 @@ def _title(module: str) -> str:
 
 def _contents_row(cls: type[Operator]) -> str:
     spec = cls.spec
-    takes = _distinct(t for port in spec.inputs.values() for t in port.types)
-    gives = _distinct(t for port in spec.outputs.values() for t in port.types)
+    takes = _distinct(t for port in spec.inputs.values() for t in _sorted(port.types))
+    gives = _distinct(t for port in spec.outputs.values() for t in _sorted(port.types))
     summary = _cell(" ".join(spec.doc.partition("\n\n")[0].split()))
     return f"| [{spec.name}](#{spec.name.lower()}) | {takes} | {gives} | {summary} |"
+
+
+def _sorted(types: Iterable[type[Message]]) -> list[type[Message]]:
+    """Sorts the types of a port by name: Python may give a union in the order in which another module wrote it."""
+    return sorted(types, key=lambda t: t.SCHEMA or "")
 
 
 def _distinct(types: Iterable[type[Message]]) -> str:
@@ -95,7 +100,9 @@ def _distinct(types: Iterable[type[Message]]) -> str:
 
 
 def _types(types: Iterable[type[Message]]) -> str:
-    return " or ".join(f"[{t.SCHEMA}](messages.md#{t.SCHEMA.lower()})" if t.SCHEMA else "any message" for t in types)
+    return " or ".join(
+        f"[{t.SCHEMA}](messages.md#{t.SCHEMA.lower()})" if t.SCHEMA else "any message" for t in _sorted(types)
+    )
 
 
 def _world(cls: type[Operator]) -> str:

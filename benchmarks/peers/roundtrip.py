@@ -2,6 +2,7 @@
 
     python benchmarks/peers/roundtrip.py --peers VENV
     python benchmarks/peers/roundtrip.py --peers VENV --rounds 9 --sizes 1008,921600,8294400 --only ours,dora
+    python benchmarks/peers/roundtrip.py --against OTHER_CHECKOUT --only ours,there
 
 VENV is a virtual environment with dora-rs, dora-rs-cli, eclipse-zenoh, iceoryx2, lcm, pyarrow and numpy.
 
@@ -24,6 +25,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
+ROOT = HERE.parent.parent
 WARM_UP = 20
 
 
@@ -52,23 +54,20 @@ def dora(peers: Path) -> Callable[[int, int], list[float]]:
     return run
 
 
-def ours(options: dict[str, object]) -> Callable[[int, int], list[float]]:
-    """A live run of `roundtrip.yaml`, in a Python of its own."""
+def ours(tree: Path) -> Callable[[int, int], list[float]]:
+    """A live run of `roundtrip.yaml` with the code of a checkout, in a Python of its own."""
 
     def run(size: int, count: int) -> list[float]:
         code = (
-            "import json, sys\n"
-            "from pathlib import Path\n"
+            "import sys\n"
             f"sys.path.append({str(HERE)!r})\n"
             "from dataflow.graph import load_graph\n"
             "from dataflow.supervision.run import run\n"
             f"settings = ['nbytes={size}', 'count={count}']\n"
             f"graph = load_graph({str(HERE / 'roundtrip.yaml')!r}, settings=settings, live=True)\n"
-            f"options = json.loads({json.dumps(options)!r})\n"
-            "options = {k: Path(v) if k == 'record' else v for k, v in options.items()}\n"
-            "print(run(graph, live=True, **options).summaries['pong']['took'])\n"
+            "print(run(graph, live=True).summaries['pong']['took'])\n"
         )
-        return parsed(finished([sys.executable, "-c", code]))
+        return parsed(finished([sys.executable, "-c", code], PYTHONPATH=str(tree)))
 
     return run
 
@@ -99,9 +98,12 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=150)
     parser.add_argument("--sizes", default="1008,921600,8294400")
+    parser.add_argument("--against", type=Path, help="another checkout, as contestant `there`")
     parser.add_argument("--only", default="", help="names of contestants, separated by commas")
     arguments = parser.parse_args()
-    contestants: dict[str, Callable[[int, int], list[float]]] = {"ours": ours({}), "floor": script("floor", None)}
+    contestants: dict[str, Callable[[int, int], list[float]]] = {"ours": ours(ROOT), "floor": script("floor", None)}
+    if arguments.against is not None:
+        contestants["there"] = ours(arguments.against.resolve())
     if arguments.peers is not None:
         contestants["dora"] = dora(arguments.peers)
         for name in ("zenoh", "iceoryx", "lcm"):

@@ -14,6 +14,7 @@ from dataflow.api.builder import Graph
 from dataflow.api.html import run_html, verify_html
 from dataflow.api.local import LocalRun, Watch
 from dataflow.api.recordings import RecordedStreams, open
+from dataflow.editing.untouched import keep_untouched
 from dataflow.firing import seeding
 from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph import load_graph
@@ -135,18 +136,19 @@ def replay(
 
     Recorded streams replace the sources; everything else runs again. `start`, `end`: seconds from the first message;
     operators begin in the state that they had at `start`. A ROS bag (file or folder) or any MCAP plays into `graph`
-    too: `maps` says which topic stands in for which stream (`{"/camera/image_raw": "camera/image"}`), where types leave
-    a choice; `clock` whether headers or log times stamp it. Raises `ReplayError`, `GraphError`, `RunFailed`, and
-    `MappingError` that lists the topics.
+    too, and its other topics are in the recording as they are: `maps` says which topic stands in for which stream
+    (`{"/camera/image_raw": "camera/image"}`), where types leave a choice; `clock` whether headers or log times stamp
+    it. Raises `ReplayError`, `GraphError`, `RunFailed`, and `MappingError` that lists the topics.
     """
     path = Path(recording)
     facts: dict[str, dict[str, str]] = {}
+    played: set[str] | None = None
     if graph is not None and is_foreign(path):
         built = resolved(graph, settings)
         words = [f"{topic}={stream}" for topic, stream in (maps or {}).items()]
         with play(path, built, words, clock) as bag:
             log = plan_replay(bag, built, start=start, end=end)
-            facts = {BAG: bag.facts()}
+            facts, played = {BAG: bag.facts()}, {p.topic for p in bag.played.values()}
     else:
         with Recording(path) as opened:
             built = recorded_graph(opened) if graph is None else resolved(graph, settings)
@@ -155,6 +157,8 @@ def replay(
     report = LocalRun(built, log=log, paranoid=paranoid).execute(
         record=file, metadata=facts | _metadata(built, "replay"), overwrite=overwrite, watch=watch
     )
+    if file is not None and played is not None:
+        keep_untouched(file, path, played, log.start, log.end)
     return RunResult(report, file)
 
 

@@ -62,8 +62,11 @@ class SourceFaults:
         self._flood: tuple[int, float] = (1, 0.0)
         self._shift = 0
         self._past: int | None = None
+        self.begun = False
+        """Whether there ever was a fault: until then every step takes its own place."""
 
     def begin(self, kind: str, fields: Mapping[str, Any], now: float) -> None:
+        self.begun = True
         match kind:
             case "stop":
                 self._silent_until = now + fields["span"]

@@ -176,11 +176,20 @@ def chosen_streams(words: Sequence[str] | None, names: Iterable[str], namespace:
 
 
 def span(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] | None:
-    """The first and the last stamp (ns) of those streams that are not static; None when they hold no message."""
+    """The first and the last stamp (ns) of those streams that are not static; None when they hold no message.
+
+    Of a part of a recording, what lies outside of its span is left out.
+    """
+    from dataflow.recording.cutting import cut_of
+
     infos = [recording.streams[s] for s in streams if not recording.streams[s].static]
     firsts = [info.first for info in infos if info.first is not None]
     lasts = [info.last for info in infos if info.last is not None]
-    return (min(firsts), max(lasts)) if firsts and lasts else None
+    if not firsts or not lasts:
+        return None
+    part = cut_of(recording.metadata)
+    start, end = (None, None) if part is None else (part.start, part.end)
+    return min(firsts) if start is None else start, max(lasts) if end is None else min(max(lasts), end)
 
 
 def check_offset(option: str, value: float | None) -> None:

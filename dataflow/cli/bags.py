@@ -46,6 +46,7 @@ def replay_bag(
     quiet: bool,
 ) -> None:
     """Replays a bag through a graph, and says what of it is played, by which clock, and what was repaired."""
+    from dataflow.editing.untouched import keep_untouched
     from dataflow.interop.playing import match
     from dataflow.interop.streams import BagStreams
     from dataflow.recording.layout import BAG
@@ -69,6 +70,11 @@ def replay_bag(
             json=json,
             quiet=quiet,
         )
+        if outputs.record is not None:
+            kept = keep_untouched(outputs.record, path, {p.topic for p in opened.played.values()}, begin, finish)
+            if kept and not quiet:
+                names = ", ".join(sorted(kept))
+                say(f"[dim]kept as they are: {plural(sum(kept.values()), 'message')} of {escape(names)}[/]")
 
 
 def say_what_is_played(matching: Matching, opened: BagStreams) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from dataflow.interop.export.material import Material
     from dataflow.interop.export.report import Exported
 
-Format = Literal["mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "csv", "parquet"]
+Format = Literal[
+    "mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "kitti-raw", "lerobot", "csv", "parquet"
+]
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 """Of formats that are one file; the others are folders."""
 
@@ -45,6 +47,10 @@ def convert(
     start: Start = None,
     end: End = None,
     clock: Clock = "auto",
+    action: Annotated[
+        str | None, typer.Option("--action", metavar="STREAM", help="Of lerobot: the stream that is the action.")
+    ] = None,
+    task: Annotated[str, typer.Option("--task", metavar="TEXT", help="Of lerobot: what is done.")] = "",
     overwrite: Overwrite = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", metavar=" ", help="Show no progress.")] = False,
     json: Json = False,
@@ -53,7 +59,8 @@ def convert(
 
     Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
-    kept as they are. Datasets (tum, 7scenes, euroc, kitti) take one stream of a kind: --stream chooses among several.
+    kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --stream chooses among
+    several. Into lerobot, every image of the first camera is a frame, with the newest message of every other stream.
 
     Exit codes:
 
@@ -70,6 +77,8 @@ def convert(
       dataflow convert run.mcap folder --to 7scenes
       dataflow convert run.mcap folder --to euroc
       dataflow convert run.mcap folder --to kitti --stream camera/*
+      dataflow convert run.mcap folder --to kitti-raw
+      dataflow convert run.mcap folder --to lerobot --action cmd/twist
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
@@ -82,7 +91,9 @@ def convert(
             view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
             return
         with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            done = _export(material, output, to, overwrite, watch)
+            if to != "lerobot" and (action is not None or task):
+                raise fail("--action and --task are of --to lerobot")
+            done = _export(material, output, to, overwrite, watch, action, task)
     if json:
         print_json(done.as_json())
         return
@@ -112,20 +123,24 @@ def _opened(
     path: Path, words: list[str] | None, start: float | None, end: float | None, clock: Literal["auto", "header", "log"]
 ) -> Iterator[Material]:
     from dataflow.interop.export.material import Material
+    from dataflow.recording.cutting import cut_of
     from dataflow.recording.layout import RECORDING
 
+    metadata: Mapping[str, Mapping[str, str]]
     with Material(path, clock=clock) as whole:
         names = [*whole.streams, *(t.name for t in whole.untouched)]
-        namespace = ""
+        namespace, metadata = "", {}
         if not whole.foreign:
             from dataflow.recording import Recording
 
             with Recording(path) as opened:
-                namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
+                metadata = opened.metadata
+                namespace = metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(words, names, namespace) if words else None
         firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
         firsts += [t.first for t in whole.untouched if t.first is not None]
-        first = min(firsts, default=0)
+        part = None if whole.foreign else cut_of(metadata)
+        first = min(firsts, default=0) if part is None or part.start is None else part.start
         if whole.clock:
             say(f"[dim]stamps: {escape(whole.clock)}[/]")
     begin = None if start is None else first + round(start * 1e9)
@@ -135,7 +150,13 @@ def _opened(
 
 
 def _export(
-    material: Material, output: Path, to: str, overwrite: bool, watch: Callable[[int], None] | None
+    material: Material,
+    output: Path,
+    to: str,
+    overwrite: bool,
+    watch: Callable[[int], None] | None,
+    action: str | None,
+    task: str,
 ) -> Exported:
     from dataflow.interop.export.datasets import DATASETS
     from dataflow.interop.export.foxglove import export_foxglove
@@ -152,6 +173,10 @@ def _export(
             export_foxglove(material, output, done)
         case "ros2":
             export_ros2(material, output, done)
+        case "lerobot":
+            from dataflow.interop.export.lerobot import export_lerobot
+
+            export_lerobot(material, output, done, action=action, task=task)
         case "csv":
             export_csv(material, output, done)
         case "parquet":

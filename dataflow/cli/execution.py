@@ -97,7 +97,8 @@ def execute(
     began: float,
     json: bool,
     quiet: bool,
-) -> None:
+) -> RunReport:
+    """Runs it; ends the command where it was interrupted."""
     from dataflow.cli.progress import RunDisplay, shown
     from dataflow.cli.report import print_report, report_json
     from dataflow.cli.viewers import attached_viewer, open_saved
@@ -119,6 +120,7 @@ def execute(
         open_saved(outputs.view_file)
     if report.interrupted:
         raise typer.Exit(INTERRUPTED)
+    return report
 
 
 def _written(file: Path) -> tuple[int, int] | None:

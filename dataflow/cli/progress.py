@@ -65,7 +65,8 @@ class RunDisplay:
         total, completed = self.fraction(status)
         parts = (waiting_for(status), self.reached(status), self._clock(total, completed))
         note = " · ".join(part for part in parts if part)
-        self._bar.update(self._task, description=status.phase, total=total, completed=completed, note=note)
+        phase = "paused" if status.paused and status.phase not in ENDING else status.phase
+        self._bar.update(self._task, description=phase, total=total, completed=completed, note=note)
 
     def fraction(self, status: Status) -> tuple[float | None, float]:
         """(total, completed): seconds of event time where the span is known, else steps of the sources."""

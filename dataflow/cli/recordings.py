@@ -83,7 +83,8 @@ def info(
 
 
 def _facts(described: Description) -> Table:
-    from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RUN
+    from dataflow.recording.cutting import cut_of
+    from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.sync.stamps import format_stamp
 
     grid = Table.grid(padding=(0, 2))
@@ -108,6 +109,11 @@ def _facts(described: Description) -> Table:
     if OUTCOME in made:
         outcome = made[OUTCOME].get("outcome", "")
         row("outcome", outcome, "" if outcome == "complete" else "yellow")
+    if (part := cut_of(made)) is not None:
+        ends = [f"{word} {format_stamp(s)}" for word, s in (("from", part.start), ("to", part.end)) if s is not None]
+        row("part of", " ".join([part.of, *ends]))
+    if RECOVERED in made:
+        row("recovered", f"from {made[RECOVERED].get('of', '')}: what could be read of it", "yellow")
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
         row("torn", "no proper end: its writer died" + (lost if described.lost_bytes else ""), "yellow")

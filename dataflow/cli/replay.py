@@ -5,12 +5,13 @@ from __future__ import annotations
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
 from dataflow.cli.arguments import (
+    FLAG,
     AnyRecording,
     Clock,
     End,
@@ -29,6 +30,7 @@ from dataflow.cli.arguments import (
 )
 from dataflow.cli.execution import checked_outputs, execute, plan_options
 from dataflow.cli.output import DIFFERENT, err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.playback import keys, looped
 from dataflow.cli.run_options import (
     OUTPUT,
     Json,
@@ -63,6 +65,12 @@ def replay(
     start: Start = None,
     end: End = None,
     rate: Rate = None,
+    step: Annotated[
+        bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
+    ] = False,
+    loop: Annotated[
+        int, typer.Option("--loop", metavar="N", help="Replay N times, and compare the passes; 0: until Ctrl-C.")
+    ] = 1,
     timeout: Timeout = 120.0,
     paranoid: Paranoid = False,
     network: Network = False,
@@ -96,6 +104,9 @@ def replay(
     the error proposes what to say. Messages are stamped with the time in their headers, or where that cannot be trusted
     with the time of their recording; which, and why, is printed.
 
+    In a terminal, space pauses it and lets it go on, the right arrow or n makes one step (all messages of one
+    timestamp), q ends it; `dataflow playback` does the same from elsewhere. Results do not depend on that.
+
     With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
     nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded
     digest. Where one comes out otherwise, nothing is written and the exit code is 1; also 1 where firings could not be
@@ -114,6 +125,8 @@ def replay(
       dataflow replay run.mcap --start 5 --end 10 --rate 1 --view spawn
       dataflow replay run.mcap --graph other.yaml --set cloud.stride=8
       dataflow replay run.mcap --record again.mcap --view again.rrd --open
+      dataflow replay run.mcap --step --view spawn
+      dataflow replay run.mcap --rate 1 --loop 3
       dataflow replay thin.mcap --complete full.mcap
       dataflow replay drive.bag --graph g.yaml --map /rgb=camera/image
     """
@@ -124,6 +137,10 @@ def replay(
         existing_recording(recording)
         if record is not None and record.exists() and record.samefile(recording):
             raise fail(f"--record {record} is the recording that is being replayed; name another file")
+        if loop < 0:
+            raise fail(f"--loop {loop}: expected 1 or more, or 0 for no end")
+        if loop != 1 and (record is not None or view is not None or complete is not None):
+            raise fail("--loop makes the same in each pass: it does not go with --record, --view or --complete")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
         find_modules_in(path)
@@ -131,6 +148,7 @@ def replay(
         from dataflow.graph import load_graph
         from dataflow.interop.opening import is_foreign, open_bag
         from dataflow.recording import Recording
+        from dataflow.recording.cutting import cut_of
         from dataflow.reexecution.recorded_run import graph_as_recorded, isolated
         from dataflow.supervision.replay import plan_replay
         from dataflow.supervision.run import replay as replay_recording
@@ -146,7 +164,9 @@ def replay(
             loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
             outputs = checked_outputs(record, view, open_view, overwrite)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-            options["early"] = early
+            options |= {"early": early, "paused": step, "controls": keys(quiet or json)}
+            if loop != 1:
+                raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
             replay_bag(
                 recording, loaded, maps or (), clock, start, end, outputs, options, began=began, json=json, quiet=quiet
             )
@@ -173,24 +193,32 @@ def replay(
             if opened.torn:
                 name = escape(str(recording))
                 say(f"[yellow]{name} has no proper end:[/] what its writer had not stored when it died is missing")
+            part = cut_of(opened.metadata)
+            begin = part.start if begin is None and part is not None else begin
             if begin is not None:
-                _say_what_begins_fresh(opened, loaded)
+                _say_what_begins_fresh(opened, loaded, begin)
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         shown = None
         if whole is not None:
             shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
-        execute(
-            lambda watch: replay_recording(
-                recording, graph=loaded, start=start, end=end, watch=watch, early=early, **options
-            ),
-            loaded,
-            outputs,
-            shown,
-            began=began,
-            json=json,
-            quiet=quiet,
-        )
+        options |= {"paused": step, "controls": keys(quiet or json)}
+
+        def once() -> dict[str, Any]:
+            report = execute(
+                lambda watch: replay_recording(
+                    recording, graph=loaded, start=start, end=end, watch=watch, early=early, **options
+                ),
+                loaded,
+                outputs,
+                shown,
+                began=began,
+                json=json,
+                quiet=quiet,
+            )
+            return dict(report.streams)
+
+        looped(loop, once)
 
 
 def say_network_ignored(recording: Path) -> None:
@@ -201,12 +229,12 @@ def say_network_ignored(recording: Path) -> None:
     )
 
 
-def _say_what_begins_fresh(recording: Recording, graph: Graph) -> None:
-    """With --start: which operators cannot have the state they had then."""
+def _say_what_begins_fresh(recording: Recording, graph: Graph, stamp: int) -> None:
+    """With --start, and of a part: which operators cannot have the state they had then."""
     from dataflow.reexecution.warm_start import fresh_because
 
     for node in graph.nodes.values():
-        if not node.source and (reason := fresh_because(recording, graph, node)) is not None:
+        if not node.source and (reason := fresh_because(recording, graph, node, stamp)) is not None:
             say(f"[yellow]{escape(node.name)} begins with fresh state:[/] {escape(reason)}")
 
 

@@ -70,6 +70,9 @@ def run(
     A table of its operators is shown while it runs, and a summary at the end. Ctrl-C ends it in order: sources stop,
     everything on its way is finished, files are closed; a second Ctrl-C ends it at once.
 
+    A graph with `record: {keep: 60s}` has a flight recorder, unless --record keeps everything: what was is kept on a
+    trigger, or with `dataflow trigger`.
+
     Examples:
 
       dataflow run graphs/synthetic_rgbd.yaml
@@ -101,6 +104,9 @@ def run(
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live
+        if loaded.record.flight is not None and record is None:
+            options["flight"] = Path(loaded.record.flight.folder)
+            options["flight"].mkdir(parents=True, exist_ok=True)
         if chaos is not None:
             from dataflow.chaos.plan import load_plan
 

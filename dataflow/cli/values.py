@@ -1,4 +1,4 @@
-"""What the words of a command line mean where that is plain.
+"""Reads the words of a command line where their meaning is plain.
 
 Typer has pydantic check every value, and to import pydantic takes as long as all else that a command line needs.
 """

@@ -170,7 +170,7 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
         )
     elif repeats and judged.verdict == "culprit":
         yield f"{v.operator}: run a second time, it differed alike: its code, its libraries or the machine changed"
-    if report.start is not None and v.began == "start":
+    if report.start is not None and v.began == "start" and not v.unknown:
         yield f"{v.operator}: keeps state and the recording has no snapshot of it there: repeated from its beginning"
     yield from _left_out(v)
     for file in v.files_changed:
@@ -179,6 +179,13 @@ def explain(checked: Checked, judged: Judged) -> Iterator[str]:
 
 def _cut(report: VerifyReport) -> str:
     """Tells why a recording tells of its run only up to a cut; nothing where it tells of all."""
+    if report.part is not None:
+        span = " ".join(
+            f"{word} {format_stamp(stamp)}"
+            for word, stamp in (("from", report.part.start), ("to", report.part.end))
+            if stamp is not None
+        )
+        return f"the recording is a part of {report.part.of}, {span or 'all of it'}: verified is what it holds"
     if report.torn:
         return "the recording has no proper end: verified is what its writer had stored when it died"
     return "the run did not end in order: verified is what was recorded until then" if report.cut else ""
@@ -227,6 +234,11 @@ def _left_out(v: Verification) -> Iterator[str]:
     """Returns what could not be repeated, and what the recording lacks."""
     if v.lost_records:
         yield f"{v.operator}: {plural(v.lost_records, 'firing')} could not be repeated (records before them are lost)"
+    if v.unknown:
+        yield (
+            f"{v.operator}: {plural(v.unknown, 'firing')} could not be repeated: the recording was cut there, and "
+            "holds no state of it at or before the cut (`record: {snapshots: 10s}` records states)"
+        )
     if v.unaccounted:
         yield f"{v.operator}: {plural(v.unaccounted, 'message')} that no firing record accounts for: records are lost"
     elif v.unfinished:

@@ -66,12 +66,12 @@ def tap(found: RunningGraph, expressions: Sequence[str], window: TapWindow | Non
     """A lossy copy of the streams that match `expressions` (relative to the namespace, absolute with a leading `/`)."""
     absolute = [e[1:] if e.startswith("/") else f"{found.namespace}/{e}" for e in expressions]
     with Bus(NetworkConfig(connect=found.endpoints)) as bus:
-        _until_connected(bus, found)
+        reached(bus, found)
         with TapClient(bus, found.namespace, absolute, window, types=types_of(graph_of(found))) as client:
             yield client
 
 
-def _until_connected(bus: Bus, found: RunningGraph) -> None:
+def reached(bus: Bus, found: RunningGraph) -> None:
     """Waits (bounded) until every process is reached, and answers for the static streams that it holds."""
     deadline = time.monotonic() + CONNECT_WITHIN
     while len(bus.peers()) < len(found.endpoints) and time.monotonic() < deadline:

@@ -35,10 +35,7 @@ class Window:
         self._outstanding: deque[tuple[int, int, int]] = deque()
         self._open = False
         self.count = self.size = 0
-
-    @property
-    def full(self) -> bool:
-        return bool(self._outstanding) and (self.count >= self.messages or self.size >= self.nbytes)
+        self.full = False
 
     def add(self, stamp: int, messages: int, nbytes: int) -> None:
         if self._open:
@@ -46,6 +43,7 @@ class Window:
         self._outstanding.append((stamp, messages, nbytes))
         self.count += messages
         self.size += nbytes
+        self.full = self.count >= self.messages or self.size >= self.nbytes
 
     def cover(self, frontier: int) -> None:
         """Everything with a stamp ≤ `frontier` is done by every operator; with `FOREVER` there is none to wait for."""
@@ -54,16 +52,22 @@ class Window:
             _, messages, nbytes = self._outstanding.popleft()
             self.count -= messages
             self.size -= nbytes
+        self._look()
+
+    def _look(self) -> None:
+        self.full = bool(self._outstanding) and (self.count >= self.messages or self.size >= self.nbytes)
 
     def clear(self) -> None:
         """Forgets what is outstanding: the stamps to come are earlier."""
         self._outstanding.clear()
         self.count = self.size = 0
+        self.full = False
 
     def grow(self) -> None:
         """Doubles the window: for graphs that must look further ahead than it allows."""
         self.messages *= 2
         self.nbytes *= 2
+        self._look()
 
 
 class Handover:

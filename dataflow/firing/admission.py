@@ -15,13 +15,16 @@ EventClock = Callable[[], int]
 """The event time that a device's message would be stamped with now, ns since the epoch."""
 
 
-class Arrival(NamedTuple):
-    """One thing that a stream said: a message, a frontier or its end."""
+class Promise(NamedTuple):
+    """A frontier of a stream, or its end."""
 
-    kind: str
     stamp: int
-    entry: Entry | None = None
+    ends: bool = False
     reason: str = ""
+
+
+Arrival = Entry | Promise
+"""One thing that a stream said."""
 
 
 class AdmissionQueue:
@@ -37,18 +40,22 @@ class AdmissionQueue:
         self._queues: dict[str, deque[Arrival]] = {stream: deque() for stream in triggers}
         self._messages: Counter[str] = Counter()
 
-    def put(self, stream: str, arrival: Arrival) -> None:
+    def put(self, stream: str, entry: Entry) -> None:
+        """Takes a message."""
+        if self.policy != "block" and self._messages[stream] >= self.size:
+            if self.policy == "oldest":
+                self._drop(stream, entry)
+                return
+            self._drop_oldest(stream)
+        self._messages[stream] += 1
+        self._queues[stream].append(entry)
+
+    def promise(self, stream: str, promise: Promise) -> None:
+        """Takes a frontier or an end, which holds all that a frontier right before it did."""
         queue = self._queues[stream]
-        if arrival.kind == "message":
-            if self.policy != "block" and self._messages[stream] >= self.size:
-                if self.policy == "oldest":
-                    self._drop(stream, arrival)
-                    return
-                self._drop_oldest(stream)
-            self._messages[stream] += 1
-        elif arrival.kind == "frontier" and queue and queue[-1].kind == "frontier":
-            queue.pop()  # the new promise holds all that the old one did
-        queue.append(arrival)
+        if not promise.ends and queue and isinstance(last := queue[-1], Promise) and not last.ends:
+            queue.pop()
+        queue.append(promise)
 
     @property
     def holds(self) -> bool:
@@ -62,24 +69,24 @@ class AdmissionQueue:
                 if not queue:
                     return None
                 arrival = queue.popleft()
-                if arrival.kind == "message":
+                if arrival.__class__ is Entry:
                     self._messages[stream] -= 1
                 return stream, arrival
-        waiting = [(q[0].kind == "end", q[0].stamp, s) for s, q in self._queues.items() if q]
+        waiting = [(_is_end(q[0]), q[0].stamp, s) for s, q in self._queues.items() if q]
         if not waiting:
             return None
         stream = min(waiting)[2]
         arrival = self._queues[stream].popleft()
-        self._messages[stream] -= arrival.kind == "message"
+        self._messages[stream] -= arrival.__class__ is Entry
         return stream, arrival
 
     def clear(self) -> None:
         """Drops every message that waits, since the clock behind an input jumped back."""
         for stream, queue in self._queues.items():
             for arrival in queue:
-                if arrival.kind == "message":
+                if isinstance(arrival, Entry):
                     self._drop(stream, arrival, "reset")
-            ends = [arrival for arrival in queue if arrival.kind == "end"]
+            ends = [arrival for arrival in queue if _is_end(arrival)]
             queue.clear()
             queue.extend(ends)
         self._messages.clear()
@@ -87,16 +94,18 @@ class AdmissionQueue:
     def _drop_oldest(self, stream: str) -> None:
         queue = self._queues[stream]
         for place, arrival in enumerate(queue):
-            if arrival.kind == "message":
+            if isinstance(arrival, Entry):
                 del queue[place]
                 self._messages[stream] -= 1
                 self._drop(stream, arrival)
                 return
 
-    def _drop(self, stream: str, arrival: Arrival, reason: DropReason = "overflow") -> None:
-        entry = arrival.entry
-        assert entry is not None
+    def _drop(self, stream: str, entry: Entry, reason: DropReason = "overflow") -> None:
         self.log.add(dropped(self.triggers[stream], stream, entry, reason))
+
+
+def _is_end(arrival: Arrival) -> bool:
+    return isinstance(arrival, Promise) and arrival.ends
 
 
 def dropped(input: str, stream: str, entry: Entry, reason: DropReason) -> Drop:

@@ -13,7 +13,8 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from dataflow.firing.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, dropped
+from dataflow.firing.absent import without_absent
+from dataflow.firing.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
 from dataflow.firing.failure import RAISED, OperatorFailure
 from dataflow.firing.log import FiringLog, unlisted
 from dataflow.firing.ports import Emitter
@@ -21,7 +22,7 @@ from dataflow.firing.restarts import Restarts
 from dataflow.firing.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
-from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, InputValue, StreamOrderError
+from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 
 OWN_CLOCK = 1_000_000_000
@@ -131,34 +132,36 @@ class LiveRunner(OperatorRunner):
             self._log.add(dropped(self._input_of(stream), stream, entry, "reset"))  # of the time before the jump
             return
         else:
-            self._note(stream, entry)
+            stamp, incarnation = entry.stamp, entry.incarnation
+            seen, last = self._seen.get(stream, (incarnation, NEVER))
+            if incarnation > seen and stamp <= last and not self.ended:
+                self._reset(stream, entry)
+            self._seen[stream] = (incarnation, stamp)
+            if self._newest == NEVER and abs(stamp - self._event_time()) > OWN_CLOCK:
+                self._shift = stamp - self._event_clock()  # a device whose clock is not this machine's
+            if stamp > self._newest:
+                self._newest = stamp
         if self.restarts.pending:
             self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away
-        self._arrive(stream, Arrival("message", entry.stamp, entry))
-
-    def _note(self, stream: str, entry: Entry) -> None:
-        stamp = entry.stamp
-        incarnation, last = self._seen.get(stream, (entry.incarnation, NEVER))
-        if entry.incarnation > incarnation and stamp <= last and not self.ended:
-            self._reset(stream, entry)
-        self._seen[stream] = (entry.incarnation, stamp)
-        if self._newest == NEVER and abs(stamp - self._event_time()) > OWN_CLOCK:
-            self._shift = stamp - self._event_clock()  # a device whose clock is not this machine's
-        if stamp > self._newest:
-            self._newest = stamp
+        if not self.awake:
+            self.wake()
+        if stream in self.queue.triggers:
+            self.queue.put(stream, entry)
+        else:
+            self._admit(stream, entry)
 
     def advance(self, stream: str, frontier: int) -> None:
-        self._arrive(stream, Arrival("frontier", frontier))
+        self._promised(stream, Promise(frontier))
 
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
-        self._arrive(stream, Arrival("end", NEVER if final_stamp is None else final_stamp, None, reason))
+        self._promised(stream, Promise(NEVER if final_stamp is None else final_stamp, True, reason))
 
-    def _arrive(self, stream: str, arrival: Arrival) -> None:
+    def _promised(self, stream: str, promise: Promise) -> None:
         self.wake()
         if stream in self.queue.triggers:
-            self.queue.put(stream, arrival)
+            self.queue.promise(stream, promise)
         else:
-            self._admit(stream, arrival)
+            self._admit(stream, promise)
 
     # Work
 
@@ -223,7 +226,7 @@ class LiveRunner(OperatorRunner):
 
     def _fire(self, firing: Firing) -> None:
         if self.absent:
-            firing = self._without_the_absent(firing)
+            firing = without_absent(firing, self.node, self.absent)
         try:
             if (error := self._fault(firing)) is not None:
                 self._fail_on_purpose(firing, error)
@@ -237,22 +240,6 @@ class LiveRunner(OperatorRunner):
         failure = OperatorFailure(self.node.name, f"{firing.kind} at stamp {firing.stamp}", error)
         self._record(firing.kind, firing, time.time_ns(), (), failure.summary, injected=True)
         raise failure
-
-    def _without_the_absent(self, firing: Firing) -> Firing:
-        """Marks inputs stale whose producer is gone; drops what they still hold where the policy says so."""
-        gone = frozenset(
-            name
-            for name, port in self.spec.inputs.items()
-            if port.kind == "sampled" and not self.absent.isdisjoint(self.node.inputs.get(name, ()))
-        )
-        if not gone:
-            return firing
-        inputs = dict(firing.inputs)
-        if self.node.live.on_stale == "drop":
-            inputs |= {
-                name: None for name in gone if not self.spec.inputs[name].required and not _is_many(inputs, name)
-            }
-        return Firing(firing.stamp, firing.kind, firing.tick, inputs, firing.stale | gone, firing.late)
 
     def _start_again(self) -> None:
         """A fresh operator in the place of the failed one, with the parameters as they were last set."""
@@ -332,18 +319,16 @@ class LiveRunner(OperatorRunner):
         """Tells the aligner. What breaks a promise of its stream is refused and counted; a live run goes on."""
         self._told = True
         try:
-            match arrival.kind:
-                case "message":
-                    assert arrival.entry is not None
-                    self.aligner.push(stream, arrival.entry)
-                case "frontier":
-                    self.aligner.advance(stream, arrival.stamp)
-                case "end":
-                    self._end_at(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
+            if isinstance(arrival, Entry):
+                self.aligner.push(stream, arrival)
+            elif arrival.ends:
+                self._end_at(stream, None if arrival.stamp == NEVER else arrival.stamp, arrival.reason)
+            else:
+                self.aligner.advance(stream, arrival.stamp)
         except StreamOrderError:
             self._refused[stream] += 1
-            if arrival.entry is not None:
-                self._log.add(dropped(self._input_of(stream), stream, arrival.entry, "refused"))
+            if isinstance(arrival, Entry):
+                self._log.add(dropped(self._input_of(stream), stream, arrival, "refused"))
 
     def _end_at(self, stream: str, final_stamp: int | None, reason: str) -> None:
         try:
@@ -367,10 +352,6 @@ class LiveRunner(OperatorRunner):
 def _producer(stream: str) -> str:
     """The operator that emits a stream, by the stream's name."""
     return stream.rpartition("/")[0]
-
-
-def _is_many(inputs: Mapping[str, InputValue], name: str) -> bool:
-    return isinstance(inputs.get(name), Mapping)
 
 
 def _close_quietly(operator: Operator) -> None:

@@ -17,8 +17,10 @@ from dataflow.firing.ports import Emitter
 from dataflow.firing.protocol import Runner
 from dataflow.firing.seeding import VERSION
 from dataflow.graph.model import Node
+from dataflow.messages.base import Message
 from dataflow.operator import ParameterError
 from dataflow.records.comparison import Verification
+from dataflow.records.cuts import is_known, taken_by, without_unknown
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import Digests, beginning, needed_from, whole
 from dataflow.sync import FOREVER, NEVER, Entry, Firing, MessageRef, RecordedAligner
@@ -48,8 +50,10 @@ class RecordedRunner(Runner):
         kept, lost = whole(records)
         self._setup_record = kept.pop(0) if kept and kept[0].kind == "setup" else None
         self._before, self._records, self.result.began = beginning(kept, begin, stateless=self.operator.stateless)
+        if not self.operator.stateless:
+            self._records, self.result.unknown = without_unknown(self._records)
         calls = [r for r in self._records if r.kind in CALLS]
-        self.result.firings = len(calls) + lost
+        self.result.firings = len(calls) + lost + self.result.unknown
         self.result.lost_records = lost
         self._align_spec = align_spec(node, self.spec, static)
         self.aligner = RecordedAligner(self._align_spec, (r.firing() for r in calls))
@@ -83,17 +87,21 @@ class RecordedRunner(Runner):
             elif record.kind == "setup":
                 self._changed |= changes
                 changes = {}
-        again = [record for record in self._before if record.kind == "setup"]
+            elif (taken := taken_by(record)) is not None:
+                self._changed |= taken.at_setup
+                changes = dict(taken.since)
+        again = [r for r in self._before if r.kind == "setup" or ((t := taken_by(r)) is not None and t.again)]
         if again:
-            self._start_again(again[-1])
+            statics = self._make_anew(again[-1].incarnation)
+            if again[-1].kind == "setup":
+                self.judge.statics(again[-1], statics)
         self._change(changes, again[-1].incarnation if again else 0)
-        if self._before and self._before[-1].kind == "snapshot":
-            last = self._before[-1]
+        if self._before and is_known(last := self._before[-1]):
             self.calls.restore(last.detail["state"], (last.incarnation, last.stamp))
 
     def _change(self, values: Mapping[str, Any], incarnation: int) -> None:
         """Sets parameters to values that they had when the recording was made."""
-        for name, value in values.items():
+        for name, value in dict(values).items():
             self._changed[name] = value
             try:
                 self.calls.parameter(name, value, (incarnation, NEVER))
@@ -146,13 +154,34 @@ class RecordedRunner(Runner):
                     self.judge.state(record, self.calls.snapshot(place))
                 case "restore":
                     self._restore(record)
+                case "cut":
+                    self._take_up_at(record)
 
     def _start_again(self, record: FiringRecord) -> None:
         """A new incarnation: a fresh operator, with the parameters as they were last set."""
+        self.judge.statics(record, self._make_anew(record.incarnation))
+
+    def _make_anew(self, incarnation: int) -> Mapping[str, Message]:
+        """A fresh operator, with the parameters as they were last set; its static messages."""
         self.operator.close()
         self.operator = self.calls.operator = self.node.make()
-        self._change(self._changed, record.incarnation)
-        self.judge.statics(record, self.calls.setup())
+        self._change(self._changed, incarnation)
+        return self.calls.setup()
+
+    def _take_up_at(self, record: FiringRecord) -> None:
+        """Goes on after records that were left out: a fresh operator with its parameters and its state there."""
+        taken = taken_by(record)
+        if taken is None:
+            return
+        self._changed |= taken.at_setup
+        if taken.again or self.result.verified:
+            self._make_anew(record.incarnation)
+        else:
+            self._change(taken.at_setup, record.incarnation)
+        self._change(taken.since, record.incarnation)
+        if taken.state is not None:
+            self.calls.restore(taken.state, (record.incarnation, record.stamp))
+            self.result.began = "snapshot"
 
     def _attempt(self, record: FiringRecord) -> None:
         """Changes a parameter, or resets; compares what that raises."""

@@ -21,7 +21,9 @@ class Restarts:
         self.used = used
         self.total = used
         self._last: float | None = None
-        self._due: float | None = None
+        self._due = 0.0
+        self.pending = False
+        """Tells whether an attempt is to be made, now or later."""
 
     def failed(self) -> bool:
         """Notes a failure; False when the policy allows no further attempt."""
@@ -34,19 +36,14 @@ class Restarts:
         pause = min(self.policy.backoff * 1e-9 * 2 ** min(self.used, MOST_DOUBLINGS), LONGEST_BACKOFF)
         self.used += 1
         self.total += 1
-        self._due = now + pause
+        self._due, self.pending = now + pause, True
         return True
-
-    @property
-    def pending(self) -> bool:
-        """Tells whether an attempt is to be made, now or later."""
-        return self._due is not None
 
     def due_in(self) -> float:
         """Seconds until the attempt that is pending."""
-        assert self._due is not None
+        assert self.pending
         return max(0.0, self._due - self.clock())
 
     def begun(self) -> None:
         """The attempt is made."""
-        self._due = None
+        self.pending = False

@@ -136,8 +136,10 @@ class SourceRunner:
         self.ports.promise(self.last)
 
     def emit(self, step: Mapping[str, Message]) -> tuple[int, int]:
+        return self._emit(step, step_stamp(step))
+
+    def _emit(self, step: Mapping[str, Message], stamp: int) -> tuple[int, int]:
         started = time.time_ns()
-        stamp = step_stamp(step)
         if stamp <= self.last:
             error = OutputError(f"{self.node.name} yielded stamp {stamp} after {self.last}: stamps strictly increase")
             raise OperatorFailure(self.node.name, "stream()", error)
@@ -168,7 +170,7 @@ class SourceRunner:
         if stamp > self.last:
             self._backwards.clear()
             self._resumed = False
-            return self.emit(step)
+            return self._emit(step, stamp)
         if self._resumed:
             self.refused["repeated"] += 1
             return None
@@ -180,7 +182,7 @@ class SourceRunner:
             return None
         self._backwards.clear()
         self._begin_after_jump(stamp)
-        return self.emit(step)
+        return self._emit(step, stamp)
 
     def _begin_after_jump(self, stamp: int) -> None:
         incarnation = self.records.incarnation + 1

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from dataflow.graph.sections import Network, Record, View
+from dataflow.graph.sections import Network, Record, View, record_from_json, record_to_json, view_from_json
 from dataflow.messages.base import Message, MessageError, import_type, message_type
 from dataflow.messages.declaration import Declaration
 
@@ -222,7 +222,7 @@ class Graph:
             "streams": [asdict(stream) for stream in self.streams.values()],
             "aliases": dict(self.aliases),
             "types": [declaration.to_json() for declaration in self.types.values()],
-            "record": asdict(self.record),
+            "record": record_to_json(self.record),
             "view": asdict(self.view),
             "network": asdict(self.network),
             "bundle": asdict(self.sources_bundle),
@@ -244,8 +244,8 @@ class Graph:
             streams={stream.name: stream for stream in streams},
             aliases=dict(data["aliases"]),
             types={declaration.schema: declaration for declaration in types},
-            record=Record(**{**data["record"], "streams": tuple(data["record"]["streams"])}),
-            view=_view_from_json(data["view"]),
+            record=record_from_json(data["record"]),
+            view=view_from_json(data["view"]),
             network=Network(
                 **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},
             ),
@@ -322,11 +322,6 @@ class Graph:
     def relative(self, stream: str) -> str:
         """`stream` without the namespace, for people."""
         return stream.removeprefix(f"{self.namespace}/")
-
-
-def _view_from_json(data: Mapping[str, Any]) -> View:
-    """Sections that older recordings lack are as they were: every panel, no saved layout."""
-    return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""))
 
 
 def _node_from_json(values: Mapping[str, Any]) -> Node:

@@ -6,6 +6,8 @@ from collections.abc import Iterable, Mapping
 
 from dataflow.graph.drafts import Draft, Expansion, GraphInput, Pattern, Wired
 from dataflow.graph.fields import Fields
+from dataflow.graph.flight import KEYS as FLIGHT_KEYS
+from dataflow.graph.flight import read_flight
 from dataflow.graph.keys import canonical, has_wildcard, key_fault
 from dataflow.graph.model import Bundle, Graph, Node
 from dataflow.graph.network import read_network
@@ -226,7 +228,7 @@ class Resolver:
         if isinstance(tree, Leaf):
             self.fields.wrong(tree, "record", "'all' or a mapping with 'topics' or 'exclude'")
             return Record(everything)
-        table = self.fields.table(tree, "record", ("topics", "exclude", "snapshots"))
+        table = self.fields.table(tree, "record", ("topics", "exclude", "snapshots", *FLIGHT_KEYS))
         if table is None:
             return Record(everything)
         kept = set(everything if table.get("topics") is None else self.topics(table.get("topics"), "record"))
@@ -236,7 +238,10 @@ class Resolver:
         snapshots = self.fields.duration(table.get("snapshots"), "snapshots")
         if snapshots == 0:
             self.problems.add(table.get("snapshots").place, "snapshots must be further apart than 0")  # type: ignore[union-attr]
-        return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots)
+        flight = read_flight(table, self.fields, [draft.name for draft in drafts], self.topics)
+        if flight is not None and snapshots is None:
+            snapshots = max(flight.keep // 6, 1_000_000_000)
+        return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots, flight=flight)
 
     def view(self, tree: Tree | None) -> View:
         table = self.fields.table(tree, "view", ("hide", "panels", "layout"))

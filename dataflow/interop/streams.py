@@ -4,27 +4,25 @@ from __future__ import annotations
 
 import heapq
 import json
-from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
-import numpy.typing as npt
-import xxhash
 
-from dataflow.interop.bag import Bag, BagError, Stored, Topic
-from dataflow.interop.clocks import Choice, Clock, Repair, Times, choose_clock, repair
+from dataflow.interop.bag import Bag, BagError, Stored
+from dataflow.interop.clocks import Choice, Clock, Repair, choose_clock, repair
 from dataflow.interop.conversions import convert, offers
+from dataflow.interop.found import Found
 from dataflow.interop.opening import open_bag
+from dataflow.interop.ranking import Ranking, within
 from dataflow.interop.topics import Reading
 from dataflow.messages import CameraInfo, Message, MessageError, Transforms, message_type
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
 
 MAX_HELD = 1 << 30
 """Bytes of messages that wait for earlier ones, which the log has later."""
-I64 = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,38 +32,6 @@ class Played:
     topic: str
     type: str
     static: bool = False
-
-
-@dataclass(slots=True)
-class _Found:
-    """The entries of one topic in the order of the log: a message, or a part of one."""
-
-    messages: array[int] = field(default_factory=lambda: array("q"))
-    parts: array[int] = field(default_factory=lambda: array("q"))
-    logs: array[int] = field(default_factory=lambda: array("q"))
-    headers: array[int] = field(default_factory=lambda: array("q"))
-    digests: array[int] = field(default_factory=lambda: array("Q"))
-    stamped: bool = True
-    bytes: int = 0
-
-    def add(self, stored: Stored, stamps: tuple[int, ...]) -> None:
-        self.stamped &= bool(stamps)
-        self.bytes += len(stored.data)
-        digest = xxhash.xxh3_64_intdigest(stored.data)
-        for part, stamp in enumerate(stamps or (0,)):
-            self.messages.append(stored.number)
-            self.parts.append(part)
-            self.logs.append(stored.log_time)
-            self.headers.append(stamp)
-            self.digests.append(digest)
-
-    def times(self, topic: Topic, shares: bool) -> Times:
-        header = _column(self.headers) if self.stamped else None
-        return Times(topic.name, _column(self.logs), header, topic.latched, shares)
-
-
-def _column(values: array[int]) -> I64:
-    return np.frombuffer(values, np.int64) if len(values) else np.empty(0, np.int64)
 
 
 class BagStreams:
@@ -156,7 +122,7 @@ class BagStreams:
         if self.played[stream].static:
             return iter([self._static[stream].stamp])
         stamps = np.unique(self.repairs[self.played[stream].topic].stamps)
-        return iter(stamps[_within(stamps, start, end)].tolist())
+        return iter(stamps[within(stamps, start, end)].tolist())
 
     def close(self) -> None:
         """Closes the bag. Idempotent."""
@@ -188,8 +154,8 @@ class BagStreams:
             )
         return reading
 
-    def _scan(self, watch: Callable[[int], None] | None) -> dict[str, _Found]:
-        found = {topic: _Found() for topic in self._moving}
+    def _scan(self, watch: Callable[[int], None] | None) -> dict[str, Found]:
+        found = {topic: Found() for topic in self._moving}
         for seen, stored in enumerate(self._bag.messages(self._moving), 1):
             reader = self._readings[stored.topic].reader
             assert reader is not None
@@ -257,7 +223,7 @@ class BagStreams:
 
     def _merged(self, streams: Sequence[str], start: int | None, end: int | None) -> Iterator[Recorded]:
         """Reads the log once; a message waits until all earlier ones have come."""
-        plan = _Plan(self, streams, start, end)
+        plan = Ranking({s: self.played[s].topic for s in streams}, self._found, self.repairs, start, end)
         waiting: list[tuple[int, int, int, Stored]] = []
         held = due = 0
         pending: _Pending | None = None
@@ -310,81 +276,12 @@ class _Pending:
         return Recorded(self.stream, self.message, self.seq, 0)
 
 
-class _Plan:
-    """The order of the messages to come: which rank each entry of the log has."""
-
-    def __init__(self, bag: BagStreams, streams: Sequence[str], start: int | None, end: int | None) -> None:
-        self._streams = sorted(streams)
-        self.topics = sorted({bag.played[s].topic for s in streams})
-        columns: list[list[I64]] = []
-        for number, stream in enumerate(self._streams):
-            topic = bag.played[stream].topic
-            found, mended = bag._found[topic], bag.repairs[topic]
-            _, seqs = np.unique(mended.stamps, return_inverse=True)
-            keep = _within(mended.stamps, start, end)
-            order = mended.order[keep]
-            size = len(order)
-            columns.append(
-                [
-                    mended.stamps[keep],
-                    np.full(size, number),
-                    seqs[keep].astype(np.int64),
-                    np.arange(size),
-                    _column(found.messages)[order],
-                    _column(found.parts)[order],
-                ]
-            )
-        stamps, numbers, seqs, places, messages, parts = (np.concatenate(c) for c in zip(*columns, strict=True))
-        ranked = np.lexsort((places, numbers, stamps))
-        self._stamps, self._numbers, self._seqs = stamps[ranked], numbers[ranked], seqs[ranked]
-        self._of_topic = {topic: self._by_message(bag, topic, messages[ranked], parts[ranked]) for topic in self.topics}
-
-    def _by_message(self, bag: BagStreams, topic: str, messages: I64, parts: I64) -> Iterator[tuple[int, int, int]]:
-        """(message, rank, part) of a topic's entries, in the order of the log."""
-        numbers = [i for i, stream in enumerate(self._streams) if bag.played[stream].topic == topic]
-        ranks = np.flatnonzero(np.isin(self._numbers, numbers))
-        order = ranks[np.lexsort((ranks, messages[ranks]))]
-        return _Ahead(zip(messages[order].tolist(), order.tolist(), parts[order].tolist(), strict=True))
-
-    def ranks(self, stored: Stored) -> Iterator[tuple[int, int]]:
-        """(rank, part) of the entries that a message of the log holds."""
-        rows = self._of_topic[stored.topic]
-        assert isinstance(rows, _Ahead)
-        while rows.next is not None and rows.next[0] == stored.number:
-            yield rows.next[1], rows.next[2]
-            next(rows)
-
-    def place(self, rank: int) -> tuple[str, int, int]:
-        """(stream, stamp, number in the stream) of an entry."""
-        return self._streams[int(self._numbers[rank])], int(self._stamps[rank]), int(self._seqs[rank])
-
-
-class _Ahead(Iterator[tuple[int, int, int]]):
-    """An iterator whose next item can be looked at."""
-
-    def __init__(self, rows: Iterator[tuple[int, int, int]]) -> None:
-        self._rows = rows
-        self.next = next(rows, None)
-
-    def __next__(self) -> tuple[int, int, int]:
-        if self.next is None:
-            raise StopIteration
-        item, self.next = self.next, next(self._rows, None)
-        return item
-
-
 def recorded_streams(path: Path, opening: Mapping[str, Any] | None) -> Recording | BagStreams:
     """Opens a recording, or the bag that `opening` (`PlayableStreams.opening`) says how to open."""
     if opening is None:
         return Recording(path)
     played = {stream: Played(*values) for stream, values in opening["played"].items()}
     return BagStreams(path, played, opening["clock"])
-
-
-def _within(stamps: I64, start: int | None, end: int | None) -> npt.NDArray[np.bool_]:
-    return (stamps >= (np.iinfo(np.int64).min if start is None else start)) & (
-        stamps <= (np.iinfo(np.int64).max if end is None else end)
-    )
 
 
 def joined(a: Transforms, b: Transforms) -> Transforms:

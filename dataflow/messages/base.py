@@ -70,7 +70,7 @@ def registered_type(schema: str) -> type[Message] | None:
 
 def message_type(schema: str) -> type[Message]:
     """The class of a schema name such as `"DepthImage"`; raises `MessageError` for an unknown one."""
-    found = registered_type(schema)
+    found = _registry.get(schema) or registered_type(schema)
     if found is None:
         raise MessageError(f"unknown message schema {schema!r}; known: {', '.join(sorted(_registry))}")
     return found

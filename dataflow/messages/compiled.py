@@ -89,7 +89,11 @@ def compile_class(
         "_small": ONE_UPDATE,
         "_stamp": canonical_stamp,
         "_str": str,
-        "_text": _text_bytes,
+        "_len": len,
+        "_long_text": _text_bytes,
+        "_no_words": _words_bytes(()),
+        "_short": CACHED_TEXT,
+        "_text": _short_text_bytes,
         "_tuple": tuple,
         "_updated": _updated,
         "_words": _words_bytes,
@@ -202,8 +206,8 @@ def _digest(
             "bool": f"(b'T' if {value} else b'F')",
             "int": f"_int_bytes(b'i', {value})",
             "float": f"_float_bytes(b'f', {value})",
-            "str": f"_text({value})",
-            "strs": f"_words({value})",
+            "str": f"(_text({value}) if _len({value}) <= _short else _long_text({value}))",
+            "strs": f"(_words({value}) if {value} else _no_words)",
         }[spec.kind]
         head.append(f"(b'n' if {value} is None else {canonical})" if spec.optional else canonical)
     text = ["def _digest(_self):", "    _state = _self.__dict__"]
@@ -327,20 +331,14 @@ def _shape_bytes(shape: tuple[int, ...]) -> bytes:
 
 
 def _text_bytes(text: str) -> bytes:
-    return _short_text_bytes(text) if len(text) <= CACHED_TEXT else _any_text_bytes(text)
-
-
-def _any_text_bytes(text: str) -> bytes:
     encoded = text.encode()
     return b"s" + struct.pack("<I", len(encoded)) + encoded
 
 
-_short_text_bytes = lru_cache(maxsize=1024)(_any_text_bytes)
+_short_text_bytes = lru_cache(maxsize=1024)(_text_bytes)
 
 
 def _words_bytes(words: tuple[str, ...]) -> bytes:
     """The bytes of a list of strings: their number, then each with its length."""
-    if not words:
-        return b"l\x00\x00\x00\x00"
     encoded = [word.encode() for word in words]
     return b"l" + struct.pack("<I", len(words)) + b"".join(struct.pack("<I", len(w)) + w for w in encoded)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataflow.feeds.log import LogFeed
+from dataflow.feeds.playback import Action, Playback
 from dataflow.feeds.window import Feed, Window
 from dataflow.process.pace import Pace
 
@@ -15,6 +16,7 @@ class Feeding:
 
     def __init__(self, window: Window, pace: Pace) -> None:
         self.feeds: list[Feed] = []
+        self.playback = Playback()
         self._window, self._pace = window, pace
         self._since_promise = 0
 
@@ -39,16 +41,26 @@ class Feeding:
     def admit(self) -> bool:
         """Emits the next step; False when there is none, or it has to wait."""
         due = self._oldest()
-        if due is None or self._window.full or self._pace.due_in(due[0]) > 0:
+        if due is None or self._window.full or self.playback.holds:
+            return False
+        if self._pace.due_in(due[0]) > 0 and not self.playback.stepping:
             return False
         stamp, feed = due
         self._window.add(stamp, *feed.admit())
+        self.playback.passed()
         self._since_promise += 1
         if self._since_promise >= PROMISE_EVERY:
             self.promise()
         if feed.look_ahead() is None:
             feed.finish("end of source")
         return True
+
+    def play(self, action: Action, steps: int = 1) -> None:
+        """Pauses, resumes or steps; the clock goes on from where it stopped. Raises `ValueError`."""
+        was_paused = self.playback.paused
+        self.playback.do(action, steps)
+        if was_paused and not self.playback.paused and (due := self._oldest()) is not None:
+            self._pace.put(due[0])
 
     def promise(self) -> None:
         """Sends the frontiers of streams which had no message of late."""
@@ -59,7 +71,7 @@ class Feeding:
 
     def next_due(self) -> float | None:
         """Seconds until the next paced step; None when nothing waits for the clock."""
-        if not self._pace.held or self._window.full:
+        if not self._pace.held or self._window.full or self.playback.paused:
             return None
         stamps = [s for feed in self.feeds if not feed.ended and (s := feed.look_ahead()) is not None]
         return self._pace.due_in(min(stamps)) if stamps else None

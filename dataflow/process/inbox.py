@@ -32,6 +32,7 @@ class Inbox:
         self.wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC) if wake is None else wake
         self._incoming = tuple(incoming)
         self._items: deque[Item] = deque()
+        self.qsize = self._items.__len__
         self._asleep = False
         self._turn = threading.Lock()
         self._turn.acquire()
@@ -101,9 +102,6 @@ class Inbox:
             "received_bytes": sum(ring.nbytes for ring in self._incoming),
             "unresolved": sum(ring.unresolved for ring in self._incoming),
         }
-
-    def qsize(self) -> int:
-        return len(self._items)
 
     def _forget_wakes(self) -> None:
         try:

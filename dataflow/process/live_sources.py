@@ -84,8 +84,11 @@ class Reader:
                 return True
             if not runner.source.live and not self._paced(step_stamp(step)):
                 continue
-            for given in self._faults.apply(step, time.monotonic()):
-                self._hand_over(given)
+            if self._faults.begun:
+                for given in self._faults.apply(step, time.monotonic()):
+                    self._hand_over(given)
+            else:
+                self._hand_over(step)
             runner.check_draws()
         runner.close_stream()
         return False

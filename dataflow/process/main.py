@@ -61,7 +61,12 @@ def _make(
 
 
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
-    """The sink that writes an MCAP recording; options: `path`, `metadata`, `compression`, `overwrite`."""
+    """The sink that writes an MCAP recording; options: `path` (or `flight`: a folder), `metadata`,
+    `compression`, `overwrite`."""
+    if "flight" in config.options:
+        from dataflow.process.flight import FlightSink
+
+        return FlightSink(Path(config.options["flight"]), graph, config.streams, config.options)
     from dataflow.process.recorder import RecorderSink
 
     return RecorderSink(Path(config.options["path"]), graph, config.streams, config.options)

@@ -102,7 +102,14 @@ class OperatorProcess:
         )
         self.progress = Progress(channel, self.runners, self.feeding, self.live, paced=config.live)
         self.requests = Requests(
-            config, self.runners, self.live, self.progress, self.outlet.recent, self.pace.event_time
+            config,
+            self.runners,
+            self.live,
+            self.progress,
+            self.outlet.recent,
+            self.pace.event_time,
+            self.feeding,
+            channel,
         )
         self.orders = Orders(self)
         self._watch: Watchdog | None = None
@@ -279,11 +286,13 @@ class OperatorProcess:
             self.live.failed(item[1], item[2])
         elif kind == "param":
             self.requests.answer_parameter(item[1], item[2])
+        elif kind == "playback":
+            self.requests.answer_playback(item[2])
 
     def _deliver(self, stream: str, envelope: Envelope) -> None:
         """Gives an envelope to the operators that take its stream. What contradicts what they have seen is refused, in
         a live run."""
-        for runner in self.runners.taking(stream):
+        for runner in self.runners.consumers.get(stream, ()):
             try:
                 give(runner, stream, envelope)
             except StreamOrderError as error:
@@ -350,7 +359,13 @@ class OperatorProcess:
             full=self.feeding.full,
             waiting=self.progress.waiting(),
             due=self.feeding.next_due(),
+            **({"paused": self.feeding.playback.paused} if self.feeding.logs else {}),
         )
 
     def _waits_for_clock(self) -> bool:
-        return self._next_due() is not None or any(runner.next_due() is not None for runner in self.runners.operators)
+        held = self.feeding.playback.holds and not self.feeding.ended
+        return (
+            held
+            or self._next_due() is not None
+            or any(runner.next_due() is not None for runner in self.runners.operators)
+        )

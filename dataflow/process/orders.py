@@ -61,6 +61,8 @@ class Orders:
                 process.window.grow()
             case "poll":
                 self.asked = fields["round"]
+            case "playback":
+                process.feeding.play(fields["action"], fields["steps"])
             case "stop":
                 self.stopping = True
                 process.feeding.finish("interrupted")

@@ -89,12 +89,13 @@ class Outlet:
         """The messages of static streams: a consumer that was started again gets it again."""
         self._held: list[tuple[str, Envelope | bytes, bool]] | None = []
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
+        self._publishers: Mapping[str, StreamPublisher] = {}
         self._logs: dict[str, list[FiringRecord]] = {}
         self._flushed = time.monotonic()
 
     def open(self, network: Network) -> None:
         """Begins to publish static streams to late joiners, and copies to taps; the rest waits for `release`."""
-        self._network = network
+        self._network, self._publishers = network, network.publishers
 
     def release(self) -> None:
         """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
@@ -147,7 +148,7 @@ class Outlet:
 
     def _listened(self, stream: str) -> StreamPublisher | None:
         """Returns the publisher of a stream to which somebody outside the run subscribes."""
-        publisher = None if self._network is None else self._network.publishers.get(stream)
+        publisher = self._publishers.get(stream)
         return publisher if publisher is not None and publisher.matched else None
 
     def _send(self, stream: str, envelope: Envelope, *, droppable: bool = True) -> None:
@@ -177,21 +178,26 @@ class Outlet:
         self.sent += self._fanout.send(key, [batch], droppable=False)
 
     def message(self, stream: str, entry: Entry) -> None:
+        """Most messages go to other processes of the run and nowhere else: that way is the short one."""
         for consumer in self._consumers(stream):
             consumer.push(stream, entry)
         self._next[stream] = entry.incarnation, entry.seq + 1
-        network = self._network
+        network, publisher = self._network, self._publishers.get(stream)
         tapped = network is not None and network.taps.active
-        static = stream in self._static
-        if not (static or tapped or self._is_taken(stream)):
+        plain = not tapped and self._held is None and (publisher is None or not publisher.matched)
+        if plain and stream not in self._fanout.takers and stream not in self._static:
             return
         message: Message = entry.value
         envelope = Envelope(_MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, "", time.time_ns())
-        if static:
+        if plain and stream not in self._static:
+            self.sent += self._fanout.send(stream, encode_parts(envelope), envelope)
+            return
+        if stream in self._static:
             self._once[stream] = [envelope]
             if network is not None:
                 network.bus.declare_static(stream, encode(envelope))
-        self._send(stream, envelope, droppable=not static)
+        if stream in self._static or self._is_taken(stream):
+            self._send(stream, envelope, droppable=stream not in self._static)
         if network is not None and tapped:
             network.taps.offer(stream, envelope)
 

@@ -29,6 +29,11 @@ class Pace:
         first, at = self._began
         return at + (stamp - first) * 1e-9 / (self._rate or 1.0) - time.time()
 
+    def put(self, stamp: int) -> None:
+        """Event time `stamp` is now: what was paused goes on from there."""
+        if self._began is not None:
+            self._began = (stamp, time.time())
+
     def event_time(self) -> int:
         """Event time now: the clock's own, or, where sources are held to the clock, as far as they have been let."""
         if self._began is None:

@@ -11,13 +11,16 @@ import msgpack
 from dataflow.firing.source import SourceRunner
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
+from dataflow.process.channel import Channel
 from dataflow.process.config import ProcessConfig
+from dataflow.process.feeding import Feeding
 from dataflow.process.inbox import Inbox
 from dataflow.process.live_sources import LiveSources
 from dataflow.process.progress import Progress
 from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
 from dataflow.remote import Remote
+from dataflow.sync import NEVER
 from dataflow.transport import Bus
 from dataflow.transport.codec import decode
 from dataflow.transport.envelope import DecodeError
@@ -35,9 +38,12 @@ class Requests:
         progress: Progress,
         recent: RecentFirings,
         event_clock: Callable[[], int],
+        feeding: Feeding,
+        channel: Channel,
     ) -> None:
         self._config, self._runners, self._live = config, runners, live
         self._progress, self._recent, self._event_clock = progress, recent, event_clock
+        self._feeding, self._channel = feeding, channel
         self._given: dict[str, int] = {}
         """The last stamp that each source was given from outside."""
 
@@ -48,6 +54,9 @@ class Requests:
             if isinstance(maker := self._runners[name], SourceRunner) and isinstance(maker.source, Remote):
                 bus.serve(runtime_key(namespace, "pub", name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
+        bus.serve(runtime_key(namespace, "trigger", self._config.label), self._answer_trigger)
+        if self._config.replay is not None:
+            bus.serve(runtime_key(namespace, "playback"), _to_inbox(inbox, "", "playback"))
 
     def answer_parameter(self, name: str, query: Any) -> None:
         """Answers a request to change a parameter with the value as validated, or with an error.
@@ -62,6 +71,20 @@ class Requests:
             except (ParameterError, KeyError, TypeError, ValueError, AttributeError) as error:
                 answer = {"ok": False, "operator": name, "error": str(error)}
             query.reply(query.key_expr, msgpack.packb(answer))
+
+    def answer_playback(self, query: Any) -> None:
+        """Answers a request to pause, resume or step what is replayed; one without an action asks how it stands."""
+        with query:
+            feeding = self._feeding
+            try:
+                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
+                if "action" in asked:
+                    feeding.play(asked["action"], int(asked.get("steps", 1)))
+                answer: dict[str, Any] = {"ok": True, "paused": feeding.playback.paused, "ended": feeding.ended}
+            except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
+                answer = {"ok": False, "error": str(error)}
+            stamps = [log.last for log in feeding.logs if log.last != NEVER]
+            query.reply(query.key_expr, msgpack.packb(answer | {"stamp": max(stamps, default=None)}))
 
     def answer_publication(self, maker: SourceRunner, query: Any) -> None:
         """Takes an envelope from outside for a source that is made for it; on Zenoh's thread.
@@ -125,6 +148,17 @@ class Requests:
                 status["firings"] = self._recent.batches()
             query.reply(query.key_expr, msgpack.packb(status))
 
+    def _answer_trigger(self, query: Any) -> None:
+        """Hands on that somebody wants to keep what was; on Zenoh's thread, so an operator at work holds up nothing."""
+        with query:
+            try:
+                asked = msgpack.unpackb(query.payload.to_bytes(), raw=False)
+                self._channel.send("trigger", id=str(asked["id"]), text=str(asked["text"]))
+                answer: dict[str, Any] = {"ok": True}
+            except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
+                answer = {"ok": False, "error": str(error)}
+            query.reply(query.key_expr, msgpack.packb(answer))
+
     def _restarts_of(self, maker: Maker) -> int:
         """Tells how often an operator was restarted, by this process and in the processes before it."""
         here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
@@ -141,10 +175,10 @@ def _asks_for_firings(query: Any) -> bool:
         return False
 
 
-def _to_inbox(inbox: Inbox, name: str) -> Callable[[Any], None]:
+def _to_inbox(inbox: Inbox, name: str, kind: str = "param") -> Callable[[Any], None]:
     put = inbox.put
 
     def asked(query: Any) -> None:
-        put(("param", name, query))
+        put((kind, name, query))
 
     return asked

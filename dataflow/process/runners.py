@@ -60,16 +60,14 @@ class Runners:
 
 def give(runner: Runner, stream: str, envelope: Envelope) -> None:
     """Gives a runner what another process says on a stream. Raises `StreamOrderError` for what contradicts it."""
-    match envelope.kind:
-        case Kind.MESSAGE:
-            message = envelope.message
-            assert message is not None
-            digest = message.digest() if runner.paranoid else b""  # as it is before anybody can have written to it
-            runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, digest, stream))
-        case Kind.FRONTIER:
-            runner.advance(stream, envelope.stamp)
-        case Kind.END:
-            runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
+    message = envelope.message
+    if message is not None:
+        digest = message.digest() if runner.paranoid else b""  # as it is before anybody can have written to it
+        runner.push(stream, Entry(envelope.stamp, message, envelope.seq, envelope.incarnation, digest, stream))
+    elif envelope.kind is Kind.FRONTIER:
+        runner.advance(stream, envelope.stamp)
+    elif envelope.kind is Kind.END:
+        runner.end(stream, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
 
 
 def make_source(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitter) -> SourceRunner:

@@ -82,6 +82,7 @@ class ContainerWriter:
         path: Path,
         *,
         library: str,
+        profile: str = "",
         compression: Compression = "zstd",
         chunk_bytes: int = CHUNK_BYTES,
         chunk_seconds: float = CHUNK_SECONDS,
@@ -103,7 +104,7 @@ class ContainerWriter:
         self._position = 0
         self._fd = self._open(overwrite)
         try:
-            self._append(MAGIC, sealed(record_bytes(Header(profile="", library=library))))
+            self._append(MAGIC, sealed(record_bytes(Header(profile=profile, library=library))))
         except RecordingError:
             os.close(self._fd)
             raise
@@ -186,6 +187,15 @@ class ContainerWriter:
         now = self._begin(0 if self._records is None else self._records.size + size)
         chunk = self._records = self._records or Gathered(now)
         chunk.add(channel, log_time, sequence, [data])
+        if chunk.size >= self._chunk_bytes:
+            self.finish_chunks()
+
+    def add_copied(self, channel: int, log_time: int, publish_time: int, sequence: int, data: Buffer) -> None:
+        """Adds a message of another file as it is there."""
+        size = message_size([data])
+        now = self._begin(0 if self._messages is None else self._messages.size + size)
+        chunk = self._messages = self._messages or Gathered(now)
+        chunk.add(channel, log_time, sequence, [data], publish_time)
         if chunk.size >= self._chunk_bytes:
             self.finish_chunks()
 

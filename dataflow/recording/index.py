@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from mcap.opcode import Opcode
 from mcap.records import Header
 
@@ -33,6 +34,7 @@ class RawMessage(NamedTuple):
     sequence: int
     log_time: int
     data: memoryview
+    publish_time: int
 
 
 class McapFile:
@@ -42,7 +44,9 @@ class McapFile:
     and was got round, or left out. Raises `RecordingError` for a file that is no MCAP or is damaged otherwise.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, lenient: bool = False) -> None:
+        """`lenient`: what cannot be read of a file without a sound index is left out, with a note."""
+        self._lenient = lenient
         self.header = Header("", "")
         self.torn = False
         self.lost_bytes = 0
@@ -77,7 +81,7 @@ class McapFile:
             data, start = memoryview(self._chunks.data(chunk)), offset
         if start < 0 or start + _MESSAGE.size > len(data):
             raise self._misplaced(chunk, offset, "outside it")
-        opcode, length, found, sequence, time, _ = _MESSAGE.unpack_from(data, start)
+        opcode, length, found, sequence, time, published = _MESSAGE.unpack_from(data, start)
         end = start + RECORD.size + length
         if opcode != Opcode.MESSAGE or length < _MESSAGE_FIXED or end > len(data):
             raise self._misplaced(chunk, offset, "where no message is")
@@ -85,7 +89,7 @@ class McapFile:
             raise self._misplaced(
                 chunk, offset, f"a message of channel {found} at {time}, not of channel {channel} at {log_time}"
             )
-        return RawMessage(channel, sequence, log_time, data[start + _MESSAGE.size : end])
+        return RawMessage(channel, sequence, log_time, data[start + _MESSAGE.size : end], published)
 
     def message_bytes(self) -> dict[int, int]:
         """Bytes of message data by channel, before compression. Exact where chunks hold nothing but messages."""
@@ -110,6 +114,37 @@ class McapFile:
                 totals[channel] = totals.get(channel, 0) + int(sizes[channel])
         return totals
 
+    def broken_chunks(self) -> dict[int, tuple[str, str]]:
+        """The chunks that cannot be read, by number: where each lies, and why. Reads all of the file."""
+        broken: dict[int, tuple[str, str]] = {}
+        for number in range(len(self._chunks.refs)):
+            try:
+                self._chunks.data(number)
+            except DamagedError as error:
+                broken[number] = self._chunks.where(number), error.what
+        return broken
+
+    def weights(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Log times of all messages, and how many bytes of the file each takes, as its chunk is compressed."""
+        found = [e for e in self.entries.values() if len(e)]
+        if not found:
+            return np.empty(0, np.int64), np.empty(0)
+        times, chunks, offsets = (
+            np.concatenate(columns) for columns in zip(*((e.times, e.chunks, e.offsets) for e in found), strict=True)
+        )
+        order = np.lexsort((offsets, chunks))
+        times, chunks, offsets = times[order], chunks[order], offsets[order]
+        refs = self._chunks.refs
+        last = np.append(chunks[1:] != chunks[:-1], True)
+        sizes = np.append(offsets[1:], 0) - offsets
+        limits = np.array([ref.uncompressed_size for ref in refs] or [0], np.int64)
+        chunked = chunks != UNCHUNKED
+        sizes[last & chunked] = limits[chunks[last & chunked]] - offsets[last & chunked]
+        sizes[last & ~chunked] = 0
+        ratios = np.array([ref.length / max(ref.uncompressed_size, 1) for ref in refs] or [1.0])
+        weights = sizes * np.where(chunked, ratios[np.where(chunked, chunks, 0)], 1.0)
+        return times, weights
+
     def _load(self) -> Contents:
         if self._file.read_up_to(0, len(MAGIC)) != MAGIC:
             raise RecordingError(f"{self._file.path} is not an MCAP file: it does not begin with the MCAP magic bytes")
@@ -121,7 +156,9 @@ class McapFile:
             contents = self._from_scan()
         self.damage += contents.damage
         undeclared = contents.undeclared()
-        if undeclared:
+        if undeclared and self._lenient:
+            self.damage.append(f"messages of channels that it does not declare are left out: {undeclared[:20]}")
+        elif undeclared:
             raise self._file.damaged(f"it holds messages of channels that it does not declare: {undeclared[:20]}")
         return contents
 
@@ -154,7 +191,7 @@ class McapFile:
     def _from_scan(self) -> Contents:
         """Returns what a pass finds. Message indexes are not believed once anything was damaged: every chunk is
         read."""
-        found = scan(self._file, sealed=self._sealed, trusting=not self.damage)
+        found = scan(self._file, sealed=self._sealed, trusting=not self.damage, lenient=self._lenient)
         if self.torn:
             self.lost_bytes = self._file.size - found.end
         elif not found.whole:

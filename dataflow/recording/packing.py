@@ -50,11 +50,14 @@ class Gathered:
     first: int = 0
     last: int = 0
 
-    def add(self, channel: int, log_time: int, sequence: int, parts: Sequence[Buffer]) -> None:
+    def add(
+        self, channel: int, log_time: int, sequence: int, parts: Sequence[Buffer], publish_time: int | None = None
+    ) -> None:
         size = message_size(parts)
+        published = log_time if publish_time is None else publish_time
         self.first = log_time if not self.parts else min(self.first, log_time)
         self.last = max(self.last, log_time)
-        self.parts.append(_MESSAGE.pack(Opcode.MESSAGE, size - 9, channel, sequence, log_time, log_time))
+        self.parts.append(_MESSAGE.pack(Opcode.MESSAGE, size - 9, channel, sequence, log_time, published))
         self.parts.extend(parts)
         self.entries.setdefault(channel, array("Q")).extend((log_time, self.size))
         self.size += size

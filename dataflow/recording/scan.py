@@ -9,6 +9,7 @@ from mcap.opcode import Opcode
 from dataflow.recording.chunks import CHUNK_HEAD, ChunkRef, size_in_head
 from dataflow.recording.container import MAGIC
 from dataflow.recording.contents import MESSAGE_BODY, Contents
+from dataflow.recording.errors import DamagedError
 from dataflow.recording.rawfile import RECORD, RawFile
 from dataflow.recording.seals import Seal, seal_of
 
@@ -25,15 +26,16 @@ class Scan:
     """One pass over the records of a file, up to the last whole one.
 
     `end`: where it stopped; `whole`: whether that was at the end of the data. `trusting`: message indexes are believed
-    where they are well formed; otherwise every chunk is read. Raises `DamagedError`.
+    where they are well formed; otherwise every chunk is read. `lenient`: chunks that cannot be read are left out, with
+    a note. Raises `DamagedError`.
     """
 
-    def __init__(self, file: RawFile, *, sealed: bool, trusting: bool) -> None:
+    def __init__(self, file: RawFile, *, sealed: bool, trusting: bool, lenient: bool = False) -> None:
         self.contents = Contents(file)
         self.end = len(MAGIC)
         self.whole = False
         self._file = file
-        self._sealed, self._trusting = sealed, trusting
+        self._sealed, self._trusting, self._lenient = sealed, trusting, lenient
         self._pending: _Pending | None = None
 
     def run(self) -> None:
@@ -99,16 +101,21 @@ class Scan:
             if contents.add_indexes(pending.number, pending.indexes):
                 return
             contents.damage.append(f"a message index of {contents.chunks.where(pending.number)} is damaged")
-        contents.take_chunk(pending.number)
+        try:
+            contents.take_chunk(pending.number)
+        except DamagedError as error:
+            if not self._lenient:
+                raise
+            contents.damage.append(f"{error.what}; it is left out")
 
 
-def scan(file: RawFile, *, sealed: bool, trusting: bool) -> Scan:
+def scan(file: RawFile, *, sealed: bool, trusting: bool, lenient: bool = False) -> Scan:
     """The pass that tells what `file` holds: where a trusting one comes upon damage, one that reads every chunk."""
-    first = Scan(file, sealed=sealed, trusting=trusting)
+    first = Scan(file, sealed=sealed, trusting=trusting, lenient=lenient)
     first.run()
     if not trusting or not first.contents.damage:
         return first
-    second = Scan(file, sealed=sealed, trusting=False)
+    second = Scan(file, sealed=sealed, trusting=False, lenient=lenient)
     second.run()
     second.contents.damage[:] = list(dict.fromkeys([*first.contents.damage, *second.contents.damage]))
     return second

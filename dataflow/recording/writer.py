@@ -107,6 +107,11 @@ class RecordingWriter:
         return self._file.path
 
     @property
+    def closed(self) -> bool:
+        """Tells whether it was closed."""
+        return self._file.closed
+
+    @property
     def saved_bytes(self) -> int:
         """Bytes that are in the file now; the unfinished chunk is not."""
         return self._file.saved_bytes

@@ -28,7 +28,8 @@ class Verification:
 
     `verified` firings were repeated and compared; `unverifiable` ones could not be, because a message they were given
     is unavailable; `lost_records` are missing between others, so the firings that follow them in their incarnation
-    cannot be repeated either. `beyond` of the unverifiable ones wait for a message after the last one of its stream.
+    cannot be repeated either. `unknown` firings follow the beginning of a part of a recording in which the operator's
+    state there is not known. `beyond` of the unverifiable ones wait for a message after the last one of its stream.
     `unaccounted` messages were made by no record, `unfinished` says that the records end before the run did: records
     are lost. `cut` says that the recording itself ends before the run did, and before this operator; `after_cut` are
     then the messages without a record. `not_stored` messages were made again, but are not in the recording.
@@ -46,6 +47,7 @@ class Verification:
     unverifiable: int = 0
     beyond: int = 0
     lost_records: int = 0
+    unknown: int = 0
     unaccounted: int = 0
     unfinished: bool = False
     cut: bool = False
@@ -67,7 +69,7 @@ class Verification:
     @property
     def whole(self) -> bool:
         """True when everything that was recorded before the cut, if there is one, was repeated, and there was any."""
-        if self.lost_records or self.unaccounted or self.unfinished:
+        if self.lost_records or self.unknown or self.unaccounted or self.unfinished:
             return False
         if self.cut:
             return self.unverifiable == self.beyond and (self.verified > 0 or not (self.beyond or self.after_cut))

@@ -16,9 +16,9 @@ import msgpack
 from dataflow.sync import Drop, FiringInputs, InputRef, MessageRef, RunRef
 
 FORMAT = 1
-Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot"]
+Kind = Literal["setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot", "cut"]
 Outcome = Literal["ok", "error"]
-KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot")
+KINDS: tuple[Kind, ...] = ("setup", "fire", "tick", "finish", "param", "reset", "restore", "snapshot", "cut")
 OUTCOMES: tuple[Outcome, ...] = ("ok", "error")
 CALLS: tuple[Kind, ...] = ("fire", "tick", "finish")
 """The kinds that stand for a call with messages."""
@@ -52,7 +52,8 @@ class FiringRecord:
     `index` counts the calls of one incarnation without gaps. `inputs` holds, by input name, the messages that were
     given, by reference; `outputs` what came out, in the order of the operator's declared outputs. `drops` are those
     decided since the previous record. `detail` holds what is particular to the kind: parameters and file hashes for
-    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, what the operator sums up
+    `setup`, the name and value for `param`, the input for `reset`, the state for `snapshot`, what stands in for the
+    records that were left out for `cut` (`dataflow.records.cuts`), what the operator sums up
     for `finish`, the error's text for the outcome `error` (with `injected` where no call was made at all), and for
     `fire` and `finish` of a source how many steps it has not sent since the record before, by reason.
     `wall_start` (ns since the epoch) and `duration` (ns) are facts of that run and never compared.
@@ -146,6 +147,9 @@ def encode_single(record: FiringRecord) -> bytes:
     key = record.operator, record.incarnation, tuple(record.inputs), tuple(streams)
     about = _about.get(key) or _describe(*key)
     stamp = record.stamp
+    outputs: list[tuple[int, int, bytes] | None] = []
+    for made in record.outputs:
+        outputs.append(None if made is None else (made.seq, made.stamp - stamp, made.digest))
     row = (
         _KIND_NUMBER[record.kind],
         stamp,
@@ -153,7 +157,7 @@ def encode_single(record: FiringRecord) -> bytes:
         refs,
         (),
         (),
-        [None if e is None else (e.seq, e.stamp - stamp, e.digest) for e in record.outputs],
+        outputs,
         0 if record.outcome == "ok" else 1,
         (),
         _NO_DETAIL,

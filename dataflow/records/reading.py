@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Protocol
 
 from dataflow.recording import Recording, RecordingError
+from dataflow.records.cuts import held_by, is_known
 from dataflow.records.firing import CALLS, FiringRecord, FiringRecordError, decode_batch
 from dataflow.sync import InputRef, MessageRef
 
@@ -69,6 +70,9 @@ class FiringLog:
                 for stream, emission in zip(outputs, record.outputs, strict=False):  # a failed call has none
                     if emission is not None and stream in found:
                         found[stream][record.incarnation, emission.seq] = emission.digest
+                for held in held_by(record):
+                    if held.stream in found:
+                        found[held.stream][held.place] = held.digest
         return found
 
 
@@ -131,7 +135,9 @@ def whole(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
         if place < following:
             continue  # handed over twice, when its process died
         begins = record.incarnation > following[0] or not following[1]
-        if begins:
+        if record.kind == "cut":
+            known = True
+        elif begins:
             known = record.index == 0 and (record.kind != "reset" or known)
         else:
             known = known and place == following
@@ -148,12 +154,12 @@ def beginning(
 ) -> tuple[list[FiringRecord], list[FiringRecord], str]:
     """Returns what lies before the place from which records are repeated, the rest, and how that place was found.
 
-    It is after the last snapshot at or before the stamp `begin`, or at `begin` itself for an operator without state;
-    for any other at the start, since its state in the middle is not known.
+    It is after the last recorded state at or before the stamp `begin`, or at `begin` itself for an operator without
+    state; for any other at the start, since its state in the middle is not known.
     """
     if begin is None:
         return [], records, "start"
-    place = max((k + 1 for k, r in enumerate(records) if r.kind == "snapshot" and r.stamp <= begin), default=0)
+    place = max((k + 1 for k, r in enumerate(records) if is_known(r) and r.stamp <= begin), default=0)
     if stateless:
         place = next((k for k, r in enumerate(records) if r.kind in CALLS and r.stamp >= begin), len(records))
     found = "stateless" if stateless else "snapshot" if place else "start"

@@ -18,7 +18,7 @@ from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog, beginning, needed_from, whole
-from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps, seeding_of
+from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
 
 Take = Callable[[str, Entry], None]
@@ -71,7 +71,7 @@ def plan_feeding(
     """Feeds operators from the recording wherever it holds what they take; else what makes it runs too.
 
     `incomplete` streams are recorded, but lack messages that the recorded firings were given: they are made again.
-    Raises `ReplayError` when a stream of a source or an external operator is needed and was not recorded.
+    Raises `NotRecorded` when a stream of a source or an external operator is needed and was not recorded.
     """
     chosen, streams = set(operators), set[str]()
     left = list(operators)
@@ -83,9 +83,10 @@ def plan_feeding(
                 check_type(recording, graph, stream)
                 streams.add(stream)
             elif maker.source or maker.external:
-                raise ReplayError(
+                raise NotRecorded(
                     f"{recording.path}: stream {stream!r} was not recorded, but {node.name!r} takes it and "
-                    f"{maker.name!r} cannot make it again"
+                    f"{maker.name!r} cannot make it again",
+                    stream,
                 )
             elif maker.name not in chosen:
                 chosen.add(maker.name)

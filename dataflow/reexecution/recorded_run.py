@@ -22,6 +22,14 @@ class ReplayError(ValueError):
     """A recording that cannot drive a graph: says which stream is missing and what would help."""
 
 
+class NotRecorded(ReplayError):
+    """A stream that operators need, that the recording does not hold, and that cannot be made again."""
+
+    def __init__(self, message: str, stream: str) -> None:
+        super().__init__(message)
+        self.stream = stream
+
+
 def recorded_graph(recording: PlayableStreams) -> Graph:
     """Returns the graph that made a recording, without its network: a recording opens no port and calls nobody.
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from dataflow.graph.model import Graph, Node
 from dataflow.operator import Operator
 from dataflow.recording import Recording
+from dataflow.records.cuts import is_known, taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog, recorded_firings
 from dataflow.reexecution.engine import Recomputation, plan_feeding
@@ -24,8 +25,9 @@ class WarmStart:
     began: str
 
 
-def fresh_because(recording: Recording, graph: Graph, node: Node) -> str | None:
-    """Tells why an operator must begin with fresh state, in words; None where its recorded state can be had again."""
+def fresh_because(recording: Recording, graph: Graph, node: Node, stamp: int) -> str | None:
+    """Tells why an operator must begin with fresh state at `stamp`, in words; None where its recorded state can be had
+    again."""
     if node.operator.stateless:
         return None
     try:
@@ -34,8 +36,11 @@ def fresh_because(recording: Recording, graph: Graph, node: Node) -> str | None:
         return "the recording does not hold the graph that made it"
     if recorded is None or (recorded.use, recorded.params, recorded.inputs) != (node.use, node.params, node.inputs):
         return "it is not the operator that was recorded"
-    if next(recorded_firings(recording, node.name), None) is None:
+    records = list(recorded_firings(recording, node.name))
+    if not records:
         return "it left no firing records"
+    if _is_unknown(records, stamp):
+        return "the recording was cut, and holds no state of it before that"
     try:
         plan_feeding(recording, graph, [node.name])
     except ReplayError as error:
@@ -50,18 +55,31 @@ def warm_start(path: Path, graph: Graph, node: Node, stamp: int) -> WarmStart | 
     fresh state. Raises `OperatorFailure`.
     """
     with Recording(path) as recording:
-        if node.operator.stateless or fresh_because(recording, graph, node) is not None:
+        if node.operator.stateless or fresh_because(recording, graph, node, stamp) is not None:
             return None
         feeding = plan_feeding(recording, graph, [node.name])
-        begin = stamp if feeding.operators == (node.name,) else None
+        begin = stamp - 1 if feeding.operators == (node.name,) else None  # a state at `stamp` has seen its messages
         log = FiringLog.read(recording)
         work = Recomputation(recording, graph, feeding, log, made=lambda stream, entry: None, begin=begin, end=stamp)
         result = work.run(close=False)[node.name]
         work.close(besides=node.name)
-        if result.unverifiable or result.lost_records:
+        if result.unverifiable or result.lost_records or result.unknown:
             work.runners[node.name].operator.close()
             return None
         return WarmStart(work.runners[node.name].operator, result.began)
+
+
+def _is_unknown(records: Iterable[FiringRecord], stamp: int) -> bool:
+    """Tells whether records were left out, and no state was recorded between there and `stamp`."""
+    unknown = False
+    for record in records:
+        if record.stamp > stamp and record.kind in CALLS:
+            break
+        if taken_by(record) is not None or record.kind == "snapshot":
+            unknown = not is_known(record)
+        elif record.kind == "setup":
+            unknown = False
+    return unknown
 
 
 def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> tuple[list[Entry], bool]:
@@ -80,7 +98,8 @@ def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> t
         ]
         if not known:
             return [], False
-        calls = [r for r in recorded_firings(recording, node.name) if r.kind in CALLS]
+        records = list(recorded_firings(recording, node.name))
+        calls = [r for r in records if r.kind in CALLS]
         taken = _taken_from(calls, stamp)
         held: list[Entry] = []
         last: dict[str, Entry] = {}
@@ -92,7 +111,7 @@ def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> t
             if item.stream in sampled - others:
                 last[item.stream] = entry
         had = {entry.stream for entry in held}
-        began = any(record.stamp < stamp for record in calls)
+        began = any(r.stamp < stamp for r in calls) or any(taken_by(r) is not None for r in records)
         return [*held, *(entry for stream, entry in last.items() if stream not in had)], began
 
 

@@ -21,6 +21,7 @@ from dataflow.supervision.restarts import LiveRestarts, RestartPolicy
 from dataflow.supervision.run_state import RunState
 from dataflow.supervision.stall import LiveStallWatch, StallWatch
 from dataflow.supervision.supervised import Supervised
+from dataflow.supervision.triggers import TriggersPart
 
 
 def core_of(plan: RunPlan, processes: Mapping[str, ProcessPlan], configs: Mapping[str, Config]) -> Core:
@@ -31,7 +32,8 @@ def core_of(plan: RunPlan, processes: Mapping[str, ProcessPlan], configs: Mappin
 def _lossless(run: RunState) -> Core:
     """Nothing may be lost: sources wait for all, and the first death ends the run."""
     quiescence = Quiescence(run)
-    parts = [Counts(run), LosslessCover(run), quiescence, StallWatch(run, quiescence), DrainLimit(run)]
+    watch = StallWatch(run, quiescence)
+    parts = [Counts(run), LosslessCover(run), quiescence, watch, DrainLimit(run), TriggersPart(run)]
     return Core(run, parts, RestartPolicy(run))
 
 
@@ -53,5 +55,5 @@ def _live(run: RunState) -> Core:
     parts += [Counts(run), remains, cover, Lateness(run), restarts, Heartbeats(run, cover, restarts)]
     if run.plan.faults is not None:
         parts.append(PlannedFaults(run, run.plan.faults))
-    parts += [DiagnosticsPart(run), quiescence, LiveStallWatch(run, quiescence), DrainLimit(run)]
+    parts += [DiagnosticsPart(run), TriggersPart(run), quiescence, LiveStallWatch(run, quiescence), DrainLimit(run)]
     return Core(run, parts, restarts)

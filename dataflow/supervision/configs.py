@@ -70,7 +70,7 @@ def _operators(
         "window": list(plan.window),
         "rate": 1.0 if plan.live and plan.rate is None else plan.rate,
         "paranoid": plan.paranoid,
-        "firings": plan.record is not None,
+        "firings": plan.keeps_records,
         "snapshots": plan.graph.record.snapshots,
         "warm": _warm_start(plan),
     }
@@ -86,6 +86,7 @@ def _log(plan: RunPlan) -> dict[str, Any]:
         "start": log.start,
         "end": log.end,
         "bag": log.bag,
+        "paused": plan.paused,
     }
 
 

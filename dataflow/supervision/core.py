@@ -22,6 +22,7 @@ from dataflow.supervision.events import (
     LeftBehind,
     Moment,
     NotReading,
+    PlaybackAsked,
     Printed,
     Remained,
     Said,
@@ -75,6 +76,9 @@ class Core:
                 self._tick()
             case StopAsked():
                 self._stop()
+            case PlaybackAsked(action, steps):
+                if self._closing is None and self.run.phase is not Phase.STARTING:
+                    self.run.send_all("playback", action=action, steps=steps)
             case Aborted(why, interrupted):
                 raise RunFailed(why, interrupted=interrupted)
             case Said(label, kind, fields):

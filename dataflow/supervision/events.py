@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from dataflow.feeds.playback import Action
 from dataflow.recording.logs import LogLine
 from dataflow.records.black_box import Remains
 
@@ -31,6 +32,14 @@ class Tick:
 @dataclass(frozen=True, slots=True)
 class StopAsked:
     """The user asks for an orderly end; a second time, for an end at once."""
+
+
+@dataclass(frozen=True, slots=True)
+class PlaybackAsked:
+    """The user asks to pause, resume or step what is replayed."""
+
+    action: Action
+    steps: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,4 +110,17 @@ class Died:
     code: int | None
 
 
-Event = Begin | Tick | StopAsked | Aborted | Said | Printed | NotReading | HungUp | LeftBehind | Remained | Died
+Event = (
+    Begin
+    | Tick
+    | StopAsked
+    | PlaybackAsked
+    | Aborted
+    | Said
+    | Printed
+    | NotReading
+    | HungUp
+    | LeftBehind
+    | Remained
+    | Died
+)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +16,9 @@ if TYPE_CHECKING:  # runs without faults read no fault plan
 
 LOG_PROCESS = "@log"
 RECORDER = "@recorder"
+FLIGHT_SETTLES = 0.75
+"""Seconds after which the firing records of what a flight recorder is to keep have come: batches wait a quarter of
+one."""
 VIEWER_FILE = "@view"
 
 
@@ -39,12 +43,14 @@ class RunPlan:
 
     - `placement`: see `Graph.processes`.
     - `log`: a recording instead of the sources (a replay); None runs the sources themselves.
+    - `flight`: the folder of the graph's flight recorder; None, or a `record`: there is none.
     - `record`, `view_file`: files to write; None for none; an existing recording only with `overwrite`. `metadata` goes
       into the recording.
     - `live`: time does not wait: every source is read on its own thread, at the pace of the clock, and the operators'
       `live:` policies apply.
     - `faults`: what is to go wrong on purpose, by time (live runs only).
     - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
+    - `paused`: a replay waits at its beginning until it is let go on, or step by step.
     - `window`: messages and bytes that feeds may be ahead of the graph.
     - `paranoid`: re-digest inputs after each firing to catch operators that write into them.
     - `start_timeout`, `stall_timeout`: seconds allowed for all processes to become ready, and without any progress.
@@ -54,11 +60,13 @@ class RunPlan:
     placement: Placement | Mapping[str, str] = "graph"
     log: LogPlan | None = None
     record: Path | None = None
+    flight: Path | None = None
     view_file: Path | None = None
     metadata: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     live: bool = False
     faults: Iterator[Fault] | None = None
     rate: float | None = None
+    paused: bool = False
     window: tuple[int, int] = (256, 64 << 20)
     paranoid: bool = False
     start_timeout: float = 120.0
@@ -68,6 +76,11 @@ class RunPlan:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "placement", current_placement(self.placement))
+
+    @property
+    def keeps_records(self) -> bool:
+        """Tells whether anybody takes the operators' firing records."""
+        return self.record is not None or self.flight is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +122,22 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
             taken_in[edge.stream].add(labels[edge.consumer])
 
     sinks: dict[str, tuple[str, tuple[str, ...], Mapping[str, Any]]] = {}
+    options: dict[str, Any]
     if plan.record is not None:
         recorded = tuple(s for s in graph.record.streams if s in streams)
-        options: dict[str, Any] = {
+        options = {
             "path": str(plan.record),
             "metadata": {name: dict(values) for name, values in plan.metadata.items()},
             "compression": plan.compression,
             "overwrite": plan.overwrite,
         }
         sinks[RECORDER] = ("record", recorded, options)
+    elif plan.flight is not None:
+        everything = tuple(s for s in graph.record.streams if s in streams)
+        metadata = {name: dict(values) for name, values in plan.metadata.items()}
+        options = {"flight": str(plan.flight), "metadata": metadata, "compression": plan.compression, "overwrite": True}
+        options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES}
+        sinks[RECORDER] = ("record", everything, options)
     if plan.view_file is not None:
         shown = tuple(s for s in sorted(streams) if s not in graph.view.hide)
         sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file)})
@@ -130,7 +150,7 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         publish = {
             s: len(taken_in[s] - {label}) for s in sorted(streams) if made_in[s] == label and taken_in[s] - {label}
         }
-        if plan.record is not None:
+        if plan.keeps_records:
             publish |= {firings_key(graph.namespace, node): 1 for node in nodes}
         subscribe = tuple(s for s in sorted(streams) if label in taken_in[s] and made_in[s] != label)
         plans[label] = ProcessPlan(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dataflow.feeds.playable import PlayableStreams
 from dataflow.graph.model import Graph
+from dataflow.recording.cutting import cut_of
 from dataflow.reexecution.recorded_run import ReplayError, check_type, final_stamps
 from dataflow.supervision.plan import LogPlan
 
@@ -21,7 +22,8 @@ def plan_replay(
 ) -> LogPlan:
     """Tells which recorded streams stand in for which operators: the sources, or those that `replaced` names.
 
-    `start`, `end`: seconds from the recording's first message. Raises `ReplayError`.
+    `start`, `end`: seconds from the recording's first message, or from where it was cut: then it begins there, with the
+    states that operators had. Raises `ReplayError`.
     """
     streams: list[str] = []
     for node in graph.sources() if replaced is None else [graph.nodes[name] for name in sorted(replaced)]:
@@ -47,6 +49,9 @@ def plan_replay(
             "run takes nothing from them; name another graph with --graph"
         )
     first = min((i.first for s in streams if (i := recording.streams[s]).first is not None and not i.static), default=0)
+    part = cut_of(recording.metadata)
+    if part is not None and part.start is not None:
+        first, start = part.start, start or 0.0
     return LogPlan(
         Path(recording.path),
         tuple(sorted(streams)),

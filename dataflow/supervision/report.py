@@ -58,6 +58,8 @@ class Status:
     restarts: dict[str, int] = field(default_factory=dict)
     behind: dict[str, float] = field(default_factory=dict)
     """Seconds by which each source of a live run is behind the clock."""
+    paused: bool = False
+    """A replay waits until it is let go on."""
 
     @property
     def covered(self) -> int:

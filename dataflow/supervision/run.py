@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,8 @@ from dataflow.supervision.report import RunReport, Status
 from dataflow.supervision.supervisor import Supervisor
 
 Watch = Callable[[Status], None]
+Controls = Callable[[Supervisor], AbstractContextManager[None]]
+"""Steers a run while it lasts."""
 
 
 def run(graph: Graph, *, watch: Watch | None = None, early: EarlyNursery | None = None, **options: Any) -> RunReport:
@@ -40,32 +42,41 @@ def replay(
     end: float | None = None,
     watch: Watch | None = None,
     early: EarlyNursery | None = None,
+    controls: Controls | None = None,
     **options: Any,
 ) -> RunReport:
     """Replays a recording through the graph that made it, or another one with the same sources.
 
     `played`: a recording by its path, or recorded streams that are open already, such as those of a bag; they stay so.
-    `start` and `end` are seconds from the recording's first message. Further options are the fields of `RunPlan`.
-    Raises `ReplayError`, `RunFailed`.
+    `start` and `end` are seconds from the recording's first message. `controls` may pause and step it. Further options
+    are the fields of `RunPlan`. Raises `ReplayError`, `RunFailed`.
     """
     with Recording(played) if isinstance(played, Path) else nullcontext(played) as recording:
         loaded = graph or recorded_graph(recording)
         log = plan_replay(recording, loaded, start=start, end=end)
-    return execute(RunPlan(loaded, log=log, **options), mode="replay", watch=watch, early=early)
+    return execute(RunPlan(loaded, log=log, **options), mode="replay", watch=watch, early=early, controls=controls)
 
 
-def execute(plan: RunPlan, *, mode: str, watch: Watch | None = None, early: EarlyNursery | None = None) -> RunReport:
+def execute(
+    plan: RunPlan,
+    *,
+    mode: str,
+    watch: Watch | None = None,
+    early: EarlyNursery | None = None,
+    controls: Controls | None = None,
+) -> RunReport:
     """Runs a plan under a supervisor; Ctrl-C asks it for an orderly end, a second one ends it at once.
 
-    `early`: a nursery that was started already.
+    `early`: a nursery that was started already. `controls`: is entered with the supervisor while it runs.
     """
     for file in (plan.record, plan.view_file):
         if file is not None:
             file.parent.mkdir(parents=True, exist_ok=True)
-    if plan.record is not None:
+    if plan.keeps_records:
         plan = replace(plan, metadata=_metadata(plan, mode))
     supervisor = Supervisor(plan, early=early)
-    with interrupts(supervisor.stop), _watching(supervisor, watch):
+    steered = nullcontext() if controls is None else controls(supervisor)
+    with interrupts(supervisor.stop), _watching(supervisor, watch), steered:
         return supervisor.run()
 
 

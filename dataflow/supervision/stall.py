@@ -34,8 +34,10 @@ class StallWatch(Part):
         self._heard = self.run.steady
 
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
-        if kind in ("progress", "ended"):
+        if kind in ("progress", "ended") or fields.get("paused"):
             self._heard = self.run.steady
+        if kind == "state" and "paused" in fields:
+            self.run.status.paused = fields["paused"]
 
     def tick(self) -> None:
         timeout = self.run.plan.stall_timeout

@@ -12,8 +12,10 @@ import selectors
 import signal
 import sys
 import time
+from collections import deque
 from collections.abc import Callable
 
+from dataflow.feeds.playback import Action
 from dataflow.firing.threads import environment
 from dataflow.process.channel import ChannelClosed
 from dataflow.process.speech import heard, shown
@@ -68,6 +70,7 @@ class Supervisor:
         self._over: commands.Over | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._stops = 0
+        self._asked: deque[events.PlaybackAsked] = deque()
 
     @property
     def status(self) -> Status:
@@ -77,6 +80,12 @@ class Supervisor:
         """Asks for an orderly end: sources stop, everything drains. A second call ends at once."""
         self._stops += 1
         with contextlib.suppress(BlockingIOError, OSError):  # full: it will wake up; closed: it is over
+            os.write(self._waking, b"!")
+
+    def play(self, action: Action, steps: int = 1) -> None:
+        """Pauses, resumes or steps what is replayed; on any thread."""
+        self._asked.append(events.PlaybackAsked(action, steps))
+        with contextlib.suppress(BlockingIOError, OSError):
             os.write(self._waking, b"!")
 
     def pid_of(self, label: str) -> int:
@@ -133,6 +142,8 @@ class Supervisor:
                 while seen_stops < self._stops:
                     seen_stops += 1
                     self._feed(events.StopAsked())
+                while self._asked:
+                    self._feed(self._asked.popleft())
                 if time.monotonic() >= due:
                     due = time.monotonic() + TICK
                     self._tick()

@@ -70,10 +70,13 @@ def refs_of(firing: Firing) -> FiringInputs:
 
 def input_refs(firing: Firing) -> dict[str, InputRef]:
     """The inputs of a firing by reference."""
-    return {
-        name: MessageRef(value.stream, value.incarnation, value.seq) if value.__class__ is Entry else _ref(value)
-        for name, value in firing.inputs.items()
-    }
+    refs: dict[str, InputRef] = {}
+    for name, value in firing.inputs.items():
+        if value.__class__ is Entry:
+            refs[name] = MessageRef(value.stream, value.incarnation, value.seq)
+        else:
+            refs[name] = _ref(value)
+    return refs
 
 
 def _ref(value: InputValue) -> InputRef:

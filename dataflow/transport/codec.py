@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from dataflow.messages.base import ArrayField, Message, MessageError, message_type
+from dataflow.messages.compiled import Compiled
 from dataflow.transport.body import Body, short, where
 from dataflow.transport.envelope import (
     ALIGNMENT,
@@ -134,6 +135,11 @@ def _unpacking(**limits: int) -> Callable[[Any], Any]:
 
 _pack: Final = msgpack.Packer(autoreset=True).pack
 _unpack_small = _unpacking(max_array_len=_SMALL_ARRAY, max_str_len=DEFAULT_LIMITS.string_bytes)
+_ArrayDescribed = tuple[np.dtype[Any], tuple[int, ...], int]
+_Described = tuple[type[Message], Compiled, tuple[Any, ...], tuple[_ArrayDescribed | None, ...]]
+"""The class of a message with its functions, its scalars, and the dtype, shape and bytes of each of its arrays."""
+_bodies: dict[bytes, _Described] = {}
+_MOST_BODIES: Final = 64
 _head_unpackers: dict[int, Callable[[Any], Any]] = {}
 
 
@@ -159,27 +165,21 @@ def _usual(buffer: Buffer, types: TypeOf) -> Envelope | None:
             or not (_INT64_MIN <= stamp <= _INT64_MAX and _INT64_MIN <= wall <= _INT64_MAX)
         ):
             return None
-        schema, header, described = _unpack_small(view[start:end])
-        cls = types(schema)
-        made = cls._made or cls.compiled()
+        data = view[start:end].tobytes()
+        known = _bodies.get(data)
+        if known is None or types(known[0].SCHEMA) is not known[0]:
+            known = _described(data, types)
+        cls, made, header, described = known
         arrays: list[npt.NDArray[Any] | None] = []
-        for dtypes, description in zip(made.dtypes, described, strict=True):
-            if description is None:
+        for each in described:
+            if each is None:
                 arrays.append(None)
                 continue
-            code, shape = description
-            dtype = dtypes[code]
-            size = dtype.itemsize
-            for extent in shape:
-                if extent.__class__ is not int or extent <= 0:
-                    return None
-                size *= extent
+            dtype, shape, size = each
             offset += -offset % ALIGNMENT
-            if dtype.kind == "b" or len(shape) > DEFAULT_LIMITS.dimensions:
-                return None
             arrays.append(np.ndarray(shape, dtype, view, offset))  # raises where it does not fit
             offset += size
-        if offset != len(view) or offset - end > DEFAULT_LIMITS.payload_bytes or header.__class__ is not tuple:
+        if offset != len(view) or offset - end > DEFAULT_LIMITS.payload_bytes:
             return None
         message = cls.__new__(cls)
         if not made.adopt(message, stamp, header, arrays):
@@ -187,6 +187,36 @@ def _usual(buffer: Buffer, types: TypeOf) -> Envelope | None:
         return Envelope(_MESSAGE, stream, incarnation, seq, stamp, message, reason, wall)
     except Exception:  # whatever it is, the general way finds it, and says what is wrong and where
         return None
+
+
+def _described(data: bytes, types: TypeOf) -> _Described:
+    """What a small body says. Raises for anything that is rare, or wrong. Most bodies of a stream are equal: what they
+    say is kept."""
+    schema, header, arrays = _unpack_small(data)
+    cls = types(schema)
+    made = cls._made or cls.compiled()
+    described: list[_ArrayDescribed | None] = []
+    for dtypes, array in zip(made.dtypes, arrays, strict=True):
+        if array is None:
+            described.append(None)
+            continue
+        code, shape = array
+        dtype = dtypes[code]
+        size = dtype.itemsize
+        for extent in shape:
+            if extent.__class__ is not int or extent <= 0:
+                raise ValueError("an extent that is no positive number")
+            size *= extent
+        if dtype.kind == "b" or len(shape) > DEFAULT_LIMITS.dimensions or shape.__class__ is not tuple:
+            raise ValueError("an array of bool, or of many dimensions")
+        described.append((dtype, shape, size))
+    if header.__class__ is not tuple:
+        raise ValueError("a header that is no list")
+    found = cls, made, header, tuple(described)
+    if len(_bodies) >= _MOST_BODIES:
+        _bodies.clear()
+    _bodies[data] = found
+    return found
 
 
 def _head(view: memoryview, limits: Limits) -> tuple[Head, int, int]:

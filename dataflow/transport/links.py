@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 from dataflow.transport.envelope import Buffer, DecodeError, Kind
 from dataflow.transport.pool import Block
-from dataflow.transport.ring import RingReader, RingWriter
+from dataflow.transport.ring import READERS, RingReader, RingWriter
 from dataflow.transport.shared import (
     BOARD_BYTES,
     SLOTS,
@@ -70,6 +70,7 @@ class Outgoing:
 
     def __init__(self, ring: int, wake: int, board: int, most: tuple[int, int] | None) -> None:
         self._ring = RingWriter(ring, wake)
+        self._words = self._ring.words
         self._cells = memoryview(mmap.mmap(board, BOARD_BYTES)).cast("Q")
         self._most = most
         self._reader = self._ring.reader()
@@ -130,7 +131,7 @@ class Outgoing:
         self, channel: int, parts: Sequence[Buffer], size: int, *, droppable: bool = True, block: Block | None = None
     ) -> None:
         """Sends one envelope, given as consecutive buffers, or keeps it until there is room."""
-        if (self.away or self._reader != self._ring.reader()) and not self.present():
+        if (self.away or self._reader != self._words[READERS]) and not self.present():
             if block is not None:
                 self.claim.drop(block)
             return
@@ -210,23 +211,12 @@ class Incoming:
 
     def __init__(self, ring: int, wake: int, board: int, keys: Sequence[str], pools: PoolReader) -> None:
         self._ring = RingReader(ring, wake)
+        self.arrived, self.sleep, self.awake = self._ring.arrived, self._ring.sleep, self._ring.awake
         self._board = Board(board)
         self._keys, self._pools = keys, pools
         self._pieces: dict[int, list[bytes]] = {}
         self.messages = self.nbytes = self.unresolved = 0
         """The count taken so far, and how much of it lies in memory that could not be opened."""
-
-    def arrived(self) -> bool:
-        """Tells whether there is something to take."""
-        return self._ring.arrived()
-
-    def sleep(self) -> bool:
-        """Announces a wait; False when there is something to take instead."""
-        return self._ring.sleep()
-
-    def awake(self) -> None:
-        """Says that the wait is over: until the next one nobody needs to wake this process."""
-        self._ring.awake()
 
     def take(self) -> list[tuple[str, Buffer]]:
         """Returns (key, payload) of what has arrived."""

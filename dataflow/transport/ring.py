@@ -25,7 +25,7 @@ from collections.abc import Sequence
 
 CAPACITY = 1 << 20
 _HEADER = 4096
-_HEAD, _TAIL, _ASLEEP, _BLOCKED, _READERS = (64 * k // 8 for k in range(5))  # a cache line each
+_HEAD, _TAIL, _ASLEEP, _BLOCKED, READERS = (64 * k // 8 for k in range(5))  # a cache line each
 _FRAME = struct.Struct("<II")
 _ROUNDED = _FRAME.size + 7
 """A frame takes its content and this of the ring, without the last three bits: whole words, so that a head
@@ -56,7 +56,7 @@ class _End:
         size = os.fstat(descriptor).st_size
         self.capacity = size - _HEADER
         self._memory = mmap.mmap(descriptor, size)
-        self._words = memoryview(self._memory)[:_HEADER].cast("Q")
+        self.words = self._words = memoryview(self._memory)[:_HEADER].cast("Q")
         self._lock = threading.Lock()
 
     def _fence(self) -> None:
@@ -81,7 +81,7 @@ class RingWriter(_End):
 
     def reader(self) -> int:
         """Returns which reader is at the other end, by number; 0: there was none yet."""
-        return int(self._words[_READERS])
+        return int(self._words[READERS])
 
     @property
     def written(self) -> int:
@@ -141,7 +141,7 @@ class RingReader(_End):
         self._wake = wake
         self._tail = self._words[_HEAD]
         self._words[_TAIL] = self._tail
-        self._words[_READERS] += 1
+        self._words[READERS] += 1
         self._words[_BLOCKED] = 0
 
     def arrived(self) -> bool:
@@ -167,9 +167,9 @@ class RingReader(_End):
             taken.append((channel, self._memory[start : start + size]))
             tail += room
         if tail != self._tail:
-            self._tail = tail
-            self._words[_TAIL] = tail
-            self._fence()
+            self._tail = self._words[_TAIL] = tail
+            with self._lock:  # a fence
+                pass
             if self._words[_BLOCKED]:
                 self._words[_BLOCKED] = 0
                 os.eventfd_write(self._wake, 1)

@@ -28,9 +28,9 @@ from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.run import Watch
 from dataflow.sync import Entry
 from dataflow.verification.board import Board
+from dataflow.verification.choice import require_records
 from dataflow.verification.ledger import read_ledger
 from dataflow.verification.processes import Call, call_workers
-from dataflow.verification.task import require_records
 
 
 @dataclass(frozen=True, slots=True)

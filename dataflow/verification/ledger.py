@@ -12,8 +12,10 @@ from dataclasses import dataclass
 
 from dataflow.graph.model import Graph
 from dataflow.recording import Recording
-from dataflow.recording.layout import OUTCOME
+from dataflow.recording.cutting import Cut, cut_of
+from dataflow.recording.layout import OUTCOME, RECOVERED
 from dataflow.records.comparison import Verification
+from dataflow.records.cuts import held_by
 from dataflow.records.firing import CALLS, WITHHELD
 from dataflow.records.reading import FiringLog, Place, whole
 from dataflow.sync import messages_of
@@ -42,24 +44,26 @@ class Ledger:
     """The accounts of nodes, and whether the recording tells of its run to the end.
 
     `ended` is False for a file without a proper end (`torn`) and for a run that failed or was interrupted. Records are
-    stored before messages: what a torn file lacks may have followed, what another lacks was never sent.
+    stored before messages: what a torn file lacks may have followed, what another lacks was never sent. `part`: the
+    file is a part of a recording, cut out of it.
     """
 
     accounts: Mapping[str, Account]
     ended: bool
     torn: bool
+    part: Cut | None = None
 
     def enter(self, verification: Verification) -> None:
         """Tells a verification what its recording cannot account for."""
         account = self.accounts[verification.operator]
         verification.not_stored = account.not_stored
         lacking = self.torn and bool(account.not_stored or verification.beyond)
-        verification.cut = not self.ended and (not account.finished or lacking)
-        if verification.cut:
+        verification.cut = not self.ended and (not account.finished or lacking or self.part is not None)
+        if verification.cut and self.part is None:
             verification.after_cut = account.unaccounted
         else:
             verification.unaccounted = account.unaccounted
-            verification.unfinished = not account.finished
+            verification.unfinished = not account.finished and self.part is None
 
 
 def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Collection[str]) -> Ledger:
@@ -79,6 +83,9 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
             for stream, emission in zip(outputs, record.outputs, strict=False):  # a failed call has none
                 if emission is not None and emission.seq != WITHHELD:
                     made[stream].add((record.incarnation, emission.seq))
+            for held in held_by(record):
+                if held.stream in made:
+                    made[held.stream].add(held.place)
             if (record.incarnation, record.index) > last:
                 last = (record.incarnation, record.index)
                 finished[name] = record.kind == "finish" or (finished[name] and record.kind not in CALLS)
@@ -86,7 +93,8 @@ def read_ledger(recording: Recording, graph: Graph, log: FiringLog, nodes: Colle
             lost[name] = whole(log.of(name))[1]
     accounts = {name: _account(recording, graph, name, made, taken, lost[name], finished[name]) for name in nodes}
     outcome = recording.metadata.get(OUTCOME, {}).get("outcome")
-    return Ledger(accounts, not recording.torn and outcome == COMPLETE, recording.torn)
+    part, torn = cut_of(recording.metadata), recording.torn or RECOVERED in recording.metadata
+    return Ledger(accounts, not torn and part is None and outcome == COMPLETE, torn, part)
 
 
 def incomplete_streams(recording: Recording, graph: Graph, log: FiringLog, nodes: Iterable[str]) -> frozenset[str]:

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from dataflow.recording.cutting import Cut
 from dataflow.records.comparison import Verification
 from dataflow.supervision.report import OperatorCounts
 from dataflow.verification.compare import OutputComparison
@@ -20,8 +21,8 @@ class StandIn:
     """A source, or another operator whose recorded streams were used: its streams against its firing records.
 
     `unaccounted` stored messages are of no record; `lost_records` calls follow a gap in the records; `unfinished`: they
-    end before the run did. `missing` messages are in the records and not in the recording: never sent, or lost.
-    `cut`: the recording itself ends before the run did.
+    end before the run did. `missing` messages are in the records and not in the recording: never sent, or lost. `cut`:
+    the recording itself ends before the run did; `part`: it was cut out of another, in which all is accounted for.
     """
 
     operator: str
@@ -30,18 +31,19 @@ class StandIn:
     unfinished: bool = False
     missing: int = 0
     cut: bool = False
+    part: bool = False
 
     @staticmethod
-    def of(operator: str, account: Account, *, ended: bool, torn: bool) -> StandIn:
-        cut = not ended and (not account.finished or (torn and account.not_stored > 0))
+    def of(operator: str, account: Account, *, ended: bool, torn: bool, part: bool = False) -> StandIn:
+        cut = not ended and (part or not account.finished or (torn and account.not_stored > 0))
         return StandIn(
-            operator, account.unaccounted, account.lost, not account.finished and not cut, account.not_stored, cut
+            operator, account.unaccounted, account.lost, not account.finished and not cut, account.not_stored, cut, part
         )
 
     @property
     def whole(self) -> bool:
         """Its records tell of every stored message, as far as the recording goes. Missing messages are only noted."""
-        return not (self.lost_records or self.unfinished or (self.unaccounted and not self.cut))
+        return not (self.lost_records or self.unfinished or (self.unaccounted and (self.part or not self.cut)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,8 @@ class VerifyReport:
     for culprits that were run twice, whether they differed alike. `digests` are (messages, stream digest) of what was
     made here, by stream; `outputs` the streams of each operator, `producers` the nodes that it takes from.
     `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so what is
-    verified is what had been stored. `work` tells how long each operator worked.
+    verified is what had been stored. `part`: the recording is a part of another, cut out of it. `work` tells how long
+    each operator worked.
     """
 
     operators: tuple[Verification, ...]
@@ -78,6 +81,7 @@ class VerifyReport:
     producers: Mapping[str, frozenset[str]] = field(default_factory=dict)
     start: float | None = None
     torn: bool = False
+    part: Cut | None = None
     work: Mapping[str, OperatorCounts] = field(default_factory=dict)
 
     @property
@@ -150,6 +154,7 @@ class VerifyReport:
             "start_s": self.start,
             "torn": self.torn,
             "cut": self.cut,
+            "part": None if self.part is None else asdict(self.part),
             "messages": self.messages,
             "streams": self.streams,
             "wall_s": self.wall,

@@ -3,26 +3,66 @@
 from __future__ import annotations
 
 import math
+import os
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from dataflow.firing.threads import environment
 from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.recording.cutting import cut_of
+from dataflow.recording.facts import machine_facts
+from dataflow.recording.layout import RECOVERED
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS
-from dataflow.records.reading import beginning, whole
-from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.records.reading import FiringLog, beginning, whole
+from dataflow.reexecution.engine import plan_feeding
+from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.report import OperatorCounts
 from dataflow.supervision.run import Watch
-from dataflow.verification import part
+from dataflow.verification import part, partition
+from dataflow.verification.choice import (
+    accountable,
+    chosen_operators,
+    require_ports,
+    require_records,
+    stored_checks,
+    unfed_operators,
+    with_makers,
+)
 from dataflow.verification.compare import OutputComparison
+from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.letters import shared_records
 from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
 from dataflow.verification.stored import StoredStream
-from dataflow.verification.task import Task, prepare
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Holds what is to be verified, and what the recording says of it: all that was read before any worker starts.
+
+    `unfed`: operators that cannot be repeated, by the stream that they need and the recording does not hold.
+    """
+
+    path: Path
+    graph: Graph
+    log: FiringLog
+    ledger: Ledger
+    operators: tuple[str, ...]
+    stood_in: tuple[str, ...]
+    stand_ins: tuple[str, ...]
+    incomplete: frozenset[str]
+    parts: tuple[partition.Part, ...]
+    unchecked: tuple[str, ...]
+    facts: tuple[tuple[str, str, str], ...]
+    begin: int | None
+    span: float
+    unfed: Mapping[str, str]
+    torn: bool
 
 
 def verify(
@@ -57,7 +97,7 @@ def verify(
     if jobs is not None and jobs < 1:
         raise ReplayError(f"{jobs} jobs: expected 1 or more")
     workers = workers or call_workers
-    task = prepare(path, graph, first, only, start, jobs)
+    task = _prepare(path, graph, first, only, start, jobs)
     options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
     with shared_records(task.log) as (descriptor, batches):
         options |= {"descriptors": (descriptor,), "locate": _locate(task)}
@@ -84,7 +124,54 @@ def verify(
     return replace(report, repeated=repeated, total=time.monotonic() - began)
 
 
-def _locate(task: Task) -> Locate:
+def _prepare(
+    path: Path, graph: Graph | None, first: str | None, only: str | None, start: float | None, jobs: int | None
+) -> _Task:
+    with Recording(path) as recording:
+        played = graph or recorded_graph(recording)
+        log = FiringLog.read(recording)
+        told = [n for n in played.nodes if accountable(recording, played, log, n)]
+        incomplete = incomplete_streams(recording, played, log, told)
+        held = recording.streams.keys() - incomplete
+        chosen = with_makers(held, played, chosen_operators(played, first, only))
+        unfed = {} if first or only else unfed_operators(recording, played, chosen, incomplete)
+        if unfed.keys() >= chosen:
+            plan_feeding(recording, played, sorted(chosen), incomplete=incomplete)  # says what is missing
+        chosen -= unfed.keys()
+        operators = tuple(name for name in played.nodes if name in chosen)
+        require_records(recording, log, operators)
+        require_ports(recording, played, log, operators)
+        plan_feeding(recording, played, operators, incomplete=incomplete)
+        feeding = {
+            played.streams[s].node for name in chosen for taken in played.nodes[name].inputs.values() for s in taken
+        } - chosen
+        sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
+        stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, log, n)]
+        checks, unchecked = stored_checks(recording, played, log, [*operators, *stand_ins])
+        groups = partition.units(played, held, operators)
+        work = {n: sum(r.duration + partition.PER_FIRING_NS for r in log.of(n)) for n in operators}
+        jobs = jobs or partition.jobs_for(work, len(os.sched_getaffinity(0)))
+        begin, last = _span(recording, start)
+        return _Task(
+            path=path,
+            graph=played,
+            log=log,
+            ledger=read_ledger(recording, played, log, [*operators, *stand_ins]),
+            operators=operators,
+            stood_in=tuple(name for name in played.nodes if name in feeding),
+            stand_ins=tuple(stand_ins),
+            incomplete=incomplete,
+            parts=tuple(partition.with_checks(played, partition.balanced(groups, work, jobs), checks)),
+            unchecked=unchecked,
+            facts=_differing_facts(recording.metadata, played),
+            begin=None if start is None else begin,
+            span=(last - begin) * 1e-9,
+            unfed=unfed,
+            torn=recording.torn or RECOVERED in recording.metadata,
+        )
+
+
+def _locate(task: _Task) -> Locate:
     """Names the call that an operator is at, from the number of calls that it has repeated."""
 
     def located(operator: str, repeated: int) -> str:
@@ -101,15 +188,18 @@ def _locate(task: Task) -> Locate:
 
 
 def _report(
-    task: Task, answers: Iterable[Mapping[str, Any]], tolerance: float | None, start: float | None
+    task: _Task, answers: Iterable[Mapping[str, Any]], tolerance: float | None, start: float | None
 ) -> VerifyReport:
     answers = list(answers)
     found = {v["operator"]: Verification.from_wire(v) for answer in answers for v in answer["operators"]}
     counts = {name: OperatorCounts(*values) for answer in answers for name, values in answer["work"].items()}
     stored = [StoredStream.from_wire(s) for answer in answers for s in answer["stored"]]
-    operators = tuple(found[name] for name in task.operators)
-    for verification in operators:
-        task.ledger.enter(verification)
+    for name in task.operators:
+        task.ledger.enter(found[name])
+    for name, stream in task.unfed.items():
+        calls = sum(record.kind in CALLS for record in task.log.of(name))
+        found[name] = Verification(name, firings=calls, unverifiable=max(calls, 1), missing=stream)
+    operators = tuple(found[name] for name in task.graph.nodes if name in found)
     nodes = task.graph.nodes
     return VerifyReport(
         operators=operators,
@@ -136,13 +226,20 @@ def _report(
         },
         start=start,
         torn=task.torn,
+        part=task.ledger.part,
         work=counts,
     )
 
 
-def _stand_in(task: Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
+def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
     """The books of a stand-in, with what reading its messages has shown."""
-    made = StandIn.of(name, task.ledger.accounts[name], ended=task.ledger.ended, torn=task.ledger.torn)
+    made = StandIn.of(
+        name,
+        task.ledger.accounts[name],
+        ended=task.ledger.ended,
+        torn=task.ledger.torn,
+        part=task.ledger.part is not None,
+    )
     read = [s for s in stored if s.maker == name]
     return replace(
         made,
@@ -152,7 +249,7 @@ def _stand_in(task: Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
 
 
 def _repeat(
-    task: Task, report: VerifyReport, request: Mapping[str, Any], options: Mapping[str, Any], workers: Workers
+    task: _Task, report: VerifyReport, request: Mapping[str, Any], options: Mapping[str, Any], workers: Workers
 ) -> Mapping[str, bool]:
     """Runs the culprits once more, to the first difference of each: did they differ alike?"""
     culprits = report.culprits
@@ -170,3 +267,34 @@ def _repeat(
     again = {name: first for answer in workers(calls, **options) for name, first in answer.items()}
     before = {v.operator: v.first for v in report.operators if v.first is not None}
     return {name: again[name] == [before[name].incarnation, before[name].index, before[name].got] for name in culprits}
+
+
+def _span(recording: Recording, start: float | None) -> tuple[int, int]:
+    """The stamp `start` seconds after the first message of the recording (or of what was cut out), and its last one."""
+    spans = [s for s in recording.streams.values() if s.first is not None and not s.static and "/@/" not in s.name]
+    first = min((s.first for s in spans if s.first is not None), default=0)
+    last = max((s.last for s in spans if s.last is not None), default=0)
+    part = cut_of(recording.metadata)
+    if part is not None:
+        first = first if part.start is None else part.start
+        last = last if part.end is None else min(last, part.end)
+    begin = first + round((start or 0.0) * 1e9)
+    if not first <= begin <= last:
+        raise ReplayError(f"--start {start:g}: the recording is {(last - first) * 1e-9:.3g} s long")
+    return begin, last
+
+
+def _differing_facts(metadata: Mapping[str, Mapping[str, str]], graph: Graph) -> tuple[tuple[str, str, str], ...]:
+    """Facts of the machine, packages, threads and devices that are not as when the recording was made."""
+    here = machine_facts(environment(graph.threads))
+    here["threads"] = {name: value for name, value in here["threads"].items() if name in metadata.get("threads", {})}
+    facts = [
+        (f"{group} {name}", metadata[group].get(name, "–"), here[group].get(name, "–"))
+        for group in sorted(here.keys() & metadata.keys())
+        for name in sorted(here[group].keys() | metadata[group].keys())
+        if metadata[group].get(name) != here[group].get(name)
+    ]
+    threads = metadata.get("dataflow:run", {}).get("threads", str(graph.threads))
+    if threads != str(graph.threads):
+        facts.append(("graph threads", threads, str(graph.threads)))
+    return tuple(facts)

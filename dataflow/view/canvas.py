@@ -3,7 +3,7 @@ class."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
@@ -126,12 +126,6 @@ def visualizer(
         return function
 
     return register
-
-
-def visualizers() -> Mapping[type[Message], Visualizer]:
-    """Every registered visualiser by message class."""
-    _load()
-    return dict(_visualizers)
 
 
 def roles_of(message_type: type[Message]) -> tuple[Role, ...]:

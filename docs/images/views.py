@@ -21,21 +21,40 @@ DATA = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / 
 SIZE = (1600, 1000)
 
 VIEWS: dict[str, tuple[str, ...]] = {
-    "dead_reckoning": ("graphs/dead_reckoning.yaml",),
-    "depth": ("graphs/depth.yaml",),
-    "lidar": ("graphs/simulated_lidar.yaml",),
-    "mono_depth": ("graphs/mono_depth.yaml", "--set", f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}"),
-    "stereo": ("graphs/simulated_stereo.yaml",),
+    "dead_reckoning": ("run", "graphs/dead_reckoning.yaml"),
+    "depth": ("run", "graphs/depth.yaml"),
+    "fusion": ("run", "graphs/fusion.yaml"),
+    "lidar": ("run", "graphs/simulated_lidar.yaml"),
+    "mono_depth": (
+        "run",
+        "graphs/mono_depth.yaml",
+        "--set",
+        f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}",
+    ),
+    "perception": ("replay", "recordings/demo.mcap", "--graph", "graphs/perception.yaml"),
+    "slam": ("run", "graphs/slam.yaml", "--set", "duration=26s"),
+    "stereo": ("run", "graphs/simulated_stereo.yaml"),
 }
-"""The arguments of `dataflow run` by the picture's name."""
+"""The arguments of `dataflow` by the picture's name."""
+
+LATER = {"slam": 22}
+"""Seconds after the start of which a picture is, where there is little to be seen at first."""
 
 
 def picture(name: str, folder: Path) -> Path:
     """Runs a graph, renders what the viewer shows of it, and writes NAME.png beside this file."""
     shown, large = folder / f"{name}.rrd", folder / f"{name}.png"
     programs = Path(sys.executable).parent
-    run = [sys.executable, "-m", "dataflow.cli.main", "run", *VIEWS[name], "--view", str(shown), "--quiet"]
-    subprocess.run(run, cwd=REPOSITORY, check=True)
+    command = [sys.executable, "-m", "dataflow.cli.main"]
+    if name in LATER:
+        recorded = folder / f"{name}.mcap"
+        run = [*command, *VIEWS[name], "--record", str(recorded), "--quiet"]
+        subprocess.run(run, cwd=REPOSITORY, check=True)
+        show = [*command, "view", str(recorded), "--to", str(shown), "--start", str(LATER[name])]
+        subprocess.run(show, cwd=REPOSITORY, check=True)
+        recorded.unlink()
+    else:
+        subprocess.run([*command, *VIEWS[name], "--view", str(shown), "--quiet"], cwd=REPOSITORY, check=True)
     size = f"{SIZE[0]}x{SIZE[1]}"
     # The screen is so large that the pointer, in its middle, is not on the window.
     subprocess.run(

@@ -40,6 +40,11 @@ def pages() -> Iterator[str]:
     yield from sorted(str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "docs").rglob("*.ipynb"))
 
 
+def figures() -> list[str]:
+    """Returns where in the site the pages of benchmarks/ stand, which no `nav` has to list."""
+    return [place_of(file) for file in pages() if file.startswith("benchmarks/")]
+
+
 def linked(text: str, file: str) -> Iterator[str]:
     """Yields the files of the repository to which the page in `file` links."""
     for prose in FENCED.split(text)[::2]:
@@ -87,6 +92,7 @@ def github_anchor(heading: str, separator: str = "-") -> str:
 
 def on_config(config: Any) -> Any:
     config.mdx_configs.setdefault("toc", {})["slugify"] = github_anchor
+    config.nav.append({"Figures": figures()})
     return config
 
 

@@ -90,7 +90,7 @@ def shape_of(points: Array, up: Array) -> Shape:
     offset = points - centroid
     smallest, middle, largest = (max(float(v), 0.0) for v in np.linalg.eigvalsh(offset.T @ offset / len(points)))
     scale = largest if largest > 1e-12 else np.inf
-    T, size = _standing_box(points, up)
+    T, size = upright_box(points, up)
     return Shape(
         centroid=centroid,
         lower=points.min(axis=0),
@@ -104,7 +104,8 @@ def shape_of(points: Array, up: Array) -> Shape:
     )
 
 
-def _standing_box(points: Array, up: Array) -> tuple[Array, Array]:
+def upright_box(points: Array, up: Array) -> tuple[Array, Array]:
+    """Returns the axes and place T (4, 4), z along up, and the size (3,) of the upright box of least area."""
     helper = np.eye(3)[int(np.argmin(np.abs(up)))]
     x = np.cross(helper, up)
     x /= np.linalg.norm(x)

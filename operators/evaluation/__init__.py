@@ -1,4 +1,4 @@
-"""Sinks that score streams against ground truth."""
+"""Scores streams against ground truth, and draws their errors."""
 
 from typing import TYPE_CHECKING
 
@@ -9,8 +9,10 @@ if TYPE_CHECKING:
     from operators.evaluation.depth_metrics import DepthMetrics
     from operators.evaluation.detection_metrics import DetectionMetrics
     from operators.evaluation.orientation_metrics import OrientationMetrics
+    from operators.evaluation.scene_graph_metrics import SceneGraphMetrics
     from operators.evaluation.segmentation_metrics import SegmentationMetrics
     from operators.evaluation.trajectory_metrics import TrajectoryMetrics
+    from operators.evaluation.trajectory_plots import TrajectoryPlots
 else:
     __getattr__, __dir__ = lazily(
         __name__,
@@ -19,8 +21,10 @@ else:
             "depth_metrics": ("DepthMetrics",),
             "detection_metrics": ("DetectionMetrics",),
             "orientation_metrics": ("OrientationMetrics",),
+            "scene_graph_metrics": ("SceneGraphMetrics",),
             "segmentation_metrics": ("SegmentationMetrics",),
             "trajectory_metrics": ("TrajectoryMetrics",),
+            "trajectory_plots": ("TrajectoryPlots",),
         },
     )
 
@@ -29,6 +33,8 @@ __all__ = [
     "DepthMetrics",
     "DetectionMetrics",
     "OrientationMetrics",
+    "SceneGraphMetrics",
     "SegmentationMetrics",
     "TrajectoryMetrics",
+    "TrajectoryPlots",
 ]

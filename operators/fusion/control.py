@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.fusion.error_state import GYRO_BIAS, ROTATION, SIZE, VELOCITY, State
+from operators.fusion.error_state import GYRO_BIAS, ROTATION, VELOCITY, State
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ class Command:
         if time - self.time > self.lasts:
             return state
         share = 1.0 - math.exp(-seconds / self.lag)
-        F = np.eye(SIZE)
+        F = np.eye(len(state.covariance))
         turned = state.rotation @ before.T
         F[VELOCITY, VELOCITY] = (1.0 - share) * turned
         F[VELOCITY, ROTATION] = -share * state.rotation @ skew(self.linear)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
@@ -26,12 +25,13 @@ from dataflow.messages import (
 )
 from dataflow.messages.geometry import invert
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
-from operators.fusion.beginning import Prior, coasting_node, first_node, rests
+from operators.fusion.beginning import Prior, coasting_node
 from operators.fusion.control import Command
 from operators.fusion.error_state import POSITION, Noise
 from operators.fusion.gate import GateConfig
+from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
-from operators.fusion.nodes import Measurement, Sample
+from operators.fusion.nodes import Measurement
 from operators.fusion.output import diagnostics, odometry_of
 from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, measurements, unheard, use_of
 from operators.geometry.extrinsics import transform_between
@@ -54,13 +54,17 @@ class EkfFusion(Operator):
     second one that agrees, and refused ones that agree with each other show the filter to be wrong, which makes room
     for them. Detections of a radar and ranges may be of something else, so the filter never yields to those.
 
+    A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
+    as the motion tells of it.
+
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
     rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
     around are tried side by side until one is left, and the covariance holds them all. Odometry begins when the
     position's standard deviation is below `sure` for the first time. With `start: origin` the first pose is the world
     frame.
 
-    Method: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017.
+    Methods: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017; Li and Mourikis, "Online temporal
+    calibration for camera-IMU systems", 2014.
     """
 
     measurements: In[Imu | NavSatFix | Pose | Odometry | Twist | MagneticField | RadarScan | LandmarkSightings] = In(
@@ -111,8 +115,11 @@ class EkfFusion(Operator):
 
     def _begin(self) -> None:
         self._filter: LateFilter | None = None
-        self._samples: list[Sample] = []
-        self._first_stamp = self._last_sample = self._reported = -1
+        self._inertial = InertialSensor(
+            InertialConfig(self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience)
+        )
+        self._reported = -1
+        self._stamps: dict[str, int] = {}
         self._before: dict[str, Message] = {}
         self._origin, self._sure = self.origin, False
         self._ignored: Counter[str] = Counter()
@@ -134,13 +141,13 @@ class EkfFusion(Operator):
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
         self._extrinsics = extrinsics
         self._heard |= {stream.partition("/")[2] for stream in measurements}
-        named = {self._name(stream): message for stream, message in measurements.items()}
+        named = {name: m for stream, m in measurements.items() if self._follows(name := self._name(stream), m.stamp)}
         felt = False
         for name, message in named.items():
             settings = self._settings(name)
             if isinstance(message, Imu) and use_of(name, message, settings) == "inertial":
                 felt = self._feel(name, message, settings)
-        around = Surroundings(self._place, self.world_frame, self._origin, landmark_map)
+        around = Surroundings(self._place, self.world_frame, self._origin, landmark_map, self._ignored)
         for name, message in named.items():
             if not (isinstance(message, Imu) and use_of(name, message, self._settings(name)) == "inertial"):
                 self._measure(name, message, around)
@@ -156,11 +163,9 @@ class EkfFusion(Operator):
     def snapshot(self) -> Mapping[str, Any]:
         return {
             "filter": None if self._filter is None else self._filter.snapshot(),
-            "samples": [
-                [s.time, s.gyro, s.accel, s.noise.gyro, s.noise.accel, s.noise.gyro_walk, s.noise.accel_walk]
-                for s in self._samples
-            ],
-            "stamps": [self._first_stamp, self._last_sample, self._reported],
+            "inertial": self._inertial.snapshot(),
+            "reported": self._reported,
+            "stamps": dict(self._stamps),
             "before": {
                 name: [m.stamp, m.frame, m.child_frame, m.position, m.orientation]
                 for name, m in self._before.items()
@@ -181,8 +186,13 @@ class EkfFusion(Operator):
             self._gates[name] = GateConfig(share=self._settings(name).share, agreeing=_NEVER_AGREE)
         if state["filter"] is not None:
             self._filter = LateFilter.restored(self._config(), state["filter"])
-        self._samples = [Sample(int(t), gyro, accel, Noise(*noise)) for t, gyro, accel, *noise in state["samples"]]
-        self._first_stamp, self._last_sample, self._reported = (int(stamp) for stamp in state["stamps"])
+        if "inertial" in state:
+            self._inertial.restore(state["inertial"])
+            self._reported = int(state["reported"])
+            self._stamps = {name: int(stamp) for name, stamp in state["stamps"].items()}
+        else:  # as snapshots were before the sensor kept its own part
+            *stamps, self._reported = (int(stamp) for stamp in state["stamps"])
+            self._inertial.restore({"samples": state["samples"], "stamps": stamps})
         self._before = {
             name: Odometry(stamp=int(stamp), frame=frame, child_frame=child, position=p, orientation=q)
             for name, (stamp, frame, child, p, q) in state["before"].items()
@@ -198,9 +208,24 @@ class EkfFusion(Operator):
                 figures[f"{name}, used after making room"] = health.widened
                 figures[f"{name}, refused"] = health.refused
                 figures[f"{name}, unconfirmed"] = health.unconfirmed
+            for name, (offset, sigma) in self._offsets().items():
+                figures |= {f"{name}, offset (s)": offset, f"{name}, sigma of the offset (s)": sigma}
         ignored = self._ignored + (self._filter.ignored if self._filter is not None else Counter())
         figures |= {f"settings of {name}": f"of no stream{near}" for name, near in self._unheard()}
         return figures | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}
+
+    def _follows(self, name: str, stamp: int) -> bool:
+        """Tells whether a message comes after the sensor's last; one that does not is counted."""
+        if stamp <= self._stamps.get(name, -1):
+            self._ignored[f"{name}: stamp not later than the last"] += 1
+            return False
+        self._stamps[name] = stamp
+        return True
+
+    def _offsets(self) -> dict[str, tuple[float, float]]:
+        """The time offset of each sensor that has it estimated, in all, and its standard deviation, s."""
+        found = {} if self._filter is None else self._filter.offsets()
+        return {name: (self._settings(name).offset + at, sigma) for name, (at, sigma) in found.items()}
 
     def _name(self, stream: str) -> str:
         """The name in `sensors` that a stream's name ends with, else its name without the namespace."""
@@ -232,6 +257,7 @@ class EkfFusion(Operator):
             if inertial
             else Noise(0.0, self.free_acceleration, self.free_turning, 0.0),
             gates=self._gates,
+            clocks=tuple((name, s.offset_sigma) for name, s in sorted(self.sensors.items()) if s.offset_sigma),
         )
 
     def _prior(self) -> Prior:
@@ -250,51 +276,27 @@ class EkfFusion(Operator):
         if self.motion == "constant_velocity":
             self._ignored[f"{name}: motion is constant_velocity"] += 1
             return False
-        if not (np.isfinite(imu.angular_velocity).all() and np.isfinite(imu.linear_acceleration).all()):
-            self._ignored[f"{name}: not finite"] += 1
-            return False
         if self._body not in ("", imu.frame):
             raise ValueError(
                 f"{name}: a second inertial sensor, {imu.frame!r} beside {self._body!r}: only one can move"
             )
+        if settings.offset_sigma:
+            raise ValueError(f"{name}: its clock is the one that offsets are related to: it has no offset_sigma")
+        try:
+            sample = self._inertial.sample(name, imu, imu.stamp - round(settings.offset * 1e9))
+        except Unusable as reason:
+            self._ignored[f"{name}: {reason}"] += 1
+            return False
         self._body = imu.frame
-        time = imu.stamp - round(settings.offset * 1e9)
-        sample = Sample(time, imu.angular_velocity, imu.linear_acceleration, self._noise(name, imu, time))
-        self._last_sample = time
         if self._filter is not None:
             self._filter.feel(sample)
             return True
-        if self._first_stamp < 0:
-            self._first_stamp = time
-        self._samples = [s for s in self._samples if time - s.time <= self.rest * 1e9] + [sample]
-        waited = (time - self._first_stamp) * 1e-9
-        if waited < self.rest or len(self._samples) < 3:
+        begun = self._inertial.begun(sample, self._prior(), self.gravity, self._place(self.base_frame))
+        if begun is None:
             return False
-        prior = self._prior()
-        resting = rests(self._samples, prior)
-        if resting or waited >= self.patience:
-            place = self._place(self.base_frame)
-            node = first_node(self._samples, prior, self.gravity, at_rest=resting, T_body_base=place)
-            self._filter = LateFilter(self._config(), node)
-            self._ignored["begun in motion"] += int(not resting)
-            self._samples = []
-        return self._filter is not None
-
-    def _noise(self, name: str, imu: Imu, time: int) -> Noise:
-        """Densities of the parameters, else of the sample's covariance and the time since the last."""
-        period = min((time - self._last_sample) * 1e-9, 0.1) if self._last_sample >= 0 else 0.01
-        found = []
-        for given, covariance, word in (
-            (self.gyro_noise, imu.angular_velocity_covariance, "gyro_noise"),
-            (self.accel_noise, imu.linear_acceleration_covariance, "accel_noise"),
-        ):
-            if given is None and covariance is None:
-                raise ValueError(f"{name}: its samples have no covariance, so {word} must say how good they are")
-            found.append(given if covariance is None or given is not None else math.sqrt(covariance[0, 0] * period))
-        gyro, accel = found
-        assert gyro is not None
-        assert accel is not None
-        return Noise(gyro, accel, self.gyro_walk, self.accel_walk)
+        self._filter = LateFilter(self._config(), begun[0])
+        self._ignored["begun in motion"] += int(not begun[1])
+        return True
 
     def _measure(self, name: str, message: Message, around: Surroundings) -> None:
         if self._filter is None and self.motion == "constant_velocity":
@@ -311,11 +313,18 @@ class EkfFusion(Operator):
         if settings.use == "control":
             self._command(name, message, settings, around)
             return
+        clock, assumed = self._clock(name)
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
-                self._filter.measure(Measurement(time, sensor, model, noise))
+                self._filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
         except Unusable as reason:
             self._ignored[f"{name}: {reason}"] += 1
+
+    def _clock(self, name: str) -> tuple[int, int]:
+        """Which clock of the filter is a sensor's, -1 for none, and the offset (ns) that it is believed to have."""
+        assert self._filter is not None
+        offsets = self._filter.offsets()
+        return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)
 
     def _command(self, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> None:
         assert self._filter is not None
@@ -345,7 +354,7 @@ class EkfFusion(Operator):
         self._reported = stamp
         ignored = self._ignored + self._filter.ignored
         unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
-        return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, unused)
+        return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)
 
     def _unheard(self) -> list[tuple[str, str]]:
         return list(unheard(tuple(self.sensors), sorted(self._heard)).items())

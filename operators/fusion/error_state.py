@@ -1,13 +1,14 @@
 """The error-state Kalman filter of an inertial body: its state, its motion, and the update by an innovation.
 
-The error is (15,): position and velocity in the world's axes, rotation as a right perturbation R <- R exp(θ), gyroscope
-bias, accelerometer bias. Solà, "Quaternion kinematics for the error-state Kalman filter", 2017.
+The error is (15 + K,): position and velocity in the world's axes, rotation as a right perturbation R <- R exp(θ),
+gyroscope bias, accelerometer bias, and the errors of K sensors' time offsets. Solà, "Quaternion kinematics for the
+error-state Kalman filter", 2017; Li and Mourikis, "Online temporal calibration for camera-IMU systems", 2014.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,17 @@ Array = NDArray[np.float64]
 POSITION, VELOCITY, ROTATION, GYRO_BIAS, ACCEL_BIAS = (slice(3 * k, 3 * k + 3) for k in range(5))
 SIZE = 15
 _I3, _I15 = np.eye(3), np.eye(SIZE)
+_CLOCK_WALK = 1e-4
+"""Random walk of a sensor's time offset, s/√s."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """An estimate: position (3,) and velocity (3,) in the world, R_world_body (3, 3), biases (3,), covariance (15, 15).
+    """An estimate: position (3,) and velocity (3,) in the world, R_world_body (3, 3), biases (3,), covariance.
 
-    A body without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose sensor reads 0.
+    `offsets` (K,): seconds by which measurements of sensors are older than they are taken for; `covariance` is
+    (15 + K, 15 + K). A body without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose
+    sensor reads 0.
     """
 
     position: Array
@@ -34,6 +39,7 @@ class State:
     gyro_bias: Array
     accel_bias: Array
     covariance: Array
+    offsets: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -92,14 +98,15 @@ def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: N
     F[VELOCITY, GYRO_BIAS] = lever * (0.5 * dt * dt)
     F[ROTATION, ROTATION] = step.T
     F[ROTATION, GYRO_BIAS] = middle.T * -dt
-    P = F @ state.covariance @ F.T
+    P = _carried(F, state.covariance)
     a, g = noise.accel**2, noise.gyro**2
-    d = P.reshape(-1)[:: SIZE + 1]  # the diagonal, as a view
+    d = P.reshape(-1)[:: len(P) + 1]  # the diagonal, as a view
     d[POSITION] += a * dt**3 / 3
     d[VELOCITY] += a * dt
     d[ROTATION] += g * dt
     d[GYRO_BIAS] += noise.gyro_walk**2 * dt
     d[ACCEL_BIAS] += noise.accel_walk**2 * dt
+    d[SIZE:] += _CLOCK_WALK**2 * dt
     index = np.arange(3)
     P[index, index + 3] += a * dt * dt / 2
     P[index + 3, index] += a * dt * dt / 2
@@ -110,11 +117,31 @@ def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: N
         gyro_bias=state.gyro_bias,
         accel_bias=state.accel_bias,
         covariance=P,
+        offsets=state.offsets,
+    )
+
+
+def _carried(F: Array, covariance: Array) -> Array:
+    """The covariance after a motion F (15, 15) that leaves time offsets as they are."""
+    if len(covariance) == SIZE:
+        return np.asarray(F @ covariance @ F.T)
+    G = np.eye(len(covariance))
+    G[:SIZE, :SIZE] = F
+    return np.asarray(G @ covariance @ G.T)
+
+
+def shifted(state: State, rate: Array, acceleration: Array, seconds: float) -> State:
+    """Moves pose and velocity by a moment, forth or back: `rate` (3,) in the body, `acceleration` (3,) in the world."""
+    return replace(
+        state,
+        position=state.position + state.velocity * seconds,
+        velocity=state.velocity + acceleration * seconds,
+        rotation=state.rotation @ exp_rotation(rate * seconds),
     )
 
 
 def moved(state: State, error: Array) -> State:
-    """Adds an error (15,) to the state; the covariance stays."""
+    """Adds an error (15 + K,) to the state; the covariance stays."""
     return State(
         position=state.position + error[POSITION],
         velocity=state.velocity + error[VELOCITY],
@@ -122,11 +149,12 @@ def moved(state: State, error: Array) -> State:
         gyro_bias=state.gyro_bias + error[GYRO_BIAS],
         accel_bias=state.accel_bias + error[ACCEL_BIAS],
         covariance=state.covariance,
+        offsets=state.offsets + error[SIZE:],
     )
 
 
 def difference(state: State, other: State) -> Array:
-    """Returns the error (15,) that brings `state` to `other`."""
+    """Returns the error (15 + K,) that brings `state` to `other`."""
     return np.concatenate(
         [
             other.position - state.position,
@@ -134,19 +162,20 @@ def difference(state: State, other: State) -> Array:
             log_rotation(state.rotation.T @ other.rotation),
             other.gyro_bias - state.gyro_bias,
             other.accel_bias - state.accel_bias,
+            other.offsets - state.offsets,
         ]
     )
 
 
 def updated(state: State, residual: Array, H: Array, R: Array) -> State:
-    """Corrects the state by a residual (M,) with Jacobian (M, 15) and covariance (M, M); Joseph's form."""
+    """Corrects the state by a residual (M,) with Jacobian (M, 15 + K) and covariance (M, M); Joseph's form."""
     P = state.covariance
     PH = P @ H.T
     K = np.linalg.solve(H @ PH + R, PH.T).T
     error = K @ residual
-    A = _I15 - K @ H
+    A = np.eye(len(P)) - K @ H
     P = A @ P @ A.T + K @ R @ K.T
-    reset = _I15.copy()  # the error is from now on one of the corrected rotation
+    reset = np.eye(len(P))  # the error is from now on one of the corrected rotation
     reset[ROTATION, ROTATION] -= 0.5 * skew(error[ROTATION])
     P = reset @ P @ reset.T
     return replace(moved(state, error), covariance=0.5 * (P + P.T))

@@ -50,7 +50,10 @@ class Doubt:
 
 @dataclass(frozen=True, eq=False)
 class Health:
-    """Counts of a sensor's measurements by their fate."""
+    """Counts of a sensor's measurements by their fate.
+
+    `nis`: normalised innovation squared over its degrees of freedom, lately; `nis_sum`, `freedom`: of all used.
+    """
 
     used: int = 0
     widened: int = 0
@@ -59,13 +62,19 @@ class Health:
     last_used: int | None = None
     nis: float = 1.0
     doubts: tuple[Doubt, ...] = ()
+    nis_sum: float = 0.0
+    freedom: int = 0
 
-    def after(self, verdict: Verdict, time: int, ratio: float, doubt: Doubt, config: GateConfig) -> Health:
-        """Returns the health after a verdict; `ratio` is NIS over degrees of freedom."""
+    def after(self, verdict: Verdict, time: int, nis: float, doubt: Doubt, config: GateConfig) -> Health:
+        """Returns the health after a verdict on a measurement with a normalised innovation squared."""
+        freedom = len(doubt.residual)
         counted = replace(self, **{verdict: getattr(self, verdict) + 1})
         if verdict in ("used", "widened"):
-            smooth = counted.nis if verdict == "widened" else 0.98 * counted.nis + 0.02 * ratio
-            return replace(counted, last_used=time, doubts=(), nis=smooth)
+            counted = replace(counted, last_used=time, doubts=())
+            if verdict == "widened":
+                return counted
+            smooth = 0.98 * counted.nis + 0.02 * nis / freedom
+            return replace(counted, nis=smooth, nis_sum=self.nis_sum + nis, freedom=self.freedom + freedom)
         kept = [d for d in self.doubts if time - d.time <= config.memory * 1e9][-16:]
         return replace(counted, doubts=(*kept, doubt))
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,15 +18,16 @@ from numpy.typing import NDArray
 
 from operators.fusion.control import Command
 from operators.fusion.error_state import (
-    ROTATION,
+    SIZE,
     Noise,
     State,
-    difference,
     mahalanobis,
     propagated,
+    shifted,
     updated,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge
+from operators.fusion.hypotheses import combined, reduced, with_clocks
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.nodes import (
     Entry,
@@ -41,6 +42,8 @@ from operators.fusion.nodes import (
 )
 
 Array = NDArray[np.float64]
+_MOMENT = 1e-3
+"""Seconds over which the change of a prediction is taken."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +53,8 @@ class FilterConfig:
     `window`: seconds for which late measurements are taken; `gravity` in m/s²; `max_gap`: seconds without an inertial
     sample after which the motion in between is unknown, with the noise `unknown`; `inertial`: there are samples at all.
     Without them velocity and angular velocity stay but for the noise `unknown`. `gates`: those of single sensors, by
-    the first word of their name.
+    the first word of their name. `clocks`: sensors whose time offset is estimated, and its standard deviation at first,
+    seconds.
     """
 
     window: float = 1.0
@@ -60,6 +64,7 @@ class FilterConfig:
     unknown: Noise = field(default_factory=lambda: Noise(0.0, 1.0, 1.0, 0.0))
     gate: GateConfig = field(default_factory=GateConfig)
     gates: Mapping[str, GateConfig] = field(default_factory=dict)
+    clocks: tuple[tuple[str, float], ...] = ()
 
 
 class LateFilter:
@@ -68,7 +73,7 @@ class LateFilter:
     def __init__(self, config: FilterConfig, start: Node) -> None:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
-        self._nodes = [start]
+        self._nodes = [with_clocks(start, [sigma for _, sigma in config.clocks])]
         self._entries: list[Entry] = []
         self._keys: list[tuple[int, int, str, int]] = []
         self._sample_times: list[int] = []
@@ -116,6 +121,15 @@ class LateFilter:
         self._insert(command, (command.time, 2, "", self._count))
         return True
 
+    def offsets(self) -> dict[str, tuple[float, float]]:
+        """Returns the estimated time offset of each sensor that has a clock, and its standard deviation, seconds."""
+        if not self._config.clocks:
+            return {}
+        state = combined(self._nodes[-1].hypotheses)
+        sigmas = np.sqrt(np.diag(state.covariance)[SIZE:]).tolist()
+        names = [name for name, _ in self._config.clocks]
+        return {name: (float(at), sigma) for name, at, sigma in zip(names, state.offsets, sigmas, strict=True)}
+
     def estimate(self, time: int) -> tuple[State, Array]:
         """Returns the state at a time, not before the newest entry, and the gyroscope's reading."""
         node = self._nodes[-1]
@@ -130,7 +144,7 @@ class LateFilter:
             "base": plain_node(self._nodes[0]),
             "samples": [plain_sample(s) for s in self._samples[first:]],
             "measurements": [
-                [e.time, e.sensor, to_plain(e.model), e.noise, key[3]]
+                [e.time, e.sensor, to_plain(e.model), e.noise, key[3], e.clock, e.assumed]
                 for e, key in zip(self._entries, self._keys, strict=True)
                 if isinstance(e, Measurement)
             ],
@@ -149,8 +163,9 @@ class LateFilter:
         made = cls(config, node_of(state["base"]))
         rows = [(sample_of(s), 0, "", 0) for s in state["samples"]]
         entries: list[tuple[Entry, int, str, int]] = list(rows)
-        for time, sensor, model, noise, number in state["measurements"]:
-            entries.append((Measurement(int(time), sensor, from_plain(model), noise), 1, sensor, int(number)))
+        for time, sensor, model, noise, number, *clock in state["measurements"]:
+            measurement = Measurement(int(time), sensor, from_plain(model), noise, *clock)
+            entries.append((measurement, 1, sensor, int(number)))
         for time, linear, angular, lag, number in state.get("commands", ()):
             entries.append((Command(int(time), linear, angular, float(lag)), 2, "", int(number)))
         entries.sort(key=lambda row: (row[0].time, *row[1:]))
@@ -241,22 +256,23 @@ class LateFilter:
     def _measured(self, node: Node, entry: Measurement) -> Node:
         config = self._config.gates.get(entry.sensor.partition(" ")[0], self._config.gate)
         health = node.health.get(entry.sensor, Health())
-        found = [entry.model.innovation(h.state, node.gyro) for h in node.hypotheses]
+        found = [self._innovation(entry, h.state, node) for h in node.hypotheses]
         scores = [mahalanobis(h.state, r, H, entry.noise) for h, (r, H) in zip(node.hypotheses, found, strict=True)]
         best = min(range(len(scores)), key=lambda k: scores[k][0])
         residual, H = found[best]
         doubt = Doubt(entry.time, residual, entry.noise)
         verdict = judge(config, health.doubts, doubt, node.hypotheses[best].state, H, scores[best][0])
-        after = health.after(verdict, entry.time, scores[best][0] / len(residual), doubt, config)
+        after = health.after(verdict, entry.time, scores[best][0], doubt, config)
         hypotheses = node.hypotheses
         if verdict == "widened":
             since = (entry.time - (health.last_used or self._nodes[0].time)) * 1e-9
-            room = np.diag(entry.model.widening(residual, since))
+            room = np.zeros_like(hypotheses[best].state.covariance)
+            room[:SIZE, :SIZE] = np.diag(entry.model.widening(residual, since))
             hypotheses = tuple(
                 replace(h, state=replace(h.state, covariance=h.state.covariance + room)) for h in hypotheses
             )
         if verdict in ("used", "widened"):
-            hypotheses = _reduced(
+            hypotheses = reduced(
                 [
                     Hypothesis(h.weight - 0.5 * (nis + spread), updated(h.state, r, J, entry.noise))
                     for h, (r, J), (nis, spread) in zip(hypotheses, found, scores, strict=True)
@@ -264,35 +280,24 @@ class LateFilter:
             )
         return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
 
+    def _innovation(self, entry: Measurement, state: State, node: Node) -> tuple[Array, Array]:
+        """Residual and Jacobian (M, 15 + K), with the time offset of the sensor as far as it was not taken off."""
+        residual, H = entry.model.innovation(state, node.gyro)
+        if not len(state.offsets):
+            return residual, H
+        J = np.zeros((len(residual), len(state.covariance)))
+        J[:, :SIZE] = H
+        if entry.clock >= 0:
+            change = self._change(entry, state, node)
+            residual = residual + change * (state.offsets[entry.clock] - entry.assumed)
+            J[:, SIZE + entry.clock] = -change
+        return residual, J
 
-def combined(hypotheses: Sequence[Hypothesis]) -> State:
-    """Returns the likeliest state, with a covariance that holds the others too."""
-    best = max(hypotheses, key=lambda h: h.weight)
-    if len(hypotheses) == 1:
-        return best.state
-    weights = np.exp([h.weight - best.weight for h in hypotheses])
-    weights /= weights.sum()
-    covariance = np.zeros_like(best.state.covariance)
-    for weight, h in zip(weights, hypotheses, strict=True):
-        apart = difference(best.state, h.state)
-        covariance += weight * (h.state.covariance + np.outer(apart, apart))
-    return replace(best.state, covariance=covariance)
-
-
-def _reduced(hypotheses: list[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Drops hypotheses that have become unlikely, and unites those that have become alike."""
-    if len(hypotheses) == 1:
-        return (replace(hypotheses[0], weight=0.0),)
-    ordered = sorted(hypotheses, key=lambda h: -h.weight)
-    kept: list[Hypothesis] = []
-    for h in ordered:
-        if h.weight < ordered[0].weight - 14.0:  # one in a million
-            continue
-        for k, other in enumerate(kept):
-            apart = difference(other.state, h.state)[ROTATION]
-            if float(apart @ np.linalg.solve(other.state.covariance[ROTATION, ROTATION], apart)) < 1.0:
-                kept[k] = replace(other, weight=float(np.logaddexp(other.weight, h.weight)))
-                break
-        else:
-            kept.append(h)
-    return tuple(replace(h, weight=h.weight - kept[0].weight) for h in kept)
+    def _change(self, entry: Measurement, state: State, node: Node) -> Array:
+        """How fast the prediction of a measurement changes (M,), its unit a second."""
+        acceleration = np.zeros(3)
+        if self._config.inertial:
+            acceleration = state.rotation @ (node.accel - state.accel_bias) + self._down
+        around = [shifted(state, node.gyro - state.gyro_bias, acceleration, s * _MOMENT) for s in (-0.5, 0.5)]
+        before, after = (entry.model.innovation(at, node.gyro)[0] for at in around)
+        return np.asarray((before - after) / _MOMENT)

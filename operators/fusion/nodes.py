@@ -29,12 +29,17 @@ class Sample:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """Holds what a sensor said about a time (ns), with covariance (M, M)."""
+    """Holds what a sensor said about a time (ns), with covariance (M, M).
+
+    `clock`: which of the state's time offsets is the sensor's, -1 for none; `assumed`: seconds taken for it in `time`.
+    """
 
     time: int
     sensor: str
     model: Model
     noise: Array
+    clock: int = -1
+    assumed: float = 0.0
 
 
 Entry = Sample | Measurement | Command
@@ -72,6 +77,7 @@ def plain_node(node: Node) -> dict[str, Any]:
             name: [
                 *(h.used, h.widened, h.refused, h.unconfirmed, h.last_used, h.nis),
                 [[d.time, d.residual, d.noise] for d in h.doubts],
+                *(h.nis_sum, h.freedom),
             ]
             for name, h in node.health.items()
         },
@@ -82,9 +88,9 @@ def node_of(content: Mapping[str, Any]) -> Node:
     """Returns the node that `plain_node` was given."""
     hypotheses = tuple(Hypothesis(float(weight), State(*arrays)) for weight, *arrays in content["hypotheses"])
     health = {}
-    for name, (used, widened, refused, unconfirmed, last, nis, doubts) in content["health"].items():
+    for name, (used, widened, refused, unconfirmed, last, nis, doubts, *sums) in content["health"].items():
         kept = tuple(Doubt(int(time), residual, noise) for time, residual, noise in doubts)
-        health[name] = Health(used, widened, refused, unconfirmed, last, nis, kept)
+        health[name] = Health(used, widened, refused, unconfirmed, last, nis, kept, *sums)
     gyro, accel = content["readings"]
     told = content.get("command")
     command = None if told is None else Command(int(told[0]), told[1], told[2], float(told[3]))

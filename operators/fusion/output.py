@@ -27,7 +27,7 @@ def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame
     twist = np.zeros((6, SIZE))
     twist[:3, VELOCITY], twist[:3, ROTATION] = turn.T @ R.T, turn.T @ skew(own)
     twist[:3, GYRO_BIAS], twist[3:, GYRO_BIAS] = turn.T @ skew(lever), -turn.T
-    P = state.covariance
+    P = state.covariance[:SIZE, :SIZE]
     return Odometry.from_matrix(
         T,
         stamp=stamp,
@@ -45,11 +45,19 @@ def diagnostics(
     health: Mapping[str, Health],
     hypotheses: int,
     ignored: Mapping[str, int],
+    offsets: Mapping[str, tuple[float, float]],
     warnings: Mapping[str, str],
 ) -> Diagnostics:
-    """Returns a status for the filter, one for every sensor, and one for every warning, a text by what it is about."""
+    """Returns a status for the filter, one for every sensor, and one for every warning, a text by what it is about.
+
+    `offsets`: the estimated time offset of a sensor and its standard deviation, s. `nis` is the sum of the normalised
+    innovations squared of all that was used, and `freedom` what it would be on average if the sensor were as good as
+    it says.
+    """
     text = "one hypothesis" if hypotheses == 1 else f"{hypotheses} headings in question"
-    rows = [("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))]
+    rows: list[tuple[str, str, Level, dict[str, int | str]]] = [
+        ("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))
+    ]
     for name, h in sorted(health.items()):
         silent = h.last_used is None or stamp - h.last_used > 2e9
         if h.doubts and silent:
@@ -61,7 +69,10 @@ def diagnostics(
         else:
             level, text = Level.OK, "used"
         counts = {"used": h.used, "made room for": h.widened, "refused": h.refused, "unconfirmed": h.unconfirmed}
-        rows.append((name, text, level, counts))
+        figures: dict[str, int | str] = {**counts, "nis": f"{h.nis_sum:.3f}", "freedom": h.freedom}
+        if (found := offsets.get(name.partition(" ")[0])) is not None:
+            figures |= {"offset, s": f"{found[0]:.4f}", "offset sigma, s": f"{found[1]:.4f}"}
+        rows.append((name, text, level, figures))
     rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items())]
     pairs = [(key, str(value), k) for k, row in enumerate(rows) for key, value in row[3].items()]
     return Diagnostics(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, Imu, Message, Odometry, Pose, Transforms
 from dataflow.messages.geometry import invert, matrix_to_quaternion, quaternion_to_matrix, transform_matrix
 from dataflow.operator import Context, Duration, In, Operator, Out, Param, Sampled
-from operators.fusion.agreement import Agreement
 from operators.fusion.combination import RigidPose, inverted, pose_consistency, pose_misfits, posed
+from operators.fusion.redundant import RedundantSensors
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import skew
 
@@ -44,27 +43,22 @@ class PoseFusion(Operator):
     share: float = Param(0.999, gt=0, lt=1, doc="share of true estimates that do not count as a contradiction")
 
     def setup(self) -> None:
-        self._begin()
-
-    def _begin(self) -> None:
-        self._newest: dict[str, Message] = {}
-        self._agreement = Agreement(self.share)
-        self._ignored: Counter[str] = Counter()
-        self._reported = -1
+        self._sensors: RedundantSensors[Message] = RedundantSensors(self.window, self.share)
 
     def process(
         self, estimates: Mapping[str, Message], context: Context, extrinsics: Transforms | None = None
     ) -> dict[str, Any]:
         """Raises ValueError for poses of another frame, and for estimates without covariance."""
         stamp = context.stamp
-        self._newest |= {name.partition("/")[2]: message for name, message in sorted(estimates.items())}
+        self._sensors.take(estimates)
+        agreement = self._sensors.agreement
         seen: dict[str, RigidPose] = {}
-        for name, message in sorted(self._newest.items()):
-            if stamp - message.stamp <= self.window and (one := self._of(name, message, extrinsics)) is not None:
-                seen[name] = replace(one, information=one.information / self._agreement.noise(name))
+        for name, message in self._sensors.simultaneous(stamp):
+            if (one := self._of(name, message, extrinsics)) is not None:
+                seen[name] = replace(one, information=one.information / agreement.noise(name))
         result: dict[str, Any] = {}
         if seen:
-            kept, growth = self._agreement.judge(list(seen), list(seen.values()), pose_consistency, pose_misfits)
+            kept, growth = agreement.judge(list(seen), list(seen.values()), pose_consistency, pose_misfits)
             mean = posed(kept)
             if float(np.linalg.eigvalsh(mean.information)[0]) > 0:
                 result["pose"] = Pose(
@@ -76,19 +70,15 @@ class PoseFusion(Operator):
                     covariance=inverted(mean.information) * growth,
                 )
             else:
-                self._ignored["position or orientation unknown"] += 1
-        if self._reported < 0 or stamp - self._reported >= 10**9 or self._agreement.doubted:
-            self._reported = stamp
-            result["status"] = self._agreement.status(stamp, self._ignored)
-        return result
+                self._sensors.ignored["position or orientation unknown"] += 1
+        return result | {"status": self._sensors.status(stamp)}
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew."""
-        self._begin()
+        self.setup()
 
     def summary(self) -> Mapping[str, float | int | str]:
-        figures = {f"ignored, {reason}": count for reason, count in sorted(self._ignored.items())}
-        return {"two sensors contradicted each other": self._agreement.split} | figures
+        return self._sensors.summary()
 
     def _of(self, name: str, message: Message, extrinsics: Transforms | None) -> RigidPose | None:
         """The pose in a message; None where there is none, which is counted."""
@@ -114,10 +104,10 @@ class PoseFusion(Operator):
         self, name: str, position: Array, rotation: Array, covariance: Array, known: slice
     ) -> RigidPose | None:
         if not (np.isfinite(position).all() and np.isfinite(rotation).all() and np.isfinite(covariance).all()):
-            self._ignored[f"{name}: not finite"] += 1
+            self._sensors.ignored[f"{name}: not finite"] += 1
             return None
         if float(np.linalg.eigvalsh(covariance)[0]) <= 0:
-            self._ignored[f"{name}: covariance not positive"] += 1
+            self._sensors.ignored[f"{name}: covariance not positive"] += 1
             return None
         information = np.zeros((6, 6))
         information[known, known] = inverted(covariance)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,8 +11,8 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics, LandmarkSightings, Transforms
 from dataflow.messages.geometry import transform_points
 from dataflow.operator import Context, Duration, In, Operator, Out, Param, Sampled
-from operators.fusion.agreement import Agreement
 from operators.fusion.combination import Bearing, Place, Unknown, place_consistency, place_misfits, placed
+from operators.fusion.redundant import RedundantSensors
 from operators.geometry.extrinsics import transform_between
 from operators.localization.reading import cartesian
 
@@ -43,54 +42,41 @@ class PositionFusion(Operator):
     largest: float = Param(2.0, gt=0, doc="places known to no better than this are not given", unit="m")
 
     def setup(self) -> None:
-        self._begin()
-
-    def _begin(self) -> None:
-        self._newest: dict[str, LandmarkSightings] = {}
-        self._agreement = Agreement(self.share)
-        self._ignored: Counter[str] = Counter()
-        self._reported = -1
+        self._sensors: RedundantSensors[LandmarkSightings] = RedundantSensors(self.window, self.share)
 
     def process(
         self, sightings: Mapping[str, LandmarkSightings], context: Context, extrinsics: Transforms | None = None
     ) -> dict[str, Any]:
         """Raises ValueError for sightings without covariances or of a frame without place."""
         stamp = context.stamp
-        self._newest |= {name.partition("/")[2]: message for name, message in sorted(sightings.items())}
+        self._sensors.take(sightings)
         seen: dict[int, dict[str, Place | Bearing]] = {}
-        for name, message in sorted(self._newest.items()):
-            if stamp - message.stamp <= self.window:
-                for identity, one in self._of(name, message, extrinsics):
-                    seen.setdefault(identity, {})[name] = one
+        for name, message in self._sensors.simultaneous(stamp):
+            for identity, one in self._of(name, message, extrinsics):
+                seen.setdefault(identity, {})[name] = one
         found = [(identity, *place) for identity in sorted(seen) if (place := self._place(seen[identity])) is not None]
-        result: dict[str, Any] = {
-            "places": LandmarkSightings(
-                stamp=stamp,
-                frame=self.frame,
-                ids=np.array([identity for identity, _, _ in found], np.int64),
-                positions=np.array([point for _, point, _ in found]).reshape(-1, 3),
-                covariances=np.array([C for _, _, C in found]).reshape(-1, 3, 3),
-            )
-        }
-        if self._reported < 0 or stamp - self._reported >= 10**9 or self._agreement.doubted:
-            self._reported = stamp
-            result["status"] = self._agreement.status(stamp, self._ignored)
-        return result
+        places = LandmarkSightings(
+            stamp=stamp,
+            frame=self.frame,
+            ids=np.array([identity for identity, _, _ in found], np.int64),
+            positions=np.array([point for _, point, _ in found]).reshape(-1, 3),
+            covariances=np.array([C for _, _, C in found]).reshape(-1, 3, 3),
+        )
+        return {"places": places, "status": self._sensors.status(stamp)}
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew."""
-        self._begin()
+        self.setup()
 
     def summary(self) -> Mapping[str, float | int | str]:
-        figures = {f"ignored, {reason}": count for reason, count in sorted(self._ignored.items())}
-        return {"two sensors contradicted each other": self._agreement.split} | figures
+        return self._sensors.summary()
 
     def _place(self, seen: Mapping[str, Place | Bearing]) -> tuple[Array, Array] | None:
-        kept, growth = self._agreement.judge(list(seen), list(seen.values()), place_consistency, place_misfits)
+        kept, growth = self._sensors.agreement.judge(list(seen), list(seen.values()), place_consistency, place_misfits)
         try:
             point, covariance = placed(kept, self.largest)
         except Unknown as reason:
-            self._ignored[str(reason)] += 1
+            self._sensors.ignored[str(reason)] += 1
             return None
         return point, covariance * growth
 
@@ -101,7 +87,7 @@ class PositionFusion(Operator):
         if message.covariances is None:
             raise ValueError(f"{name}: sightings have no covariances: how well a thing was seen must be known")
         T = transform_between(extrinsics, message.frame, self.frame)
-        noise = self._agreement.noise(name)
+        noise = self._sensors.agreement.noise(name)
         if message.ranges is None and message.positions is None:
             made: list[Place | Bearing] = list(_bearings(message, T, noise))
         else:
@@ -111,9 +97,9 @@ class PositionFusion(Operator):
         found = []
         for identity, one in zip(message.ids.tolist(), made, strict=True):
             if identity < 0:
-                self._ignored[f"{name}: no identity"] += 1
+                self._sensors.ignored[f"{name}: no identity"] += 1
             elif not _usable(one):
-                self._ignored[f"{name}: not finite, or covariance not positive"] += 1
+                self._sensors.ignored[f"{name}: not finite, or covariance not positive"] += 1
             else:
                 found.append((identity, one))
         return found

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Literal
 
@@ -62,6 +63,9 @@ class SensorSettings(BaseModel):
 
     use: Use = Field("auto", description="what it measures; by the type of its messages if auto")
     offset: float = Field(0.0, ge=-10, le=10, description="seconds by which a measurement is older than its stamp")
+    offset_sigma: float = Field(
+        0.0, ge=0, le=2, description="seconds by which the offset may be wrong: if above 0, it is estimated"
+    )
     sigma: float | None = Field(
         None, gt=0, description="standard deviation of what has a length (m, m/s); the message's covariance if none"
     )
@@ -107,13 +111,16 @@ class Unusable(Exception):
 
 @dataclass
 class Surroundings:
-    """Holds what measurements are related to: places of sensors on the body, the world's frame, origin and
-    landmarks."""
+    """Holds what measurements are related to: places of sensors on the body, the world's frame, origin and landmarks.
+
+    `ignored` counts what is passed over of a message whose rest serves.
+    """
 
     place: Callable[[str], Array]
     world_frame: str
     origin: tuple[float, float, float] | None = None
     landmarks: LandmarkSightings | None = None
+    ignored: Counter[str] = field(default_factory=Counter)
 
 
 def use_of(name: str, message: Message, settings: SensorSettings) -> str:
@@ -155,10 +162,12 @@ def measurements(
     elif use == "velocity":
         yield from _velocity(time, name, message, before, settings, around)
     elif isinstance(message, MagneticField):
-        field = around.place(message.frame)[:3, :3] @ message.field
-        _check(field)
+        measured = around.place(message.frame)[:3, :3] @ message.field
+        _check(measured)
+        if not measured.any():
+            raise Unusable("no field")
         sigma = settings.angular_sigma or 0.1
-        yield time, name, MagneticHeading(field, settings.azimuth), np.array([[sigma**2]])
+        yield time, name, MagneticHeading(measured, settings.azimuth), np.array([[sigma**2]])
     elif isinstance(message, RadarScan):
         yield from _doppler(time, name, message, settings, around)
     elif isinstance(message, LandmarkSightings):
@@ -210,6 +219,7 @@ def _absolute(
     C[3:, 3:] = angular
     if given is not None and settings.sigma is None and settings.angular_sigma is None:
         C[:3, 3:], C[3:, :3] = given[:3, 3:], given[3:, :3]
+        _positive(C)
     J = np.eye(6)
     J[3:, 3:] = R.T
     if use == "orientation":
@@ -228,6 +238,8 @@ def _twist(message: Message, before: Message | None) -> tuple[int, Array, Array,
     if not isinstance(before, Odometry) or before.frame != message.frame:
         raise Unusable("first of its kind")
     span = message.stamp - before.stamp
+    if not np.isfinite(before.position).all() or not np.isfinite(message.position).all():
+        raise Unusable("not finite")
     step = se3.log(invert(before.matrix()) @ message.matrix()) / (span * 1e-9)
     return span // 2, step[:3], step[3:], None
 
@@ -274,6 +286,8 @@ def _doppler(time: int, name: str, scan: RadarScan, settings: SensorSettings, ar
         if np.isfinite(direction).all() and math.isfinite(velocity):
             model = Velocity(np.array([-velocity]), direction[None], T_body_radar[:3, 3])
             yield time, name, model, np.array([[sigma**2]])
+        else:
+            around.ignored[f"{name}: detection not finite"] += 1
 
 
 def _ranges(
@@ -288,11 +302,16 @@ def _ranges(
     places = dict(zip(around.landmarks.ids.tolist(), around.landmarks.positions, strict=True))
     lever = around.place(sightings.frame)[:3, 3]
     for k, (identity, distance) in enumerate(zip(sightings.ids.tolist(), sightings.ranges.tolist(), strict=True)):
-        if identity not in places or not math.isfinite(distance):
-            continue
         C = None if sightings.covariances is None else sightings.covariances[k, :1, :1]
-        noise = _covariance(name, C, settings.sigma, "sigma")[:1, :1]
-        yield time, name, Range(np.array([distance]), places[identity], lever), noise
+        try:
+            noise = _covariance(name, C, settings.sigma, "sigma")[:1, :1]
+            if identity not in places:
+                raise Unusable("landmark not in the map")
+            _check(np.array([distance]), places[identity])
+        except Unusable as reason:
+            around.ignored[f"{name}: {reason}"] += 1
+        else:
+            yield time, name, Range(np.array([distance]), places[identity], lever), noise
 
 
 def _covariance(name: str, given: Array | None, sigma: float | None, setting: str) -> Array:
@@ -301,9 +320,17 @@ def _covariance(name: str, given: Array | None, sigma: float | None, setting: st
         return np.eye(3) * sigma**2
     if given is None:
         raise ValueError(f"{name}: its messages have no covariance, so its {setting} must say how good it is")
-    if not np.isfinite(given).all() or (np.diag(given) <= 0).any():
+    return _positive(given)
+
+
+def _positive(covariance: Array) -> Array:
+    """The covariance, symmetric. Raises Unusable for what is none."""
+    if not np.isfinite(covariance).all():
+        raise Unusable("covariance not finite")
+    symmetric = np.asarray(0.5 * (covariance + covariance.T))
+    if float(np.linalg.eigvalsh(symmetric)[0]) <= 0:
         raise Unusable("covariance not positive")
-    return given
+    return symmetric
 
 
 def _check(*values: Array) -> None:

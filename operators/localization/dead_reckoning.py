@@ -38,8 +38,12 @@ class DeadReckoning:
 
     def feel(self, stamp: int, rate: float) -> None:
         """Takes a rate about the robot's vertical axis: its time (ns), rad/s."""
-        if math.isfinite(rate):
-            self._rates.append((stamp, rate))
+        self._rates.append((stamp, rate))
+
+    @property
+    def stamp(self) -> int | None:
+        """The time of the last odometry message, ns."""
+        return None if self._last is None else self._last[0]
 
     def step(self, odometry: Odometry) -> tuple[int, Array, Array] | None:
         """Returns the time (ns) of the last message, the step since and its covariance; None at the first."""

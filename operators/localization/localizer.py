@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -52,11 +53,14 @@ class ParticleFilterLocalizer(Operator, merge=True):
     A sensor whose innovations are larger than its noise explains, while another sensor's are not, counts less, and the
     status says so. Beside the fused cloud every modality has a cloud of its own, with the same motion.
 
-    Poses come while the robot is localised: most of the weight lies in one place and observations fit there. Sensors
-    are taken at their own stamps, between the odometry messages around them.
+    Poses come while the robot is localised: most of the weight lies in one place, observations fit there, and nowhere
+    else. A robot that has been found is looked for elsewhere too; while another place explains the observations about
+    as well (a mirrored corridor), it is ambiguous, the status names both, and no pose is given. Sensors are taken at
+    their own stamps, between the odometry messages around them.
 
     Methods: Thrun, Burgard and Fox, "Probabilistic Robotics", 2005, chapter 8 (augmented Monte Carlo localisation);
-    Fox, "Adapting the sample size in particle filters through KLD-sampling", 2003.
+    Fox, "Adapting the sample size in particle filters through KLD-sampling", 2003; Jensfelt and Kristensen, "Active
+    global localization for a mobile robot using multiple hypothesis tracking", 2001.
     """
 
     odometry: In[Odometry] = In(doc="planar motion: increments between messages count, the pose itself does not")
@@ -75,7 +79,9 @@ class ParticleFilterLocalizer(Operator, merge=True):
     lidar_pose: Out[Odometry] = Out(doc="what lidar alone says, while its cloud is in one place")
     landmark_pose: Out[Odometry] = Out(doc="what landmarks and objects alone say")
     position_pose: Out[Odometry] = Out(doc="what positions alone say")
-    status: Out[Diagnostics] = Out(doc="localised, searching or lost, and what each sensor counts; every second")
+    status: Out[Diagnostics] = Out(
+        doc="localised, ambiguous, searching or lost, and what each sensor counts; every second"
+    )
 
     map_frame: str = Param("world", min_length=1, doc="frame of the maps and of the pose")
     base_frame: str = Param("base_link", min_length=1, doc="frame that is posed, on the floor")
@@ -137,10 +143,14 @@ class ParticleFilterLocalizer(Operator, merge=True):
         for name, message in sorted(measurements.items()):
             if isinstance(message, Imu):
                 T = transform_between(extrinsics, message.frame, self.base_frame)
-                self._reckoning.feel(message.stamp, vertical_rate(message, T))
+                rate = vertical_rate(message, T)
+                if math.isfinite(rate):
+                    self._reckoning.feel(message.stamp, rate)
+                else:
+                    self._ignored[f"{name.partition('/')[2]}: not finite"] += 1
             else:
                 self._pending.append((message.stamp, name.partition("/")[2], message))
-        if odometry is None:
+        if odometry is None or not self._moves(odometry):
             return None
         around = Surroundings(
             self.base_frame,
@@ -196,6 +206,16 @@ class ParticleFilterLocalizer(Operator, merge=True):
         if grid.frame != self.map_frame:
             raise ValueError(f"the map is in {grid.frame!r}, but the robot is looked for in {self.map_frame!r}")
         self._grid, self._field = grid, LikelihoodField(grid, self.hit_sigma, self.stray)
+
+    def _moves(self, odometry: Odometry) -> bool:
+        """Tells whether odometry can be used; where not, it is counted, and the next tells of both ways."""
+        if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
+            self._ignored["odometry: not finite"] += 1
+            return False
+        if self._reckoning.stamp is not None and odometry.stamp <= self._reckoning.stamp:
+            self._ignored["odometry: stamp not later than the last"] += 1
+            return False
+        return True
 
     def _advance(self, odometry: Odometry, around: Surroundings) -> None:
         """Moves to an odometry message, with the measurements on the way."""

@@ -18,6 +18,7 @@ from operators.localization.observations import Observation
 from operators.localization.particles import (
     bins_of,
     effective_size,
+    evidence_of,
     mode,
     normalised,
     particles_needed,
@@ -97,13 +98,22 @@ class MonteCarlo:
         """Moves by a step (3,) in the robot's frame, with noise."""
         self.poses = moved(self.poses, step, covariance, rng)
 
+    def replace(self, poses: Array) -> None:
+        """Takes poses (N, 3) in the place of the cloud."""
+        self.poses, self.logarithms = poses, np.zeros(len(poses))
+
     def weigh(
         self, sensor: str, observation: Observation, rng: np.random.Generator, says: Mapping[str, float] | None = None
-    ) -> None:
-        """Takes an observation. `says`: how much each sensor counts, (0, 1]; 1 for those that it does not name."""
+    ) -> float:
+        """Takes an observation; returns the logarithm of its likelihood in the cloud.
+
+        `says`: how much each sensor counts, (0, 1]; 1 for those that it does not name.
+        """
         says = says or {}
         logarithms, fits = observation.score(self.poses)
-        self.logarithms += logarithms * says.get(sensor, 1.0)
+        logarithms = logarithms * says.get(sensor, 1.0)
+        evidence = evidence_of(self.weights, logarithms)
+        self.logarithms += logarithms
         weights = self.weights
         before = self.fits.get(sensor, Fit(self.config.expected, self.config.expected))
         self.fits[sensor] = before.after(float(weights @ fits))
@@ -117,6 +127,7 @@ class MonteCarlo:
             self._draw(weights, rng, observation, _EXPLORED)
         elif effective_size(weights) < self.config.worn * len(weights):
             self._draw(weights, rng)
+        return evidence
 
     def doubt(self, says: Mapping[str, float]) -> float:
         """Returns how much worse than usual sensors fit of late, by what they count, [0, 1]."""
@@ -137,7 +148,7 @@ class MonteCarlo:
         if observation is not None and fresh:
             self.injected += fresh
             poses = np.vstack([poses, observation.propose(fresh, rng)])
-        self.poses, self.logarithms = poses, np.zeros(len(poses))
+        self.replace(poses)
 
     def snapshot(self) -> dict[str, Any]:
         return {

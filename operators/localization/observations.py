@@ -32,6 +32,11 @@ class Observation(Protocol):
         """Draws poses (count, 3) that would explain the observation."""
         ...
 
+    @property
+    def whole(self) -> bool:
+        """Tells whether it can place the robot with its heading, alone."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Scan:
@@ -45,6 +50,7 @@ class Scan:
     points: Array
     worth: float = 15.0
     search: int = 3000
+    whole = True
 
     def score(self, poses: Array) -> tuple[Array, Array]:
         mean = self.field.score(poses, self.points)
@@ -83,6 +89,10 @@ class Sightings:
     covariances: Array
     places: tuple[Array, ...]
     stray: float = 0.05
+
+    @property
+    def whole(self) -> bool:
+        return len(self.seen) > 1
 
     def score(self, poses: Array) -> tuple[Array, Array]:
         total, fits = np.zeros(len(poses)), np.zeros(len(poses))
@@ -149,6 +159,10 @@ class Placed:
     lever: Array
     heading: tuple[float, float] | None = None
     stray: float = 0.05
+
+    @property
+    def whole(self) -> bool:
+        return self.heading is not None
 
     def _off(self, poses: Array, spread: Array, turning: float) -> Array:
         c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])

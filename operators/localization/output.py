@@ -19,20 +19,30 @@ if TYPE_CHECKING:
     from operators.localization.vote import Vote
 
 Array = NDArray[np.float64]
-Word = Literal["waiting", "searching", "localised", "lost"]
-_LEVELS = {"localised": Level.OK, "searching": Level.WARN, "waiting": Level.WARN, "lost": Level.ERROR}
+Word = Literal["waiting", "searching", "ambiguous", "localised", "lost"]
+_LEVELS = {
+    "localised": Level.OK,
+    "ambiguous": Level.WARN,
+    "searching": Level.WARN,
+    "waiting": Level.WARN,
+    "lost": Level.ERROR,
+}
 _APART = 16.27
 """Chi-square with 3 degrees of freedom, 99.9 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """A pose (3,) with covariance (3, 3), the share of the weight that it has, and whether it is to be believed."""
+    """A pose (3,) with covariance (3, 3), the share of the weight that it has, and whether it is to be believed.
+
+    `other`: another place (3,) that explains what was observed about as well.
+    """
 
     word: Word
     mean: Array
     covariance: Array
     share: float
+    other: Array | None = None
 
 
 def planar(pose: Array) -> Array:
@@ -55,13 +65,22 @@ def apart(first: Estimate, second: Estimate) -> bool:
     return float(off @ np.linalg.solve(spread, off)) > _APART
 
 
+def written(pose: Array) -> str:
+    """Returns a pose (3,) as text."""
+    x, y, yaw = pose
+    return f"{x:.3f} {y:.3f} {yaw:.3f}"
+
+
 def status_of(
     stamp: int, fused: Estimate, filter: Vote, modalities: Mapping[str, Vote], ignored: Mapping[str, int]
 ) -> Diagnostics:
     """Returns a status for the filter, one for every sensor, and one for every modality beside the fused estimate."""
     figures = {**filter.figures(), "share in one place": f"{fused.share:.2f}", "injected": str(filter.injected)}
+    if fused.other is not None:
+        figures |= {"other place": written(fused.other), "likelier than the other": f"{filter.rival.lead:.1f} nats"}
     figures |= {f"ignored, {reason}": str(count) for reason, count in sorted(ignored.items())}
-    rows: list[tuple[str, str, Level, dict[str, str]]] = [("filter", fused.word, _LEVELS[fused.word], figures)]
+    said = "ambiguous: another place explains as much" if fused.other is not None else fused.word
+    rows: list[tuple[str, str, Level, dict[str, str]]] = [("filter", said, _LEVELS[fused.word], figures)]
     counts = filter.says.counts(stamp)
     for sensor, fit in sorted(filter.fits().items()):
         ratio, count = filter.says.ratio(sensor), counts.get(sensor, 1.0)
@@ -77,10 +96,8 @@ def status_of(
             own = vote.estimate()
             off = apart(own, fused)
             text = "contradicts the fused estimate" if off else own.word
-            x, y, yaw = own.mean
-            rows.append(
-                (f"{name} alone", text, Level.WARN if off else Level.OK, {"pose": f"{x:.3f} {y:.3f} {yaw:.3f}"})
-            )
+            places = {"pose": written(own.mean)} | ({} if own.other is None else {"other place": written(own.other)})
+            rows.append((f"{name} alone", text, Level.WARN if off else Level.OK, places))
     pairs = [(key, value, k) for k, row in enumerate(rows) for key, value in row[3].items()]
     return Diagnostics(
         stamp=stamp,

@@ -20,6 +20,12 @@ def normalised(logarithms: Array) -> Array:
     return np.asarray(weights / weights.sum())
 
 
+def evidence_of(weights: Array, logarithms: Array) -> float:
+    """Returns the logarithm of the mean of likelihoods (N,), given as logarithms, by weights (N,) that sum to 1."""
+    top = float(logarithms.max())
+    return top + math.log(max(float(weights @ np.exp(logarithms - top)), 1e-300)) if math.isfinite(top) else top
+
+
 def effective_size(weights: Array) -> float:
     """Returns the number of equally weighted samples that would be worth as much (Kong et al., 1994)."""
     return float(1.0 / np.square(weights).sum())

@@ -184,7 +184,7 @@ def _placed(name: str, message: Pose | Odometry, around: Surroundings) -> Placed
         raise Unusable("not finite")
     T = transform_between(around.extrinsics, message.child_frame or around.base_frame, around.base_frame)
     heading = None
-    if math.isfinite(given[5, 5]) and given[5, 5] < 1.0:
+    if 0.0 < given[5, 5] < 1.0:  # else, NaN too, the heading is unknown
         turn = math.atan2(T[1, 0], T[0, 0])
         heading = (float(yaw_of(message.orientation)) - turn, float(given[5, 5]))
     return _place(message.position[:2], given[:2, :2], T, heading)

@@ -11,11 +11,14 @@ from numpy.typing import NDArray
 from operators.localization.monte_carlo import CloudConfig, MonteCarlo
 from operators.localization.observations import Observation
 from operators.localization.output import Estimate
+from operators.localization.rival import Rival
 from operators.localization.says import Says
 
 Array = NDArray[np.float64]
 _WIDE, _TURNED, _MOST = 0.3, 0.15, 0.6
 """Localised: spread in m and rad below the first two, and more than the last of the weight in one place."""
+_LOST = 0.25
+"""Doubt above which the robot is lost."""
 
 
 class Vote:
@@ -25,6 +28,7 @@ class Vote:
         self._config = config
         self._cloud: MonteCarlo | None = None
         self.says = Says()
+        self.rival = Rival()
         self.stamp = -1
 
     @property
@@ -39,10 +43,12 @@ class Vote:
         """Begins about a pose (3,); `sigma` in m and rad."""
         spread = np.array([sigma[0], sigma[0], sigma[1]])
         self._cloud = MonteCarlo(self._config, pose + spread * rng.standard_normal((self._config.most, 3)))
+        self.rival.settle()
 
     def move(self, step: Array, covariance: Array, rng: np.random.Generator) -> None:
         if self._cloud is not None:
             self._cloud.move(step, covariance, rng)
+            self.rival.move(step, covariance, rng)
 
     def hear(self, sensor: str, stamp: int, observation: Observation, rng: np.random.Generator) -> None:
         """Takes an observation (its time in ns); one that says too little to begin with is passed over."""
@@ -54,7 +60,13 @@ class Vote:
         says = self.says.counts(stamp)
         if share > _MOST / 2:
             says[sensor] = self.says.hear(sensor, stamp, observation.misfit(mean, covariance))
-        self._cloud.weigh(sensor, observation, rng, says)
+        evidence = self._cloud.weigh(sensor, observation, rng, says)
+        if self._cloud.doubt(says) > _LOST:
+            self.rival.forget()
+        elif self._narrow(covariance):
+            better = self.rival.hear(mean, evidence, observation, says.get(sensor, 1.0), rng)
+            if better is not None:
+                self._cloud.replace(better)
 
     def estimate(self) -> Estimate:
         """Returns where the robot is, and whether that is to be believed."""
@@ -62,10 +74,17 @@ class Vote:
             return Estimate("waiting", np.zeros(3), np.eye(3) * 1e6, 0.0)
         mean, covariance, share = self._cloud.estimate()
         doubt = self._cloud.doubt(self.says.counts(self.stamp))
-        narrow = float(np.trace(covariance[:2, :2])) < _WIDE**2 and covariance[2, 2] < _TURNED**2
-        if doubt > 0.25:
+        if doubt > _LOST:
             return Estimate("lost", mean, covariance, share)
-        return Estimate("localised" if narrow and share > _MOST else "searching", mean, covariance, share)
+        other = self.rival.mean
+        if self._narrow(covariance) and other is not None:
+            return Estimate("ambiguous", mean, covariance, share, other)
+        found = self._narrow(covariance) and share > _MOST and self.rival.decided
+        return Estimate("localised" if found else "searching", mean, covariance, share)
+
+    @staticmethod
+    def _narrow(covariance: Array) -> bool:
+        return bool(np.trace(covariance[:2, :2]) < _WIDE**2 and covariance[2, 2] < _TURNED**2)
 
     def cloud(self) -> tuple[Array, Array]:
         """Returns poses (N, 3) and weights (N,)."""
@@ -84,9 +103,10 @@ class Vote:
 
     def snapshot(self) -> dict[str, Any]:
         cloud = None if self._cloud is None else self._cloud.snapshot()
-        return {"cloud": cloud, "says": self.says.snapshot(), "stamp": self.stamp}
+        return {"cloud": cloud, "says": self.says.snapshot(), "rival": self.rival.snapshot(), "stamp": self.stamp}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._cloud = None if state["cloud"] is None else MonteCarlo.restored(self._config, state["cloud"])
         self.says.restore(state["says"])
+        self.rival.restore(state.get("rival", {}))
         self.stamp = int(state["stamp"])

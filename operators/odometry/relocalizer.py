@@ -31,7 +31,7 @@ def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewes
         pairs = match(keyframe.description, seen)
         if len(pairs) < fewest:
             continue
-        points, known = _rough_points(keyframe, pairs[:, 0], camera)
+        points, known = rough_points(keyframe, pairs[:, 0], camera)
         if np.count_nonzero(known) >= fewest:
             points_world = transform_points(keyframe.T_world_camera, points[known])
             found.append(Recall(keyframe, points_world, seen.pixels[pairs[known, 1]]))
@@ -45,9 +45,7 @@ def candidates(near: Sequence[Keyframe], others: Sequence[Keyframe], count: int,
     return [*near, *(rest[(turn * take + i) % len(rest)] for i in range(take))]
 
 
-def _rough_points(
-    keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera
-) -> tuple[Points, NDArray[np.bool_]]:
+def rough_points(keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
     """Returns points (N, 3) of described pixels, and which are known: many lie on edges, where either depth may do."""
     surface = keyframe.surface
     inverse, (h, w) = surface.inverse_depth, surface.inverse_depth.shape

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.relations import Body, Relation
+from operators.scene.bodies import Body
+from operators.scene.relations import Relation
 
 Array = NDArray[np.float64]
 

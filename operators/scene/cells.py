@@ -37,6 +37,8 @@ class Cells:
         self.free: Array = np.zeros(0)
         self.other: Array = np.zeros(0)
         self._tree: cKDTree | None = None
+        self._bounds: tuple[Array, Array] | None = None
+        self._middle: Array | None = None
 
     @classmethod
     def of(cls, points: Array, side: float) -> Cells:
@@ -63,7 +65,7 @@ class Cells:
         # a voxel that is seen again was not free after all
         self.free = np.asarray(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)).clip(min=0))
         self.other = np.asarray(np.bincount(of, np.concatenate([self.other, other.other]), len(keys)))
-        self._keys, self._tree = keys, None
+        self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
 
     def carve(self, free: NDArray[np.bool_]) -> None:
         """Counts the voxels that a view saw through, and drops those that were seen through too often."""
@@ -72,13 +74,14 @@ class Cells:
         if gone.any():
             self._keys, self.points = self._keys[~gone], self.points[~gone]
             self.hits, self.free, self.other = self.hits[~gone], self.free[~gone], self.other[~gone]
-            self._tree = None
+            self._tree = self._bounds = self._middle = None
 
-    def doubt(self, confirmed: NDArray[np.bool_], points: Array) -> None:
-        """Counts the confirmed voxels that are not near the points (N, 3) which the object showed in the same view."""
-        if len(points) and confirmed.any():
-            apart, _ = cKDTree(points).query(self.points, distance_upper_bound=1.5 * self.side)
-            self.other = self.other + (confirmed & ~np.isfinite(apart))
+    def doubt(self, confirmed: NDArray[np.bool_], shown: Cells, weight: int) -> None:
+        """Counts the confirmed voxels that are not near those which the object showed in the same view, as `weight`."""
+        rows = np.flatnonzero(confirmed)
+        if len(shown) and len(rows):
+            apart, _ = shown.tree().query(self.points[rows], distance_upper_bound=1.5 * self.side)
+            self.other[rows[~np.isfinite(apart)]] += weight
 
     def sure(self) -> Array:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""
@@ -91,24 +94,42 @@ class Cells:
     @property
     def middle(self) -> Array:
         """Mean (3,) of the voxels."""
-        return np.asarray(self.points.mean(axis=0))
+        if self._middle is None:
+            self._middle = np.asarray(self.points.sum(axis=0) / max(len(self.points), 1))
+        return self._middle
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Least and greatest coordinates (3,) of the voxels."""
+        if self._bounds is None:
+            self._bounds = self.points.min(axis=0), self.points.max(axis=0)
+        return self._bounds
+
+    @property
+    def extent(self) -> Array:
+        """Size (3,) of the bounds."""
+        low, high = self.bounds
+        return high - low
+
+    def tree(self) -> cKDTree:
+        """Returns the voxels' means for questions of what is near."""
+        if self._tree is None:
+            self._tree = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+        return self._tree
 
     def near(self, points: Array, distance: float) -> float:
         """Returns the share of points (N, 3), of 100 of many, that lie within a distance of a voxel's mean."""
         if not len(self) or not len(points):
             return 0.0
-        if self._tree is None:
-            self._tree = cKDTree(self.points)
-        apart, _ = self._tree.query(points[:: -(-len(points) // 100)], distance_upper_bound=distance)
+        apart, _ = self.tree().query(points[:: -(-len(points) // 100)], distance_upper_bound=distance)
         return float(np.isfinite(apart).mean())
 
     def touches(self, other: Cells, distance: float) -> bool:
         """Tells whether the axis-parallel bounds of two sets come so near."""
         if not len(self) or not len(other):
             return False
-        low = np.maximum(self.points.min(axis=0), other.points.min(axis=0))
-        high = np.minimum(self.points.max(axis=0), other.points.max(axis=0))
-        return bool((low - high <= distance).all())
+        low = np.maximum(self.bounds[0], other.bounds[0])
+        return bool((low - np.minimum(self.bounds[1], other.bounds[1]) <= distance).all())
 
     def snapshot(self) -> dict[str, Any]:
         return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free, "other": self.other}
@@ -118,7 +139,7 @@ class Cells:
         self.points = np.array(state["points"], np.float64).reshape(-1, 3)
         self.hits, self.free = np.array(state["hits"], np.float64), np.array(state["free"], np.float64)
         self.other = np.array(state["other"], np.float64)
-        self._tree = None
+        self._tree = self._bounds = self._middle = None
 
 
 def standing_box(points: Array) -> tuple[Array, Array, float]:
@@ -127,24 +148,3 @@ def standing_box(points: Array) -> tuple[Array, Array, float]:
     low, high = float(points[:, 2].min()), float(points[:, 2].max())
     center = np.array([x + points[0, 0], y + points[0, 1], (low + high) / 2])
     return center, np.array([width, depth, high - low]), float(np.radians(angle))
-
-
-def completed(box: tuple[Array, Array, float], view: Array, usual: tuple[float, float]) -> tuple[Array, Array, float]:
-    """Returns a box that is as deep as usual where only its near side was seen.
-
-    `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. `usual` are the
-    shorter and longer side of such objects: the side across the view tells which of the two lies along it. The box
-    grows away from the viewer, less where views differ. No side is much shorter than is usual.
-    """
-    center, size, yaw = box[0].copy(), box[1].copy(), box[2]
-    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    along = axes @ view
-    deep = int(np.argmax(np.abs(along)))
-    short, long = usual
-    across = float(size[1 - deep])
-    size[1 - deep] = max(across, 0.8 * short)  # narrower things are seen in part
-    target = long if across < np.sqrt(short * long) else short
-    lack = max(0.0, target - float(size[deep])) * min(1.0, abs(float(along[deep])) * 1.2)
-    size[deep] += lack
-    center[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
-    return center, size, yaw

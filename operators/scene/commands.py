@@ -14,6 +14,7 @@ from rich.table import Table
 from dataflow.messages import SceneGraph
 from dataflow.recording import Recording, RecordingError
 from operators.scene.query import QueryError, as_json, ask
+from operators.scene.spark import as_spark_dsg
 
 scene = typer.Typer(name="scene", add_completion=False)
 
@@ -29,6 +30,9 @@ def show(
     ] = None,
     stream: Annotated[str | None, typer.Option(help="The stream of the graph, where there are several.")] = None,
     json: Annotated[bool, typer.Option("--json", help="Print nodes, relations and matches as JSON.")] = False,
+    export: Annotated[
+        Path | None, typer.Option(metavar="FILE.json", help="Write it for Spark-DSG, which Hydra's tools open.")
+    ] = None,
 ) -> None:
     """Show the scene graph of a recording at a time, or what in it a question asks for.
 
@@ -42,6 +46,9 @@ def show(
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
     names = graph.names()
+    if export is not None:
+        export.parent.mkdir(parents=True, exist_ok=True)
+        export.write_text(jsonlib.dumps(as_spark_dsg(graph)), encoding="utf-8")
     if json:
         content = as_json(graph)
         if matches is not None:

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.scene.agents import GoalInference, Motion, activity_of
-from operators.scene.relations import FLOOR, ROBOT, ROOM, Body, Hysteresis, Relation, RelationRules, relations_of
+from operators.scene.bodies import Body, BoxPairs
+from operators.scene.relations import FLOOR, ROBOT, ROOM, Hysteresis, Relation, RelationRules, relations_of
 
 Array = NDArray[np.float64]
 
@@ -75,6 +76,7 @@ class LayeredGraph:
         self._goals: dict[int, GoalInference] = {}
         self._acts: dict[int, tuple[str, int]] = {}
         self._known: set[int] = set()
+        self._pairs = BoxPairs()
 
     def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
         """Takes the objects of one time, which may have the floor among them, and the robot's pose."""
@@ -89,7 +91,7 @@ class LayeredGraph:
         ids = {b.id for b in bodies}
         vanished = self._known - ids
         self._forget(vanished)
-        now = relations_of(bodies, T_world_robot, s.rules)
+        now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
         goals = {b.id: self._goals_of(time, b, bodies, now) for b in bodies if b.agent and b.label == "person"}
         held, began, ended = self._hysteresis.update(stamp, now)
         for agent, likely in goals.items():

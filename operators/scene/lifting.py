@@ -7,26 +7,32 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
-from operators.cloud.clustering import Shape, dbscan, shape_of
+from operators.cloud.clustering import upright_box
 from operators.cloud.filtering import Voxels
-from operators.tracking.assignment import overlap
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Indices = NDArray[np.intp]
 
 _FEWEST = 5  # points of a part
-_CORE = 2
+_WHOLE = 0.6  # overlap from which points without a gap in range are not divided
+_MIDDLE = 0.5  # what holding all points in the middle of a box counts, beside the overlap
+_SAME = 0.5  # overlap from which two boxes are around the same thing
+_SMALLER = 4.0  # times smaller, and a box in another is in front
+_LEFT = 0.3  # share of its points that an object keeps
+_DENSE = 256  # so many places are compared each with each
 
 
 @dataclass(frozen=True)
 class LiftSettings:
     """Lengths in metres. `reach` and `reach_growth` say how near neighbours are: reach + growth * distance."""
 
-    voxel: float = 0.03
-    reach: float = 0.06
-    reach_growth: float = 0.02
+    reach: float = 0.04
+    reach_growth: float = 0.012
     gap: float = 0.3
     min_points: int = 8
     min_overlap: float = 0.3
@@ -38,7 +44,8 @@ class LiftSettings:
 class Seen:
     """A cloud as the camera sees it: points (N, 3), their pixels (N, 2), which are in the image, and up (3,).
 
-    `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks.
+    `classes` (N,) is the class of each point's pixel, -1 where it has none; None without masks. `grain` is by how many
+    pixels the image of a thing's points falls short of its own on each side.
     """
 
     points: Array
@@ -46,16 +53,36 @@ class Seen:
     inside: Mask
     up: Array
     classes: NDArray[np.int32] | None = None
+    grain: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
-    """One box's object: its points (indices), its shape, and the IoU of its image with the box."""
+    """One box's object: its points (indices), the IoU of its image with the box, and its upright box.
+
+    `T` (4, 4) maps the upright box's axes, z along up, to the cloud's frame; `size` (3,) is its full size.
+    """
 
     detection: int
     points: Indices
-    shape: Shape
     overlap: float
+    T: Array
+    size: Array
+
+
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """One cluster in a box: its points (indices), its bounds in the image (4,) and in space (2, 3)."""
+
+    rows: Indices
+    image: tuple[float, float, float, float]
+    bounds: Array
+
+    def joined(self, other: _Part) -> _Part:
+        (a, b, c, d), (e, f, g, h) = self.image, other.image
+        low, high = np.minimum(self.bounds[0], other.bounds[0]), np.maximum(self.bounds[1], other.bounds[1])
+        image = (min(a, e), min(b, f), max(c, g), max(d, h))
+        return _Part(np.concatenate([self.rows, other.rows]), image, np.stack([low, high]))
 
 
 def lift(
@@ -68,47 +95,66 @@ def lift(
     holds enough of it, only such points count. Otherwise points of `background` classes and on level surfaces that
     reach beyond the box do not. Points go to the box that they fit best, once.
     """
-    candidates: list[Lifted] = []
+    candidates: list[tuple[int, Indices, float]] = []
     inside = np.flatnonzero(seen.inside)
     order = inside[np.argsort(seen.pixels[inside, 0], kind="stable")]
-    columns = seen.pixels[order, 0]
-    for k, box in enumerate(boxes):
-        size = (box[2:] - box[:2]) * 0.15 + 2
-        first, last = np.searchsorted(columns, [box[0] - size[0], box[2] + size[0]], side="left")
-        near = order[first:last]
-        v = seen.pixels[near, 1]
-        near = near[(v >= box[1] - size[1]) & (v <= box[3] + size[1])]
-        inner = _within(seen.pixels[near], box)
-        rows = _foreground(seen, np.sort(near[inner]), near[~inner], mask_classes[k], background, s)
-        found = _object(seen, rows, box, s)
+    columns, lines = seen.pixels[order, 0], seen.pixels[order, 1]
+    classes = None if seen.classes is None else seen.classes[order]
+    behind = None if classes is None else np.isin(classes, background)
+    for k, (left, upper, right, lower) in enumerate(boxes.tolist()):
+        ring = 0.15 * (right - left) + 2, 0.15 * (lower - upper) + 2
+        first, last = np.searchsorted(columns, [left - ring[0], right + ring[0]], side="left")
+        u, v, near = columns[first:last], lines[first:last], order[first:last]
+        inner = (u >= left) & (u <= right) & (v >= upper) & (v <= lower)
+        if np.count_nonzero(inner) < s.min_points:
+            continue
+        if classes is None or behind is None:
+            around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
+            rows = _off_support(seen, near[inner], around, s)
+        else:
+            of_class = inner & (classes[first:last] == mask_classes[k])
+            if mask_classes[k] >= 0 and np.count_nonzero(of_class) >= max(
+                s.min_points, s.mask_share * np.count_nonzero(inner)
+            ):
+                rows = near[of_class]
+            else:
+                around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
+                rows = _off_support(seen, near[inner & ~behind[first:last]], around, s)
+        found = _object(seen, np.sort(rows), (left, upper, right, lower), s)
         if found is not None:
-            candidates.append(Lifted(k, found[0], shape_of(seen.points[found[0]], seen.up), found[1]))
-    free = np.ones(len(seen.points), np.bool_)
-    kept = []
-    for each in sorted(candidates, key=lambda c: (-c.overlap, c.detection)):
-        own = each.points[free[each.points]]
-        if len(own) < s.min_points or len(own) < 0.5 * len(each.points):
-            continue  # another box has it
-        free[own] = False
-        shape = each.shape if len(own) == len(each.points) else shape_of(seen.points[own], seen.up)
-        kept.append(Lifted(each.detection, own, shape, each.overlap))
+            candidates.append((k, *found))
+    owned = _divided(seen.pixels, boxes, candidates)
+    kept = [
+        Lifted(k, own, value, *upright_box(seen.points[own], seen.up))
+        for (k, points, value), own in zip(candidates, owned, strict=True)
+        if len(own) >= max(_FEWEST, _LEFT * len(points))  # else others have it
+    ]
     return sorted(kept, key=lambda c: c.detection)
 
 
-def _within(pixels: Array, box: Array) -> Mask:
-    return np.asarray(((pixels >= box[:2]) & (pixels <= box[2:])).all(axis=1))
+def _divided(pixels: Array, boxes: Array, candidates: Sequence[tuple[int, Indices, float]]) -> list[Indices]:
+    """Returns what each candidate (box, points, overlap) keeps of its points: each goes to one.
 
-
-def _foreground(
-    seen: Seen, rows: Indices, ring: Indices, wanted: int, background: Sequence[int], s: LiftSettings
-) -> Indices:
-    if seen.classes is not None and wanted >= 0:
-        of_class = rows[seen.classes[rows] == wanted]
-        if len(of_class) >= max(s.min_points, s.mask_share * len(rows)):
-            return np.asarray(of_class)
-    if seen.classes is not None:
-        rows = rows[~np.isin(seen.classes[rows], background)]
-    return _off_support(seen, rows, ring, s)
+    Of boxes around the same thing the better one gets all. Of others a much smaller one does, since it is in front;
+    else each point goes to the box whose middle is nearer, as measured by the boxes' sides.
+    """
+    owner = np.full(len(pixels), -1)
+    distance = np.zeros(len(pixels))
+    middles, sides = (boxes[:, :2] + boxes[:, 2:]) / 2, np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
+    order = sorted(range(len(candidates)), key=lambda c: (-candidates[c][2], candidates[c][0]))
+    for c in order:
+        k, points, _ = candidates[c]
+        away = np.abs((pixels[points] - middles[k]) / sides[k]).max(axis=1)
+        before = owner[points]
+        wins = before < 0
+        for rival in np.unique(before[~wins]).tolist():
+            other = candidates[rival][0]
+            same = _overlap(tuple(boxes[k].tolist()), tuple(boxes[other].tolist())) >= _SAME
+            ratio = float(np.prod(sides[k]) / np.prod(sides[other]))
+            nearer = away < distance[points] if 1 / _SMALLER < ratio < _SMALLER else ratio <= 1 / _SMALLER
+            wins |= (before == rival) & np.asarray(nearer & (not same))
+        owner[points[wins]], distance[points[wins]] = c, away[wins]
+    return [points[owner[points] == c] for c, (_, points, _) in enumerate(candidates)]
 
 
 def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> Indices:
@@ -124,39 +170,88 @@ def _off_support(seen: Seen, rows: Indices, ring: Indices, s: LiftSettings) -> I
     return kept if len(kept) >= s.min_points else rows
 
 
-def _object(seen: Seen, rows: Indices, box: Array, s: LiftSettings) -> tuple[Indices, float] | None:
+def _object(
+    seen: Seen, rows: Indices, box: tuple[float, float, float, float], s: LiftSettings
+) -> tuple[Indices, float] | None:
     """Returns the points of the object in a box and the overlap of their image with it."""
     if len(rows) < s.min_points:
         return None
     points = seen.points[rows]
-    voxels = Voxels.by_size(points.astype(np.float32), s.voxel)
-    middle = float(np.median(np.linalg.norm(points, axis=1)))
-    labels = dbscan(voxels.means(points), s.reach + s.reach_growth * middle, _CORE, voxels.counts)[voxels.of]
-    parts = [rows[labels == c] for c in range(int(labels.max(initial=-1)) + 1)]
-    parts = [part for part in parts if len(part) >= _FEWEST]
+    ranges = np.sort(np.sqrt(np.einsum("ij,ij->i", points, points)))
+    reach = s.reach + s.reach_growth * float(ranges[len(ranges) // 2])
+    whole = _part(seen, rows)
+    value = _overlap(whole.image, box)
+    if value >= _WHOLE and float(np.diff(ranges).max()) <= reach:
+        return rows, value  # nothing to divide
+    voxels = Voxels.by_size(points.astype(np.float32), reach / 2)
+    labels = _linked(voxels.means(points), reach)[voxels.of]
+    parts = [_part(seen, rows[labels == c]) for c in np.flatnonzero(np.bincount(labels) >= _FEWEST)]
     if not parts:
         return None
-    values = [_image_overlap(seen, part, box) for part in parts]
-    order = sorted(range(len(parts)), key=lambda c: (-values[c], c))
+    values = [_overlap(part.image, box) for part in parts]
+    central = [_central(seen, part.rows, box) for part in parts]
+    ranks = [v + _MIDDLE * n / max(sum(central), _FEWEST) for v, n in zip(values, central, strict=True)]
+    order = sorted(range(len(parts)), key=lambda c: (-ranks[c], c))
     chosen, value = parts[order[0]], values[order[0]]
     for c in order[1:]:
-        both = np.concatenate([chosen, parts[c]])
-        better = _image_overlap(seen, both, box)
-        if better > value + 0.01 and _apart(seen.points[chosen], seen.points[parts[c]]) <= s.gap:
+        both = chosen.joined(parts[c])
+        better = _overlap(both.image, box)
+        if better > value + 0.01 and _apart(chosen.bounds, parts[c].bounds) <= s.gap:
             chosen, value = both, better
-    if value < s.min_overlap or len(chosen) < s.min_points:
+    if value < s.min_overlap or len(chosen.rows) < s.min_points:
         return None
-    return np.sort(chosen), value
+    return np.sort(chosen.rows), value
 
 
-def _image_overlap(seen: Seen, rows: Indices, box: Array) -> float:
-    uv = np.sort(seen.pixels[rows], axis=0)
+def _central(seen: Seen, rows: Indices, box: tuple[float, float, float, float]) -> int:
+    """Counts the points in the inner half of a box: of a thing; what shows around it has few."""
+    middle, quarter = np.array([box[0] + box[2], box[1] + box[3]]) / 2, np.array([box[2] - box[0], box[3] - box[1]]) / 4
+    return int((np.abs(seen.pixels[rows] - middle) <= quarter).all(axis=1).sum())
+
+
+def _linked(places: Array, reach: float) -> NDArray[np.intp]:
+    """Returns the group of each place (N, 3): those within reach of each other, directly or by others, are one."""
+    count = len(places)
+    if count > _DENSE:
+        pairs = cKDTree(places).query_pairs(reach, output_type="ndarray")
+        graph = coo_matrix((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (count, count))
+        return np.asarray(connected_components(graph, directed=False)[1], np.intp)
+    square = np.einsum("ij,ij->i", places, places)
+    linked = square[:, None] + square[None, :] - 2 * (places @ places.T) <= reach * reach
+    np.fill_diagonal(linked, True)
+    group = np.argmax(linked, axis=1)
+    while True:  # each takes the least number in its reach, then that one's, until nothing changes
+        least = np.where(linked, group, count).min(axis=1)
+        least = least[least]
+        if np.array_equal(least, group):
+            return np.asarray(group, np.intp)
+        group = least
+
+
+def _part(seen: Seen, rows: Indices) -> _Part:
+    points, uv = seen.points[rows], seen.pixels[rows]
     cut = len(rows) // 100  # one in a hundred may stray
-    own = np.concatenate([uv[cut], uv[len(rows) - 1 - cut]])
-    return float(overlap(own[None], box[None])[0, 0])
+    if cut:
+        uv = np.partition(uv, (cut, len(rows) - 1 - cut), axis=0)
+        low, high = uv[cut], uv[len(rows) - 1 - cut]
+    else:
+        low, high = uv.min(axis=0), uv.max(axis=0)
+    g = seen.grain
+    image = float(low[0]) - g, float(low[1]) - g, float(high[0]) + g, float(high[1]) + g
+    return _Part(rows, image, np.stack([points.min(axis=0), points.max(axis=0)]))
+
+
+def _overlap(first: tuple[float, float, float, float], second: tuple[float, float, float, float]) -> float:
+    """Returns the IoU of two image boxes."""
+    width = min(first[2], second[2]) - max(first[0], second[0])
+    height = min(first[3], second[3]) - max(first[1], second[1])
+    if width <= 0 or height <= 0:
+        return 0.0
+    areas = [(b[2] - b[0]) * (b[3] - b[1]) for b in (first, second)]
+    return width * height / (areas[0] + areas[1] - width * height)
 
 
 def _apart(first: Array, second: Array) -> float:
-    """Returns the gap between the axis-parallel boxes of two groups of points."""
-    gap = np.maximum(first.min(axis=0) - second.max(axis=0), second.min(axis=0) - first.max(axis=0))
+    """Returns the gap between the axis-parallel bounds (2, 3) of two groups of points."""
+    gap = np.maximum(first[0] - second[1], second[0] - first[1])
     return float(np.linalg.norm(np.maximum(gap, 0)))

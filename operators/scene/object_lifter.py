@@ -25,12 +25,14 @@ from dataflow.messages import (
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.cloud.filtering import finite
+from operators.cloud.filtering import in_range
 from operators.cloud.gravity import gravity, unit
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.scene.lifting import Lifted, LiftSettings, Seen, lift
 from operators.status import counted_status
+
+_MOST_GRAIN = 4.0  # pixels
 
 
 class ObjectLifter(Operator):
@@ -54,6 +56,7 @@ class ObjectLifter(Operator):
     )
     pose: Sampled[Pose | Odometry] = Sampled(required=False, doc="the cloud's sensor or its robot; tells what is up")
     boxes: Out[Boxes3D] = Out(doc="objects in the cloud's frame, with their numbers of points")
+    images: Out[Detections2D] = Out(doc="the image's boxes of the objects, in the order of the boxes")
     clusters: Out[Clusters] = Out(doc="the object of every point of the cloud, in the order of the boxes")
     status: Out[Diagnostics] = Out(doc="detections with and without an object; a warning where all are without")
 
@@ -61,7 +64,8 @@ class ObjectLifter(Operator):
     min_points: int = Param(8, ge=5, live=True, doc="fewest points of an object")
     min_overlap: float = Param(0.3, gt=0, le=1, live=True, doc="least IoU of an object's image with its box")
     max_range: float = Param(6.0, gt=0, live=True, doc="farther points are not used", unit="m")
-    reach: float = Param(0.06, gt=0, doc="points so near, and 2 % of their distance, are one cluster", unit="m")
+    reach: float = Param(0.04, gt=0, doc="points so near are one cluster", unit="m")
+    reach_growth: float = Param(0.012, ge=0, doc="share of their distance by which that grows; more for a lidar")
     gap: float = Param(0.3, gt=0, doc="parts of one object are no farther apart", unit="m")
     up: tuple[float, float, float] = Param(
         (0.0, -1.0, 0.0), doc="direction up in the cloud's frame where no pose comes"
@@ -84,17 +88,21 @@ class ObjectLifter(Operator):
         """Raises ValueError where the calibration is of another image or no transform relates the frames."""
         _check(detections, image_info)
         up, _ = gravity(cloud, pose, extrinsics, self._up)
-        usable = np.flatnonzero(finite(cloud.points))
-        usable = usable[np.linalg.norm(cloud.points[usable].astype(np.float64), axis=1) <= self.max_range]
+        usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
+        points = cloud.points[usable].astype(np.float64)
         masks = self._masks(detections, segmentation)
         T_image_cloud = transform_between(extrinsics, cloud.frame, detections.frame)
-        seen = _seen(cloud.points[usable].astype(np.float64), T_image_cloud, image_info, masks, up)
+        seen = _seen(points, T_image_cloud, image_info, masks, up)
         rows = np.flatnonzero(detections.scores >= np.float32(self.min_score))
         names = detections.labels()
         known = {} if masks is None else {name: k for k, name in enumerate(masks.class_names)}
         background = [k for name, k in known.items() if name not in detections.class_names]
         settings = LiftSettings(
-            reach=self.reach, gap=self.gap, min_points=self.min_points, min_overlap=self.min_overlap
+            reach=self.reach,
+            reach_growth=self.reach_growth,
+            gap=self.gap,
+            min_points=self.min_points,
+            min_overlap=self.min_overlap,
         )
         boxes = detections.boxes[rows].astype(np.float64)
         found = lift(seen, boxes, [known.get(names[k], -1) for k in rows], background, settings)
@@ -111,7 +119,8 @@ class ObjectLifter(Operator):
         self._counts.update(counts | {"images": 1})
         return {
             "boxes": _boxes(cloud, detections, rows, found),
-            "clusters": _clusters(cloud, labels, found),
+            "images": _images(cloud.stamp, detections, rows, found),
+            "clusters": _clusters(cloud, labels, found, points),
             "status": _status(cloud.stamp, counts),
         }
 
@@ -158,7 +167,9 @@ def _seen(
         classes = np.full(len(points), -1, np.int32)
         column, row = np.rint(pixels[inside]).astype(np.int64).T
         classes[inside] = np.where(_brink(masks.classes), -1, masks.classes.astype(np.int32))[row, column]
-    return Seen(points, pixels + 0.5, inside, up, classes)  # boxes count from the image's edge
+    spacing = np.sqrt(info.width * info.height / max(int(inside.sum()), 1))
+    grain = min(0.5 * float(spacing) + (masks is not None), _MOST_GRAIN)
+    return Seen(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge
 
 
 def _brink(classes: NDArray[Any]) -> NDArray[np.bool_]:
@@ -174,9 +185,9 @@ def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], 
         stamp=cloud.stamp,
         frame=cloud.frame,
         class_names=detections.class_names,
-        centers=np.array([f.shape.T[:3, 3] for f in found]).reshape(-1, 3),
-        sizes=np.array([f.shape.size for f in found]).reshape(-1, 3),
-        orientations=matrix_to_quaternion(np.array([f.shape.T for f in found]).reshape(-1, 4, 4)),
+        centers=np.array([f.T[:3, 3] for f in found]).reshape(-1, 3),
+        sizes=np.array([f.size for f in found]).reshape(-1, 3),
+        orientations=matrix_to_quaternion(np.array([f.T for f in found]).reshape(-1, 4, 4)),
         scores=detections.scores[own] * np.array([np.sqrt(f.overlap) for f in found], np.float32),
         class_ids=detections.class_ids[own],
         ids=None if detections.ids is None else detections.ids[own],
@@ -184,14 +195,32 @@ def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], 
     )
 
 
-def _clusters(cloud: PointCloud, labels: NDArray[np.int32], found: list[Lifted]) -> Clusters:
+def _images(stamp: int, detections: Detections2D, rows: NDArray[np.intp], found: list[Lifted]) -> Detections2D:
+    own = rows[[f.detection for f in found]] if found else rows[:0]
+    return Detections2D(
+        stamp=stamp,
+        frame=detections.frame,
+        width=detections.width,
+        height=detections.height,
+        class_names=detections.class_names,
+        boxes=detections.boxes[own],
+        scores=detections.scores[own],
+        class_ids=detections.class_ids[own],
+        ids=None if detections.ids is None else detections.ids[own],
+    )
+
+
+def _clusters(
+    cloud: PointCloud, labels: NDArray[np.int32], found: list[Lifted], points: NDArray[np.float64]
+) -> Clusters:
+    own = [points[f.points] for f in found]
     return Clusters(
         stamp=cloud.stamp,
         frame=cloud.frame,
         labels=labels,
-        centroids=np.array([f.shape.centroid for f in found]).reshape(-1, 3),
-        lower=np.array([f.shape.lower for f in found]).reshape(-1, 3),
-        upper=np.array([f.shape.upper for f in found]).reshape(-1, 3),
+        centroids=np.array([p.mean(axis=0) for p in own]).reshape(-1, 3),
+        lower=np.array([p.min(axis=0) for p in own]).reshape(-1, 3),
+        upper=np.array([p.max(axis=0) for p in own]).reshape(-1, 3),
     )
 
 

@@ -4,103 +4,43 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.cells import Cells, completed, standing_box
-from operators.scene.range_view import RangeView
+from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.cells import Cells
+from operators.scene.class_sizes import Usual
+from operators.scene.heading import RoomHeading
+from operators.scene.map_object import MOST_EVIDENCE, MapObject
+from operators.scene.matching import (
+    LARGE,
+    MapSettings,
+    Observation,
+    alike,
+    alike_mover,
+    closeness,
+    color_likeness,
+    in_image,
+    tolerance,
+)
+from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
-_MOST = 6.0
-_PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most")
-_BRINK = 0.012  # metres that masks and clouds lose of each side of an object
+_COVERED = 0.3  # share of the smaller of two boxes that both have, from which they are one
+_SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
+_AGAIN = 8  # views after which the heading of the room is looked for once more
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
-_ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
-
-
-@dataclass(frozen=True)
-class MapSettings:
-    """Lengths in metres, times in seconds, evidence in log odds."""
-
-    voxel: float = 0.03
-    margin: float = 0.1
-    bin: float = 0.012
-    overlap: float = 0.25
-    confirm: float = 1.0
-    views: int = 3
-    vacated: float = 1.0
-    missed: float = 0.12
-    miss_angle: float = 0.1
-    gain: float = 0.3
-    mover_reach: float = 0.5
-    mover_speed: float = 1.5
-    mover_memory: float = 8.0
-    move_memory: float = 120.0
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known."""
-
-    points: Array
-    class_id: int
-    score: float
-    color: Array | None = None
-
-
-@dataclass
-class MapObject:
-    """One object of the map, in an upright box. Times in nanoseconds.
-
-    `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views;
-    `most` is the largest number of voxels that it had.
-    """
-
-    id: int
-    cells: Cells
-    votes: Array
-    evidence: float
-    born: int
-    seen: int
-    views: int = 1
-    color: Array = field(default_factory=lambda: np.full(3, np.nan))
-    center: Array = field(default_factory=lambda: np.zeros(3))
-    size: Array = field(default_factory=lambda: np.zeros(3))
-    yaw: float = 0.0
-    velocity: Array = field(default_factory=lambda: np.zeros(3))
-    view: Array = field(default_factory=lambda: np.zeros(2))
-    most: int = 0
-
-    @property
-    def class_id(self) -> int:
-        return int(np.argmax(self.votes))
-
-    @property
-    def score(self) -> float:
-        """Probability that the object is there."""
-        return 1 / (1 + math.exp(-self.evidence))
-
-    def fit(self, usual: Mapping[int, tuple[float, float]]) -> None:
-        """Puts the box around what is surely the object's, as deep as usual for its class where one side was seen."""
-        sure = self.cells.sure()
-        if len(sure):
-            center, size, yaw = standing_box(sure)
-            box = (center, size + 2 * _BRINK, yaw)
-            known = usual.get(self.class_id)
-            if known is not None:
-                box = completed(box, self.view / max(self.views, 1), known)
-            self.center, self.size, self.yaw = box
 
 
 class ObjectMap:
     """Joins observations to objects, and keeps, moves and forgets objects.
 
-    An observation is of the object of its class whose voxels it shares most, colour deciding near ties; of another
-    class where the two cover each other. Two objects that come to share their voxels are one. Places that a view looks
+    An observation is of the object of its class whose box, seen from where it was seen, covers its own in the image,
+    and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
+    other. Colour decides near ties. Two objects that come to share their place are one. Places that a view looks
     through lose voxels; an object whose place is empty, or that is in plain view and not detected, loses evidence and
     at last goes. If one of its class and size appears elsewhere, that is the same object, moved.
     `movers` are classes whose place is that of their last view; they are joined by predicted place.
@@ -113,9 +53,9 @@ class ObjectMap:
         classes: int,
         movers: Iterable[int],
         settings: MapSettings,
-        usual: Mapping[int, tuple[float, float]] | None = None,
+        usual: Mapping[int, Sequence[Usual]] | None = None,
     ) -> None:
-        """`usual` are the shorter and longer side on the ground of classes whose size is known, metres."""
+        """`usual` are the sizes of classes whose size is known."""
         self._settings, self._classes, self._movers = settings, classes, frozenset(movers)
         self._usual = dict(usual or {})
         self.objects: dict[int, MapObject] = {}
@@ -123,24 +63,27 @@ class ObjectMap:
         self.moved = 0
         self._next = 1
         self._stamp: int | None = None
+        self._room, self._updates = RoomHeading(), 0
+        self._heading: float | None = None
 
     def update(self, stamp: int, seen: Sequence[Observation], view: RangeView) -> None:
         """Takes the observations of one time and the view that they come from."""
         s = self._settings
         seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         self._stamp = stamp
-        cells = [Cells.of(each.points, s.voxel) for each in seen]
+        if self._updates % _AGAIN == 0:
+            self._room.add(view.points)
+        self._updates += 1
+        self._heading = self._room.angle
+        cells = [Cells.of(self._near_side(each, view.origin), s.voxel) for each in seen]
         joined = self._joined(seen, cells, stamp)
         for k, each in enumerate(seen):
             if k in joined:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 self._begin(each, cells[k], stamp, view.origin)
-        shown = {i: k for k, i in joined.items()}
-        for object in list(self.objects.values()):
-            if object.born != stamp:
-                own = cells[shown[object.id]].points if object.id in shown else None
-                self._look(object, view, own, seconds)
+        shown = {i: cells[k] for k, i in joined.items()}
+        self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
 
@@ -152,64 +95,76 @@ class ObjectMap:
     def is_mover(self, object: MapObject) -> bool:
         return object.class_id in self._movers
 
+    def _is_large(self, object: MapObject) -> bool:
+        usual = self._usual.get(object.class_id)
+        return (max(u.size[1] for u in usual) if usual else float(object.size[:2].max())) >= LARGE
+
+    def _near_side(self, each: Observation, eye: Array) -> Array:
+        """Returns an observation's points without those that are farther behind most than such a thing is deep."""
+        usual = self._usual.get(each.class_id)
+        if not usual:
+            return each.points
+        way = each.points[:, :2] - eye[:2]
+        ranges = np.sqrt((way * way).sum(axis=1))
+        deep = max(u.size[1] * math.exp(2 * u.spread[1]) for u in usual)
+        deep += 4 * self._settings.range_noise * float(ranges.min()) ** 2
+        ranked = np.sort(ranges)
+        counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
+        first = ranked[int(np.argmax(counts))]
+        return np.asarray(each.points[(ranges >= first) & (ranges <= first + deep)])
+
     def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
-        ids = sorted(self.objects)
+        s, ids = self._settings, sorted(self.objects)
         value = np.zeros((len(seen), len(ids)))
+        if not ids or not seen:
+            return {}
+        known = [self.objects[i] for i in ids]
+        rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
+        moves = np.array([self.is_mover(o) for o in known])
+        usual = [self._usual.get(o.class_id, ()) for o in known]
+        images = in_image(seen, rows, np.array([bool(u) and u[0].round for u in usual]))
         for k, each in enumerate(seen):
-            middle, reach = cells[k].points.mean(axis=0), float(np.ptp(cells[k].points, axis=0).max()) / 2
-            for j, i in enumerate(ids):
-                object = self.objects[i]
-                gap = float(np.linalg.norm(object.center - middle))
-                if gap <= reach + float(object.size.max()) + self._settings.mover_reach + self._settings.mover_speed:
-                    value[k, j] = self._alike(each, cells[k], object, stamp)
+            mover = each.class_id in self._movers
+            more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
+            near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
+            near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
+            for j in np.flatnonzero((near <= more) & (moves == mover)).tolist():
+                if mover:
+                    value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
+                else:
+                    image = None if images is None else images[k][j]
+                    value[k, j] = alike(each, cells[k], known[j], image, s, large=self._is_large(known[j]))
         return {k: ids[j] for k, j in assign(value, value > 0)}
-
-    def _alike(self, each: Observation, cells: Cells, object: MapObject, stamp: int) -> float:
-        """Returns how likely an observation is of an object, in [0, 1]; 0 where it is not."""
-        s = self._settings
-        same = each.class_id == object.class_id
-        if same and self.is_mover(object):
-            since = (stamp - object.seen) * 1e-9
-            center, _, _ = standing_box(cells.points)
-            away = center - object.center - object.velocity * min(since, 1.0)
-            reach = s.mover_reach + s.mover_speed * min(since, 2.0)
-            return max(0.0, 1 - float(np.hypot(away[0], away[1])) / reach)
-        if self.is_mover(object) or each.class_id in self._movers:
-            return 0.0
-        loose = _tolerance(np.ptp(cells.points, axis=0))
-        if same:
-            share = object.cells.near(cells.points, loose)
-            close = _closeness(cells, object.cells)
-            alike = _color_likeness(each.color, object.color)
-            return 0.5 * share + 0.4 * close + 0.1 * alike if share >= s.overlap and close > 0 else 0.0
-        if float(np.abs(object.size - np.ptp(cells.points, axis=0)).max()) > 0.5 * float(object.size.max()):
-            return 0.0
-        share = min(object.cells.near(cells.points, s.voxel), cells.near(object.cells.points, s.voxel))
-        return 0.5 * share if share >= 0.5 else 0.0
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         mover = self.is_mover(object)
         direction = _direction(eye, cells)
         object.views += 1
         object.view = direction * object.views if mover else object.view + direction
-        if mover:
-            before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
-            object.cells = cells
-            object.fit(self._usual)
-            speed = (object.center - before) / since
-            share = min(1.0, since / 0.5)
-            object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
-        else:
-            object.cells.add(cells)
+        before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
+        voted = object.class_id
         object.votes[each.class_id] += each.score
-        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), _MOST)
+        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
             known = np.isfinite(object.color).all()
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
-        if not mover:
-            object.fit(self._usual)
+        if mover:
+            object.cells = cells
+            object.form = -1
+            object.images = [] if each.image is None or not each.image.edges.any() else [each.image]
+            object.fit(self._usual, self._heading, self._settings.range_noise)
+            speed = (object.center - before) / since
+            share = min(1.0, since / 0.5)
+            object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
+            return
+        object.cells.add(cells)
+        new = each.image is not None and object.look(each.image) and len(object.images) not in (2, 4)
+        if object.class_id != voted:
+            object.form = -1
+        if new or not object.images or object.class_id != voted:
+            object.fit(self._usual, self._heading, self._settings.range_noise)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
@@ -218,72 +173,108 @@ class ObjectMap:
         if each.color is not None:
             made.color = each.color
         made.view = _direction(eye, cells)
-        made.fit(self._usual)
+        made.center = cells.middle
+        if each.image is not None:
+            made.look(each.image)
+        made.fit(self._usual, self._heading, self._settings.range_noise)
         self.objects[made.id] = made
         self._next += 1
 
-    def _look(self, object: MapObject, view: RangeView, own: Array | None, seconds: float) -> None:
-        """Takes what a view says of an object's place; `own` are its points (N, 3) in this view, None for none."""
+    def _look_around(
+        self, view: RangeView, objects: Sequence[MapObject], shown: Mapping[int, Cells], seconds: float
+    ) -> None:
+        """Takes what a view says of the places of objects; `shown` are the voxels of those that it shows, by id."""
         s = self._settings
+        if not objects:
+            return
+        centers, radii = np.array([o.center for o in objects]), np.array([float(o.size.max()) for o in objects])
+        near = [objects[k] for k in np.flatnonzero(view.may_show(centers, radii + s.margin)).tolist()]
+        sights = dict(zip((o.id for o in near), view.of_each([o.cells.points for o in near], s.margin), strict=True))
+        for object in objects:
+            self._look(object, sights.get(object.id), view.origin, shown.get(object.id), seconds)
+
+    def _look(self, object: MapObject, sight: Sight | None, eye: Array, own: Cells | None, seconds: float) -> None:
+        """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any."""
+        s, mover = self._settings, self.is_mover(object)
         if not len(object.cells):
             object.evidence = -1.0
             return
-        sight = view.of(object.cells.points, s.margin)
-        looked = int(sight.looked.sum())
-        if not self.is_mover(object):
-            if own is not None:
-                object.cells.doubt(view.of(object.cells.points, 0.5 * s.margin).confirmed, own)
+        if not mover and sight is not None:
+            if own is not None and object.views % _SELDOM == 0:
+                object.cells.doubt(sight.confirmed, own, _SELDOM)
             object.cells.carve(sight.free)
             object.most = max(object.most, len(object.cells))
         if own is not None:
             return
         if len(object.cells) < _LEFT * object.most:
             object.evidence = -1.0
-        if self.is_mover(object):
-            object.evidence -= seconds * _MOST / s.mover_memory
+        if mover:
+            object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory
+        if sight is None:
+            return
+        looked = np.count_nonzero(sight.looked)
         if looked < max(5, 0.2 * len(sight.looked)):
             return
-        distance = float(np.linalg.norm(object.center - view.origin))
-        if sight.free.sum() >= 0.6 * looked:
-            object.evidence -= s.vacated * (3 if self.is_mover(object) else 1)
-        elif sight.confirmed.sum() >= 0.6 * len(sight.looked) and object.size.max() >= s.miss_angle * distance:
+        distance = float(np.linalg.norm(object.center - eye))
+        if np.count_nonzero(sight.free) >= 0.6 * looked:
+            object.evidence -= s.vacated * (3 if mover else 1)
+        elif (
+            np.count_nonzero(sight.confirmed) >= 0.6 * len(sight.looked)
+            and object.size.max() >= s.miss_angle * distance
+        ):
             object.evidence -= s.missed
 
     def _join_doubles(self, changed: list[int]) -> None:
         """Makes one of two objects that share their voxels."""
+        if not changed:
+            return
+        ids = sorted(self.objects)
+        centers = np.array([self.objects[i].center for i in ids])
+        radii = np.array([float(self.objects[i].size.max()) for i in ids])
         for i in changed:
-            for j in sorted(self.objects):
-                if i not in self.objects or i == j:
-                    continue
-                a, b = self.objects[i], self.objects[j]
-                if float(np.linalg.norm(a.center - b.center)) > float(a.size.max() + b.size.max()) / 2 + 0.1:
-                    continue
-                if self._one(a, b):
-                    kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
-                    if not self.is_mover(kept):
-                        kept.cells.add(other.cells)
-                    kept.votes = kept.votes + other.votes
-                    kept.evidence = min(max(kept.evidence, other.evidence), _MOST)
-                    kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
-                    kept.view = kept.view + other.view
-                    kept.fit(self._usual)
-                    del self.objects[other.id]
+            if i not in self.objects:
+                continue
+            k = ids.index(i)
+            close = np.linalg.norm(centers - centers[k], axis=1) <= (radii + radii[k]) / 2 + 0.1
+            for j in (ids[n] for n in np.flatnonzero(close).tolist()):
+                if i in self.objects and j in self.objects and i != j:
+                    self._join_two(self.objects[i], self.objects[j])
+
+    def _join_two(self, a: MapObject, b: MapObject) -> None:
+        if not self._one(a, b):
+            return
+        kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
+        if not self.is_mover(kept):
+            kept.cells.add(other.cells)
+            for image in other.images:
+                kept.look(image)
+        kept.votes = kept.votes + other.votes
+        kept.evidence = min(max(kept.evidence, other.evidence), MOST_EVIDENCE)
+        kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
+        kept.view = kept.view + other.view
+        kept.fit(self._usual, self._heading, self._settings.range_noise)
+        del self.objects[other.id]
 
     def _one(self, a: MapObject, b: MapObject) -> bool:
         s = self._settings
-        if not a.cells.touches(b.cells, 0.3):
-            return False
         movers = self.is_mover(a), self.is_mover(b)
-        small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
-        if a.class_id == b.class_id:
-            if all(movers):
-                return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-            near = large.cells.near(small.cells.points, 0.5 * _tolerance(small.size) + 0.5 * s.voxel)
-            return near >= 0.5 and _closeness(small.cells, large.cells) > 0.3
-        if any(movers):
+        if any(movers) and a.class_id != b.class_id:
             return False
-        shares = (a.cells.near(b.cells.points, s.voxel), b.cells.near(a.cells.points, s.voxel))
-        return min(shares) >= 0.5
+        if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
+            return False
+        if all(movers):
+            return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
+        if a.class_id != b.class_id:
+            return upright_iou(a.box, b.box) >= 0.5
+        least = 0.5 if a.seen == b.seen else _COVERED  # two that one view shows are seldom one
+        if shared_volume(a.box, b.box) >= least * min(float(np.prod(a.size)), float(np.prod(b.size))):
+            return True
+        small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
+        if a.images and b.images and not self._is_large(small):
+            return False
+        if closeness(small.cells, large.cells) <= 0.3:
+            return False
+        return large.cells.near(small.cells.points, 0.5 * tolerance(small.size) + 0.5 * s.voxel) >= 0.5
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""
@@ -309,51 +300,34 @@ class ObjectMap:
             "next": self._next,
             "stamp": self._stamp,
             "moved": self.moved,
-            "objects": [_packed(o) for o in self.objects.values()],
-            "gone": [[stamp, _packed(o)] for stamp, o in self.gone.values()],
+            "updates": self._updates,
+            "room": [self._room.scores, self._room.views],
+            "objects": [o.snapshot() for o in self.objects.values()],
+            "gone": [[stamp, o.snapshot()] for stamp, o in self.gone.values()],
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         side = self._settings.voxel
+        self._updates, (scores, self._room.views) = int(state["updates"]), state["room"]
+        self._room.scores = np.array(scores, np.float64)
         self._next, self._stamp, self.moved = int(state["next"]), state["stamp"], int(state["moved"])
-        objects = [_unpacked(row, side) for row in state["objects"]]
+        objects = [MapObject.restored(row, side) for row in state["objects"]]
         self.objects = {o.id: o for o in objects}
         self.gone = {}
         for stamp, row in state["gone"]:
-            old = _unpacked(row, side)
+            old = MapObject.restored(row, side)
             self.gone[old.id] = (int(stamp), old)
-
-
-def _tolerance(extent: Array) -> float:
-    """Returns how near points of one object are: a third of its middle extent, so that rows of books stay apart."""
-    return float(np.clip(0.35 * np.sort(extent)[1], 0.015, 0.12))
-
-
-def _closeness(cells: Cells, known: Cells) -> float:
-    """Returns 1 for small things whose middles agree, 0 for ones a middle extent apart; 0.5 for what may be a part."""
-    extent = np.sort(np.ptp(cells.points, axis=0))
-    if extent[2] > 0.4:
-        return 0.5
-    away = float(np.linalg.norm(cells.middle - known.middle))
-    return max(0.0, 1 - away / (max(float(extent[1]), 0.03) + 0.02))
 
 
 def _direction(eye: Array, cells: Cells) -> Array:
     """Returns the horizontal direction (2,) from the viewer to an object."""
-    way = (cells.points.mean(axis=0) - eye)[:2]
+    way = (cells.middle - eye)[:2]
     return np.asarray(way / max(float(np.hypot(*way)), 1e-6))
 
 
 def _log_odds(score: float, least: float) -> float:
     bounded = min(max(score, 0.02), 0.95)
     return max(math.log(bounded / (1 - bounded)), least)
-
-
-def _color_likeness(first: Array | None, second: Array) -> float:
-    """Returns 1 for equal mean colours, 0 for ones half the scale apart; a half where one is not known."""
-    if first is None or not np.isfinite(second).all():
-        return 0.5
-    return max(0.0, 1 - 2 * float(np.abs(first - second).max()))
 
 
 def _moved(old: MapObject, new: MapObject) -> bool:
@@ -363,15 +337,4 @@ def _moved(old: MapObject, new: MapObject) -> bool:
     sizes = np.sort(old.size[:2]), np.sort(new.size[:2])
     fits = np.abs(sizes[0] - sizes[1]).max() <= 0.1 + 0.4 * sizes[0].max()
     fits &= abs(old.size[2] - new.size[2]) <= 0.1 + 0.3 * old.size[2]
-    return bool(fits) and _color_likeness(new.color, old.color) >= 0.4
-
-
-def _packed(object: MapObject) -> dict[str, Any]:
-    return {name: getattr(object, name) for name in (*_PLAIN, *_ARRAYS)} | {"cells": object.cells.snapshot()}
-
-
-def _unpacked(state: Mapping[str, Any], side: float) -> MapObject:
-    cells = Cells(side)
-    cells.restore(state["cells"])
-    fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
-    return MapObject(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
+    return bool(fits) and color_likeness(new.color, old.color) >= 0.4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,8 @@ from dataflow.messages.geometry import invert, transform_points
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_ROW = 1 << 16
+_FAR = 1 << 30
+_WIDER = 2.0  # columns narrow towards the poles: at 60 degrees to half
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,34 +32,68 @@ class RangeView:
     def __init__(self, points: Array, T_world_sensor: Array, angle: float) -> None:
         """Takes points (N, 3) in the sensor's frame; `angle` is the side of a direction's bin, radians."""
         self._T_sensor_world = invert(T_world_sensor)
+        self._own, self._T_world_sensor = points, T_world_sensor
         self.origin = np.asarray(T_world_sensor, np.float64)[:3, 3]
         self._angle = angle
-        keys, ranges = self._directions(points)
-        order = np.lexsort((ranges, keys))
-        keys, ranges = keys[order], ranges[order]
-        self._keys, first = np.unique(keys, return_index=True)
-        self._nearest = ranges[first] if len(first) else np.zeros(0)
-        last = np.append(first[1:], len(keys)) - 1
-        self._farthest = ranges[last] if len(first) else np.zeros(0)
+        column, row, ranges = self._directions(points)
+        self._first = np.array([column.min(initial=_FAR), row.min(initial=_FAR)])
+        self._shape = (column.max(initial=-_FAR) - self._first[0] + 1, row.max(initial=-_FAR) - self._first[1] + 1)
+        self._nearest, self._farthest = np.full(0, np.inf), np.zeros(0)
+        if len(ranges):
+            bins = (column - self._first[0]) * self._shape[1] + row - self._first[1]
+            self._nearest = np.full(int(self._shape[0] * self._shape[1]), np.inf)
+            self._farthest = np.zeros(len(self._nearest))
+            np.minimum.at(self._nearest, bins, ranges)
+            np.maximum.at(self._farthest, bins, ranges)
         self.reach = float(ranges.max(initial=0.0))
+
+    @property
+    def points(self) -> Array:
+        """The returns (N, 3) in the world."""
+        return transform_points(self._T_world_sensor, self._own)
 
     def of(self, places: Array, margin: float) -> Sight:
         """Tells what the view says of places (N, 3) in the world, within a margin and 2 % of the range."""
-        keys, ranges = self._directions(transform_points(self._T_sensor_world, places))
-        if not len(self._keys):
+        column, row, ranges = self._directions(transform_points(self._T_sensor_world, places))
+        if not len(self._nearest):
             none = np.zeros(len(places), np.bool_)
             return Sight(none, none, none)
-        slot = np.searchsorted(self._keys, keys).clip(max=len(self._keys) - 1)
-        looked = self._keys[slot] == keys
+        column, row = column - self._first[0], row - self._first[1]
+        inside = (column >= 0) & (column < self._shape[0]) & (row >= 0) & (row < self._shape[1])
+        bins = np.where(inside, column * self._shape[1] + row, 0)
+        nearest, farthest = self._nearest[bins], self._farthest[bins]
+        looked = inside & (farthest > 0)
         slack = margin + 0.02 * ranges
-        free = looked & (self._nearest[slot] > ranges + slack)
-        confirmed = looked & (self._nearest[slot] <= ranges + slack) & (self._farthest[slot] >= ranges - slack)
+        free = looked & (nearest > ranges + slack)
+        confirmed = looked & (nearest <= ranges + slack) & (farthest >= ranges - slack)
         return Sight(looked, free, confirmed)
 
-    def _directions(self, points: Array) -> tuple[NDArray[np.int64], Array]:
-        ranges = np.linalg.norm(points, axis=1)
+    def may_show(self, centers: Array, radii: Array) -> Mask:
+        """Tells which spheres (N,) are at least partly in the directions and the range that the view covers."""
+        column, row, ranges = self._directions(transform_points(self._T_sensor_world, centers))
+        if not len(self._nearest):
+            return np.zeros(len(centers), np.bool_)
+        more = np.ceil(np.arcsin(np.clip(radii / np.maximum(ranges, 1e-9), 0, 1)) / self._angle) * _WIDER
+        across, up = column - self._first[0], row - self._first[1]
+        turned = (across + more >= 0) & (across - more < self._shape[0])
+        around = round(2 * np.pi / self._angle)
+        for turn in (-around, around):  # behind the sensor directions begin anew
+            turned |= (across + turn + more >= 0) & (across + turn - more < self._shape[0])
+        raised = (up + more >= 0) & (up - more < self._shape[1])
+        return np.asarray(((turned & raised) | (ranges <= radii)) & (ranges <= self.reach + radii))
+
+    def of_each(self, places: Sequence[Array], margin: float) -> list[Sight]:
+        """Tells the same of each of several sets of places."""
+        if not places:
+            return []
+        whole = self.of(np.concatenate(places), margin)
+        ends = np.cumsum([len(p) for p in places])[:-1]
+        parts = (np.split(values, ends) for values in (whole.looked, whole.free, whole.confirmed))
+        return [Sight(*part) for part in zip(*parts, strict=True)]
+
+    def _directions(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        ranges = np.sqrt(np.einsum("ij,ij->i", points, points))
         around = np.arctan2(points[:, 0], points[:, 2])
         rise = np.arcsin(np.clip(points[:, 1] / np.maximum(ranges, 1e-9), -1, 1))
-        column = np.floor(around / self._angle).astype(np.int64) + _ROW // 2
-        row = np.floor(rise / self._angle).astype(np.int64) + _ROW // 2
-        return column * _ROW + row, ranges
+        column = np.floor(around / self._angle).astype(np.int64)
+        return column, np.floor(rise / self._angle).astype(np.int64), ranges

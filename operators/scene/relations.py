@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from operators.scene.bodies import Body, BoxPairs
 
 Array = NDArray[np.float64]
 Relation = tuple[int, str, int]
@@ -39,37 +39,6 @@ FLOOR, ROBOT, ROOM = 0, -1, -2
 
 
 @dataclass(frozen=True)
-class Body:
-    """A node: centre (3,), full size (3,) and heading of its upright box, and its velocity (3,), m/s."""
-
-    id: int
-    label: str
-    center: Array
-    size: Array
-    yaw: float
-    velocity: Array
-    agent: bool = False
-
-    @property
-    def bottom(self) -> float:
-        return float(self.center[2] - self.size[2] / 2)
-
-    @property
-    def top(self) -> float:
-        return float(self.center[2] + self.size[2] / 2)
-
-    def corners(self) -> Array:
-        """Returns the four corners (4, 2) of the footprint, counter-clockwise."""
-        return self._corners
-
-    @cached_property
-    def _corners(self) -> Array:
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * self.size[:2] / 2
-        return np.asarray(half @ np.array([[c, s], [-s, c]]) + self.center[:2])
-
-
-@dataclass(frozen=True)
 class RelationRules:
     """Lengths in metres, speeds in m/s."""
 
@@ -84,68 +53,67 @@ class RelationRules:
     seats: tuple[str, ...] = ("chair",)
 
 
-def footprint_share(first: Body, second: Body) -> float:
-    """Returns the share of the first footprint's area that lies on the second."""
-    a, b = first.corners().astype(np.float32), second.corners().astype(np.float32)
-    area = float(first.size[0] * first.size[1])
-    shared, _ = cv2.intersectConvexConvex(a, b)
-    if area < 1e-6:
-        inside = cv2.pointPolygonTest(b, (float(first.center[0]), float(first.center[1])), False) >= 0
-        return float(inside)
-    return float(min(shared / area, 1.0))
+def relations_of(
+    bodies: Sequence[Body], T_world_robot: Array | None, rules: RelationRules, known: BoxPairs | None = None
+) -> dict[Relation, float]:
+    """Returns the relations that hold now between nodes, floor and robot among them, with their scores.
 
-
-def gap(first: Body, second: Body) -> float:
-    """Returns the distance between two boxes, 0 where they touch."""
-    vertical = max(0.0, first.bottom - second.top, second.bottom - first.top)
-    a, b = first.corners().astype(np.float32), second.corners().astype(np.float32)
-    if cv2.intersectConvexConvex(a, b)[0] > 0:
-        return vertical
-    level = min(
-        *(abs(float(cv2.pointPolygonTest(b, (float(x), float(y)), True))) for x, y in a),
-        *(abs(float(cv2.pointPolygonTest(a, (float(x), float(y)), True))) for x, y in b),
-    )
-    return float(np.hypot(level, vertical))
-
-
-def relations_of(bodies: Sequence[Body], T_world_robot: Array | None, rules: RelationRules) -> dict[Relation, float]:
-    """Returns the relations that hold now between nodes, floor and robot among them, with their scores."""
+    `known` spares what was worked out before for pairs of bodies that are where they were.
+    """
+    boxes = BoxPairs() if known is None else known
+    boxes.update(bodies)
     found: dict[Relation, float] = {}
     things = [b for b in bodies if b.id not in (FLOOR, ROOM, ROBOT)]
     floor = next((b for b in bodies if b.id == FLOOR), None)
     held: set[int] = set()
-    pairs = _close_pairs(things, 1.5 + rules.above)
+    around = _pairs(things, [b for b in things if b.agent], 1.5 + rules.above, flat=False)
+    stacks = _pairs(things, things, 0.0, flat=True)
+    beside = _pairs(things, things, 1.2 * rules.near, flat=False)
     for person in things:
         if person.agent:
-            held |= _contact(found, person, [b for b in pairs[person.id] if not b.agent], things, rules)
+            held |= _contact(found, person, [b for b in around[person.id] if not b.agent], things, boxes, rules)
+    sitting = {s for s, p, _ in found if p == "sitting_on"}
     for body in things:
-        if body.id not in held and not any(s == body.id and p == "sitting_on" for s, p, _ in found):
-            _placed(found, body, pairs[body.id], floor, rules)
+        if body.id not in held and body.id not in sitting:
+            _placed(found, body, stacks[body.id], floor, boxes, rules)
+    seen: dict[int, list[float]] = {}
+    if T_world_robot is not None:
+        seen = {b.id: (T_world_robot[:3, :2].T @ b.center).tolist() for b in things}
     for first in things:
-        for second in pairs[first.id]:
-            _stacked(found, first, second, rules)
+        for second in stacks[first.id]:
+            _stacked(found, first, second, boxes, rules)
+        for second in beside[first.id]:
             if first.id < second.id:
-                _beside(found, first, second, T_world_robot, rules)
-            if first.agent:
+                _beside(found, first, second, seen, boxes, rules)
+        if first.agent:
+            for second in around[first.id]:
                 _moving(found, first, second, rules)
     if any(b.id == ROOM for b in bodies):
         found |= {(b.id, "part_of", ROOM): 1.0 for b in bodies if b.id == FLOOR}
     return found
 
 
-def _close_pairs(things: Sequence[Body], reach: float) -> dict[int, list[Body]]:
-    """Returns the other things whose spheres come within a reach of each thing's."""
-    centers = np.array([b.center for b in things]).reshape(-1, 3)
-    radii = np.array([float(np.linalg.norm(b.size)) / 2 for b in things])
+def _pairs(things: Sequence[Body], of: Sequence[Body], reach: float, *, flat: bool) -> dict[int, list[Body]]:
+    """Returns the other things whose spheres, or circles as seen from above, come within a reach of each one's."""
+    axes = 2 if flat else 3
+    centers = np.array([b.center[:axes] for b in things]).reshape(-1, axes)
+    radii = np.array([float(np.linalg.norm(b.size[:axes])) / 2 for b in things])
+    row = {b.id: k for k, b in enumerate(things)}
     close: dict[int, list[Body]] = {}
-    for k, body in enumerate(things):
-        apart = np.linalg.norm(centers - centers[k], axis=1) - radii - radii[k]
+    for body in of:
+        k = row[body.id]
+        apart = np.sqrt(((centers - centers[k]) ** 2).sum(axis=1)) - radii - radii[k]
         close[body.id] = [things[j] for j in np.flatnonzero(apart <= reach).tolist() if j != k]
     return close
 
 
 def _placed(
-    found: dict[Relation, float], body: Body, others: Sequence[Body], floor: Body | None, rules: RelationRules
+    found: dict[Relation, float],
+    body: Body,
+    others: Sequence[Body],
+    floor: Body | None,
+    boxes: BoxPairs,
+    rules: RelationRules,
 ) -> None:
     """Finds what a thing is in, or else what it stands or lies on: one thing at most."""
     best: tuple[float, str, int] = (0.0, "", 0)
@@ -153,15 +121,18 @@ def _placed(
     for other in others:
         if other.agent:
             continue
-        share = footprint_share(body, other)
+        off = abs(body.bottom - other.top)
+        upon = off <= 2 * rules.touch and body.center[2] > other.top
+        if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
+            continue
+        share = boxes.share(body, other)
         if other.label in rules.containers and float(np.prod(other.size)) > 1.5 * volume and share > 0.3:
             inside = min(body.top, other.top) - max(body.bottom, other.bottom)
             deep = inside / max(float(body.size[2]), 1e-3)
             if deep > 0.5 and body.center[2] < other.top - 0.02:
                 best = max(best, (0.5 * min(1.0, share / 0.6) + 0.5 * min(1.0, deep), "in", other.id))
                 continue
-        off = abs(body.bottom - other.top)
-        if share > 0.3 and off <= 2 * rules.touch and body.center[2] > other.top:
+        if share > 0.3 and upon:
             best = max(best, (min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)), "on", other.id))
     height = body.bottom if floor is None else body.bottom - floor.top
     if best[0] < 0.5 and floor is not None and height <= 0.3:
@@ -170,29 +141,36 @@ def _placed(
         found[body.id, best[1], best[2]] = best[0]
 
 
-def _stacked(found: dict[Relation, float], first: Body, second: Body, rules: RelationRules) -> None:
+def _stacked(found: dict[Relation, float], first: Body, second: Body, boxes: BoxPairs, rules: RelationRules) -> None:
     """Finds above and under of things that do not touch."""
     between = first.bottom - second.top
-    if rules.touch < between <= rules.above and footprint_share(first, second) > 0.5:
+    if rules.touch < between <= rules.above and boxes.share(first, second) > 0.5:
         found[first.id, "above", second.id] = 1 - 0.5 * between / rules.above
     if second.top > first.top and second.bottom < first.bottom + 0.1 and not second.agent:
-        share = footprint_share(first, second)  # it stands beneath a table: within its box
+        share = boxes.share(first, second)  # it stands beneath a table: within its box
         if share > 0.4 and second.label not in rules.containers and first.top < second.top - rules.touch:
             found[first.id, "under", second.id] = share
 
 
 def _beside(
-    found: dict[Relation, float], first: Body, second: Body, T_world_robot: Array | None, rules: RelationRules
+    found: dict[Relation, float],
+    first: Body,
+    second: Body,
+    seen: Mapping[int, Sequence[float]],
+    boxes: BoxPairs,
+    rules: RelationRules,
 ) -> None:
-    """Finds near, and of things near each other which is left of or in front of the other for the robot."""
-    apart = gap(first, second)
+    """Finds near, and of things near each other which is left of or in front of the other.
+
+    `seen` are how far ahead and how far left each is for the robot; empty without one.
+    """
+    apart = boxes.gap(first, second)
     if apart > 1.2 * rules.near:
         return
-    found[first.id, "near", second.id] = float(np.clip(1 - 0.5 * apart / rules.near, 0, 1))
-    if T_world_robot is None or apart > rules.near:
+    found[first.id, "near", second.id] = min(max(1 - 0.5 * apart / rules.near, 0.0), 1.0)
+    if not seen or apart > rules.near:
         return
-    offset = first.center - second.center
-    y, x = float(offset @ T_world_robot[:3, 1]), float(offset @ T_world_robot[:3, 0])
+    x, y = (a - b for a, b in zip(seen[first.id], seen[second.id], strict=True))
     larger, smaller = max(abs(x), abs(y)), min(abs(x), abs(y))
     if larger < rules.side:
         return
@@ -206,7 +184,12 @@ def _beside(
 
 
 def _contact(
-    found: dict[Relation, float], person: Body, others: Sequence[Body], things: Sequence[Body], rules: RelationRules
+    found: dict[Relation, float],
+    person: Body,
+    others: Sequence[Body],
+    things: Sequence[Body],
+    boxes: BoxPairs,
+    rules: RelationRules,
 ) -> set[int]:
     """Finds what an agent sits on and what it holds; returns the ids of what is held."""
     held = set()
@@ -218,13 +201,13 @@ def _contact(
                 found[person.id, "sitting_on", other.id] = 1 - away
         elif float(other.size.max()) <= rules.small and person.label == "person":
             supported = any(
-                abs(other.bottom - b.top) < rules.touch and footprint_share(other, b) > 0.3
+                abs(other.bottom - b.top) < rules.touch and boxes.share(other, b) > 0.3
                 for b in things
                 if not b.agent and b.id != other.id
             )
             lifted = 0.5 < other.center[2] - person.bottom < float(person.size[2]) + 0.1
-            if not supported and lifted and gap(person, other) < rules.hand / 2:
-                found[person.id, "holding", other.id] = 1 - gap(person, other) / rules.hand
+            if not supported and lifted and boxes.gap(person, other) < rules.hand / 2:
+                found[person.id, "holding", other.id] = 1 - boxes.gap(person, other) / rules.hand
                 held.add(other.id)
     return held
 

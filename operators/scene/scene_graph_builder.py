@@ -14,8 +14,9 @@ from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES
+from operators.scene.bodies import Body
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
-from operators.scene.relations import FLOOR, ROBOT, ROOM, Body, RelationRules
+from operators.scene.relations import FLOOR, ROBOT, ROOM, RelationRules
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""

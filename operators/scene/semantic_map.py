@@ -9,16 +9,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Boxes3D, Clusters, Diagnostics, Odometry, PointCloud, Pose, SceneGraph, Transforms
+from dataflow.messages import (
+    Boxes3D,
+    CameraInfo,
+    Clusters,
+    Detections2D,
+    Diagnostics,
+    Odometry,
+    PointCloud,
+    Pose,
+    SceneGraph,
+    Transforms,
+)
 from dataflow.messages.diagnostics import Level
-from dataflow.messages.geometry import quaternion_from_yaw, transform_points
+from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.cloud.filtering import finite
+from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
 from operators.scene.class_sizes import CLASS_SIZES
-from operators.scene.object_map import MapObject, MapSettings, ObjectMap, Observation
+from operators.scene.cuboid import ImageView
+from operators.scene.map_object import MapObject
+from operators.scene.matching import MapSettings, Observation
+from operators.scene.object_map import ObjectMap
 from operators.scene.range_view import RangeView
 from operators.status import counted_status
+
+_BORDER = 3.0  # pixels; boxes that end nearer to the image's edge may go on beyond it
 
 
 class SemanticMap(Operator):
@@ -42,15 +58,24 @@ class SemanticMap(Operator):
     extrinsics: Sampled[Transforms] = Sampled(
         required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
     )
+    images: Sampled[Detections2D] = Sampled(
+        required=False,
+        doc="the image's boxes of the same objects, in their order; not used where of another stamp",
+    )
+    image_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of that image")
     objects: Out[Boxes3D] = Out(doc="the objects that are surely there, in the map's frame; scores are probabilities")
     nodes: Out[SceneGraph] = Out(doc="the same objects as nodes without relations, with when each was last seen")
     status: Out[Diagnostics] = Out(doc="objects by what became of them; a warning for a view without points")
 
     voxel: float = Param(0.03, gt=0.005, le=0.2, doc="side of the voxels that objects consist of", unit="m")
     overlap: float = Param(0.25, gt=0, le=1, doc="share of a view's points that are near those of the object it is of")
+    image_overlap: float = Param(
+        0.3, gt=0, le=1, doc="IoU in the image of an object's box and that of a view that is of it"
+    )
     confirm: float = Param(1.0, gt=0, doc="evidence from which an object is given, in log odds")
     views: int = Param(3, ge=1, doc="and views from which it was seen")
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
+    plain: float = Param(0.03, gt=0, doc="angle of view from which an object should be detected", unit="rad")
     movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
     mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
@@ -72,6 +97,8 @@ class SemanticMap(Operator):
         cloud: PointCloud,
         pose: Pose | Odometry,
         extrinsics: Transforms | None = None,
+        images: Detections2D | None = None,
+        image_info: CameraInfo | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError where boxes, clusters and cloud do not belong together or the pose's frame changes."""
         if clusters.count != boxes.count or len(clusters.labels) != cloud.count:
@@ -82,13 +109,19 @@ class SemanticMap(Operator):
         known = self._opened(boxes, pose)
         sensor = pose.child_frame or cloud.frame
         T = pose.matrix() @ transform_between(extrinsics, cloud.frame, sensor)
-        usable = np.flatnonzero(finite(cloud.points))
+        usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
         points = cloud.points[usable].astype(np.float64)
-        near = np.linalg.norm(points, axis=1) <= self.max_range
-        usable, points = usable[near], points[near]
         labels, world = clusters.labels[usable], transform_points(T, points)
-        seen = [self._observation(boxes, cloud, usable[labels == k], world[labels == k], k) for k in range(boxes.count)]
-        known.update(cloud.stamp, [each for each in seen if each is not None], RangeView(points, T, 0.012))
+        shown = _images(boxes, cloud, images, image_info, T, extrinsics)
+        seen = [
+            self._observation(boxes, cloud, rows, usable, world, k, shown[k])
+            for k, rows in enumerate(_rows_of(labels, boxes.count))
+        ]
+        known.update(
+            cloud.stamp,
+            [each for each in seen if each is not None],
+            RangeView(points[:: 1 + len(points) // 20_000], T, 0.012),
+        )
         objects = known.confirmed()
         counts = {
             "objects": len(objects),
@@ -105,6 +138,15 @@ class SemanticMap(Operator):
             "nodes": self._nodes(cloud.stamp, objects),
             "status": _status(cloud.stamp, counts),
         }
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Names of the classes, by id; empty before the first view."""
+        return self._classes
+
+    def entries(self) -> list[MapObject]:
+        """Returns all objects, those too that are not surely there."""
+        return [] if self._map is None else list(self._map.objects.values())
 
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: so does the map."""
@@ -143,6 +185,8 @@ class SemanticMap(Operator):
         settings = MapSettings(
             voxel=self.voxel,
             overlap=self.overlap,
+            image_overlap=self.image_overlap,
+            miss_angle=self.plain,
             confirm=self.confirm,
             views=self.views,
             missed=self.missed,
@@ -154,12 +198,20 @@ class SemanticMap(Operator):
         return ObjectMap(max(len(self._classes), 1), movers, settings, usual)
 
     def _observation(
-        self, boxes: Boxes3D, cloud: PointCloud, rows: NDArray[np.intp], world: NDArray[np.float64], k: int
+        self,
+        boxes: Boxes3D,
+        cloud: PointCloud,
+        rows: NDArray[np.intp],
+        usable: NDArray[np.intp],
+        world: NDArray[np.float64],
+        k: int,
+        image: ImageView | None,
     ) -> Observation | None:
         if len(rows) < 3:
             return None
-        color = None if cloud.colors is None else cloud.colors[rows].mean(axis=0) / 255.0
-        return Observation(world, int(boxes.class_ids[k]) if self._classes else 0, float(boxes.scores[k]), color)
+        color = None if cloud.colors is None else cloud.colors[usable[rows]].mean(axis=0) / 255.0
+        class_id = int(boxes.class_ids[k]) if self._classes else 0
+        return Observation(world[rows], class_id, float(boxes.scores[k]), color, image)
 
     def _boxes(self, stamp: int, objects: list[MapObject]) -> Boxes3D:
         return Boxes3D(
@@ -191,6 +243,37 @@ class SemanticMap(Operator):
             subjects=np.zeros(0, np.int32),
             objects=np.zeros(0, np.int32),
         )
+
+
+def _rows_of(labels: NDArray[np.int32], count: int) -> list[NDArray[np.intp]]:
+    """Returns the rows of each label from 0 on."""
+    order = np.argsort(labels, kind="stable")
+    ends = np.searchsorted(labels[order], np.arange(count + 1))
+    return [order[ends[k] : ends[k + 1]] for k in range(count)]
+
+
+def _images(
+    boxes: Boxes3D,
+    cloud: PointCloud,
+    images: Detections2D | None,
+    info: CameraInfo | None,
+    T_map_cloud: NDArray[np.float64],
+    extrinsics: Transforms | None,
+) -> list[ImageView | None]:
+    """Returns what the image shows of each object; None where there is no image of the same time."""
+    if images is None or info is None or images.stamp != boxes.stamp or images.count != boxes.count:
+        return [None] * boxes.count
+    if (images.width, images.height, images.frame) != (info.width, info.height, info.frame):
+        raise ValueError(
+            f"images are of {images.width}x{images.height} pixels in {images.frame!r}, but image_info describes "
+            f"{info.width}x{info.height} in {info.frame!r}"
+        )
+    T_image_map = transform_between(extrinsics, cloud.frame, images.frame) @ invert(T_map_cloud)
+    P, eye = np.asarray(info.K) @ T_image_map[:3], invert(T_image_map)[:3, 3]
+    size = np.array([images.width, images.height, images.width, images.height])
+    rows = images.boxes.astype(np.float64)
+    whole = np.where(np.arange(4) < 2, rows > _BORDER, rows < size - _BORDER)
+    return [ImageView(P, box - 0.5, edges, eye) for box, edges in zip(rows, whole, strict=True)]
 
 
 def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:

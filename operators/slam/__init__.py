@@ -1,5 +1,6 @@
 """Simultaneous localisation and mapping."""
 
 from operators.slam.landmark_slam import LandmarkSlam
+from operators.slam.visual_slam import VisualSlam
 
-__all__ = ["LandmarkSlam"]
+__all__ = ["LandmarkSlam", "VisualSlam"]

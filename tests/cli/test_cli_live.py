@@ -175,3 +175,22 @@ def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, runni
     running.end()
     assert "no graph runs" in dataflow("list").stderr
     assert json.loads(dataflow("list", "--json").stdout) == []
+
+
+@pytest.mark.usefixtures("running")
+def test_a_running_graph_is_recorded_by_pattern_and_what_it_lacks_is_said(dataflow, tmp_path: Path) -> None:
+    told = dataflow("record", "left/*", "-o", tmp_path / "a.mcap", "--seconds", 1)
+
+    assert "without firing records" in told.stderr
+    found = json.loads(dataflow("info", tmp_path / "a.mcap", "--json").stdout)
+    assert {s["name"] for s in found["streams"] if s["count"]} == {
+        f"test/left/{p}" for p in ("constant", "fast", "slow")
+    }
+    assert "left no firing records" in dataflow("verify", tmp_path / "a.mcap", code=2).stderr
+
+
+@pytest.mark.usefixtures("running")
+def test_what_plays_no_recording_and_has_no_flight_recorder_says_so(dataflow) -> None:
+    assert "plays no recording" in dataflow("playback", "pause", code=2).stderr
+    assert "has no flight recorder" in dataflow("trigger", code=2).stderr
+    assert "expected pause, resume, step or status" in dataflow("playback", "rewind", code=2).stderr

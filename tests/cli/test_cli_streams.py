@@ -44,7 +44,7 @@ def shell(command: str, *words: object, folder: Path | None = None) -> subproces
     return subprocess.run(call, cwd=folder, env=environment, capture_output=True, text=True, timeout=60)
 
 
-@pytest.mark.parametrize("module", ["typer", "dataflow.cli.run", "dataflow.recording"])
+@pytest.mark.parametrize("module", ["typer", "dataflow.cli.recordings", "dataflow.recording"])
 def test_ctrl_c_while_something_is_imported_is_no_error(small: Path, module: str) -> None:
     told = subprocess.run(
         [sys.executable, "-c", INTERRUPTED_IMPORT, module, "info", str(small)],

@@ -18,6 +18,7 @@ FOR_TESTS = {
 CALLED_BY_OTHERS = {
     "list_commands",  # Typer asks a group for the commands of its help
     "get_next",  # onnxruntime asks a calibration reader
+    # click asks a group
     "on_playback_control_request",  # Foxglove's server tells its listener
     "on_subscribe",
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -35,3 +37,10 @@ def test_streams_that_are_followed_belong_to_the_graph_that_was_started(quoted: 
             followed += 1
             assert f"{running.namespace}/{command.words[1]}" in running.streams
     assert followed
+
+
+def test_every_extra_has_a_row_that_says_what_it_brings(repository: Path) -> None:
+    project = tomllib.loads((repository / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    readme = (repository / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `\[(\w+)\]` \|", readme, re.MULTILINE)
+    assert sorted(rows) == sorted(project["optional-dependencies"]), "README.md: What an install costs"

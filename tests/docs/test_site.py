@@ -42,7 +42,7 @@ def named(entry: Any) -> Iterator[str]:
 def test_every_page_stands_in_the_navigation_once(site: dict[str, Any], hooks: ModuleType, repository: Path) -> None:
     own = [str(page.relative_to(repository)) for page in (repository / "docs").rglob("*.md")]
     pages = [hooks.place_of(file) for file in (*own, *hooks.pages())]
-    listed = list(named(site["nav"]))
+    listed = [*named(site["nav"]), *hooks.figures()]
 
     missing = sorted(set(pages) - set(listed))
     assert not missing, f"docs/site/mkdocs.yml: nav lacks {', '.join(missing)}"

@@ -24,7 +24,8 @@ from dataflow.interop.export.ros2 import export_ros2
 from dataflow.interop.export.tables import export_csv, export_parquet
 from dataflow.interop.opening import open_bag
 from dataflow.interop.ros import CONVERSIONS
-from dataflow.interop.ros.outward import OUTWARD, typestore
+from dataflow.interop.ros.made import typestore
+from dataflow.interop.ros.outward import OUTWARD
 from dataflow.messages import (
     Boxes3D,
     CameraInfo,

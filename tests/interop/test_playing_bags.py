@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from made_bags import SECOND, header, ros, write_ros2, xyz, xyzw
+from rosbags.highlevel import AnyReader
 
 import dataflow
 from dataflow.graph import load_graph
 from dataflow.interop.mapping import MappingError
+from dataflow.interop.opening import open_bag
 from dataflow.interop.playing import match, play
 from dataflow.recording import Recording
 
@@ -109,3 +112,29 @@ def test_camera_bag_of_others_feeds_a_detector_and_verifies(data_dir: Path, tmp_
     with Recording(out) as made:
         assert made.streams["detection/detector/detections"].count == 10
     assert dataflow.verify(out).identical
+
+
+def test_topics_that_are_not_played_survive_in_the_recording_byte_for_byte(
+    graph: Path, bag: Path, tmp_path: Path
+) -> None:
+    rows = [
+        (topic, 1_700_000_000 * SECOND + k, ros("std_msgs/String", data=f"{topic} {k}"))
+        for topic in ("/said", "/odd")
+        for k in range(3)
+    ]
+    both = write_ros2(tmp_path / "both", [*rows, *_rows_of(bag)])
+    file = tmp_path / "out.mcap"
+
+    dataflow.replay(both, graph=str(graph), record=file, maps=dict(word.split("=") for word in MAPS))
+
+    before, after = open_bag(both), open_bag(file)
+    kept = [(s.topic, s.log_time, bytes(s.data)) for s in before.messages(["/said", "/odd"])]
+    assert [(s.topic, s.log_time, bytes(s.data)) for s in after.messages(["/said", "/odd"])] == kept
+    assert len(kept) == 6
+    assert after.topics["/said"].schema == before.topics["/said"].schema
+    assert dataflow.verify(file).identical
+
+
+def _rows_of(bag: Path) -> list[Any]:
+    with AnyReader([bag]) as reader:
+        return [(c.topic, t, reader.deserialize(raw, c.msgtype)) for c, t, raw in reader.messages()]

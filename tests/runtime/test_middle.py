@@ -107,3 +107,14 @@ def test_a_tolerance_for_messages_is_none_for_the_states_between_them(recorded: 
 def test_a_start_beyond_the_end_is_refused(recorded: Path) -> None:
     with pytest.raises(ReplayError, match="s long"):
         verify(recorded, start=1e9)
+
+
+def test_a_replay_that_begins_where_a_state_was_recorded_gives_nothing_twice(recorded: Path, tmp_path: Path) -> None:
+    with Recording(recorded) as recording:
+        first = min(s.first for s in recording.streams.values() if s.first and not s.static)
+        state = next(r.stamp for r in recorded_firings(recording, "tuned") if r.kind == "snapshot" and r.stamp > first)
+
+    replay(recorded, start=(state - first) * 1e-9, placement="one_process", record=tmp_path / "again.mcap")
+
+    whole, part = messages(recorded), messages(tmp_path / "again.mcap")
+    assert part["test/tuned/y"].items() <= whole["test/tuned/y"].items()

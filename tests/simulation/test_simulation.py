@@ -176,7 +176,7 @@ def test_seeds(first: int, memory: Path) -> None:
 
 FOUND_BY = {
     "frontier": replace(PLAIN, graph="diamond", happenings=(Happening(0.01, "freeze", "two", {"span": 0.2}),)),
-    "C8": replace(
+    "frozen": replace(
         PLAIN,
         graph="join",
         live=True,

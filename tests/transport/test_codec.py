@@ -305,3 +305,29 @@ def test_a_small_body_is_decoded_as_any_other(data: st.DataObject) -> None:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(codec, "_SMALL_BODY", -1)
         assert outcome(bytes(wire)) == whole
+
+
+def test_a_body_that_came_before_is_decoded_by_the_class_that_is_asked_for_now() -> None:
+    """What a body says is kept, since most of a stream are equal; a class that was declared anew takes its place."""
+    wires = [encode(message_envelope(sample(stamp, mask=None, pixels=None))) for stamp in (7, 8)]
+    first, second = (decode(wire).message for wire in wires)
+
+    class Anew(Message):
+        """The same fields, of another class."""
+
+    Anew.SCHEMA, Anew.SCALARS, Anew.ARRAYS = CodecSample.SCHEMA, CodecSample.SCALARS, CodecSample.ARRAYS
+    anew = decode(wires[1], types=lambda schema: Anew).message
+
+    assert first is not None
+    assert second is not None
+    assert (first.stamp, second.stamp) == (7, 8)
+    assert second == sample(8, mask=None, pixels=None)
+    assert type(anew) is Anew
+    assert type(decode(wires[1]).message) is CodecSample
+
+
+def test_few_bodies_are_kept() -> None:
+    for count in range(3 * codec._MOST_BODIES):
+        assert decode(encode(message_envelope(sample(count=count, mask=None, pixels=None)))).message is not None
+
+    assert len(codec._bodies) <= codec._MOST_BODIES

@@ -39,7 +39,7 @@ from dataflow.messages import (
 )
 from dataflow.messages.declaration import Declaration, generic_type
 from dataflow.view import SceneState, ViewOptions, colors, visualize
-from dataflow.view.canvas import visualizers
+from dataflow.view.canvas import roles_of
 from dataflow.view.layout import layout
 
 TYPES = [
@@ -68,7 +68,7 @@ def draw(
 
 def test_every_message_type_has_a_visualizer_of_its_own() -> None:
     assert len(TYPES) > 30
-    assert [t.__name__ for t in TYPES if t not in visualizers()] == []
+    assert [t.__name__ for t in TYPES if not roles_of(t)] == []
 
 
 @pytest.mark.parametrize("message_type", TYPES, ids=lambda t: t.__name__)

@@ -1,4 +1,4 @@
-"""Folders as datasets have them: TUM RGB-D, 7-Scenes, EuRoC, KITTI odometry."""
+"""Folders as datasets have them: TUM RGB-D, 7-Scenes, EuRoC, KITTI odometry and raw."""
 
 from __future__ import annotations
 
@@ -8,28 +8,30 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.interop.conversions import convert
+from dataflow.interop.export.frames import (
+    DEPTHS,
+    IMAGES,
+    POSES,
+    messages_as,
+    nearest,
+    optional,
+    write_png,
+    write_rows,
+    write_text,
+)
+from dataflow.interop.export.kitti_raw import export_kitti_raw
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import (
     CameraInfo,
-    CompressedDepth,
-    CompressedImage,
     DepthImage,
     Image,
     Imu,
-    Message,
-    Odometry,
     Pose,
 )
 from dataflow.messages.geometry import transform_matrix
 from dataflow.recording.errors import RecordingError
 
-PAIR_WITHIN = 20_000_000
-"""Image, depth and pose of one frame lie at most this far apart (ns)."""
-_IMAGES = (Image, CompressedImage)
-_DEPTHS = (DepthImage, CompressedDepth)
-_POSES = (Pose, Odometry)
 TUM_UNITS, SCENES_UNITS = 5000.0, 1000.0
 
 
@@ -38,45 +40,45 @@ def export_tum(material: Material, folder: Path, done: Exported) -> None:
 
     Without images it is a trajectory alone. Poses are those of `frame` to `child_frame` as they are recorded.
     """
-    lists = {"rgb.txt": _optional(material, *_IMAGES), "depth.txt": _optional(material, *_DEPTHS)}
-    poses = _optional(material, *_POSES)
+    lists = {"rgb.txt": optional(material, *IMAGES), "depth.txt": optional(material, *DEPTHS)}
+    poses = optional(material, *POSES)
     if poses is None and not any(lists.values()):
         raise RecordingError(f"{material.path}: TUM RGB-D takes images, depth or poses; there are none")
     rows: dict[str, list[str]] = {"rgb.txt": [], "depth.txt": [], "groundtruth.txt": []}
     for name, kind, units in (("rgb.txt", Image, None), ("depth.txt", DepthImage, TUM_UNITS)):
         stream = lists[name]
-        for message in _messages(material, stream, kind, done):
+        for message in messages_as(material, stream, kind, done):
             place = f"{name[:-4]}/{_seconds(message.stamp)}.png"
-            _write_png(folder / place, message, units)
+            write_png(folder / place, message, units)
             rows[name].append(f"{_seconds(message.stamp)} {place}")
-    for message in _messages(material, poses, Pose, done):
+    for message in messages_as(material, poses, Pose, done):
         assert isinstance(message, Pose)
         values = [*message.position.tolist(), *message.orientation.tolist()]
         rows["groundtruth.txt"].append(" ".join([_seconds(message.stamp), *map(repr, values)]))
     for name, found in rows.items():
         if found:
             head = "# timestamp tx ty tz qx qy qz qw\n" if name == "groundtruth.txt" else "# timestamp filename\n"
-            _write(folder / name, head + "\n".join(found) + "\n", done)
+            write_text(folder / name, head + "\n".join(found) + "\n", done)
     _intrinsics(material, folder, done)
 
 
 def export_7scenes(material: Material, folder: Path, done: Exported) -> None:
     """Writes frame-NNNNNN.color.png, .depth.png (millimetres) and .pose.txt, and camera-intrinsics.txt."""
-    images = {m.stamp: m for m in _messages(material, material.only("7-Scenes", *_IMAGES), Image, done)}
-    poses = {m.stamp: m for m in _messages(material, _optional(material, *_POSES), Pose, done)}
+    images = {m.stamp: m for m in messages_as(material, material.only("7-Scenes", *IMAGES), Image, done)}
+    poses = {m.stamp: m for m in messages_as(material, optional(material, *POSES), Pose, done)}
     count = 0
-    for depth in _messages(material, material.only("7-Scenes", *_DEPTHS), DepthImage, done):
-        image = _nearest(images, depth.stamp)
+    for depth in messages_as(material, material.only("7-Scenes", *DEPTHS), DepthImage, done):
+        image = nearest(images, depth.stamp)
         if image is None:
             continue
         stem = f"frame-{count:06d}"
-        _write_png(folder / f"{stem}.color.png", image, None)
-        _write_png(folder / f"{stem}.depth.png", depth, SCENES_UNITS)
-        pose = _nearest(poses, depth.stamp)
+        write_png(folder / f"{stem}.color.png", image, None)
+        write_png(folder / f"{stem}.depth.png", depth, SCENES_UNITS)
+        pose = nearest(poses, depth.stamp)
         if pose is not None:
             assert isinstance(pose, Pose)
             rows = transform_matrix(pose.position, pose.orientation)
-            _write(folder / f"{stem}.pose.txt", _matrix_text(rows), None)
+            write_text(folder / f"{stem}.pose.txt", _matrix_text(rows), None)
         count += 1
     if not count:
         raise RecordingError(f"{material.path}: no image lies within 20 ms of a depth image")
@@ -91,25 +93,25 @@ def export_euroc(material: Material, folder: Path, done: Exported) -> None:
         head = "#timestamp [ns],w_x [rad s^-1],w_y [rad s^-1],w_z [rad s^-1],a_x [m s^-2],a_y [m s^-2],a_z [m s^-2]"
         rows = (
             [str(m.stamp), *map(repr, [*m.angular_velocity.tolist(), *m.linear_acceleration.tolist()])]
-            for m in _messages(material, stream, Imu, done)
+            for m in messages_as(material, stream, Imu, done)
             if isinstance(m, Imu)
         )
-        _write_rows(root / f"imu{k}" / "data.csv", head, rows, done)
-    for k, stream in enumerate(material.of_type(*_IMAGES)):
+        write_rows(root / f"imu{k}" / "data.csv", head, rows, done)
+    for k, stream in enumerate(material.of_type(*IMAGES)):
         names = []
-        for message in _messages(material, stream, Image, done):
-            _write_png(root / f"cam{k}" / "data" / f"{message.stamp}.png", message, None)
+        for message in messages_as(material, stream, Image, done):
+            write_png(root / f"cam{k}" / "data" / f"{message.stamp}.png", message, None)
             names.append([str(message.stamp), f"{message.stamp}.png"])
-        _write_rows(root / f"cam{k}" / "data.csv", "#timestamp [ns],filename", iter(names), done)
-    truth = _optional(material, *_POSES)
+        write_rows(root / f"cam{k}" / "data.csv", "#timestamp [ns],filename", iter(names), done)
+    truth = optional(material, *POSES)
     if truth is not None:
         head = "#timestamp, p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], q_RS_z []"
         states = (
             [str(m.stamp), *map(repr, [*m.position.tolist(), float(m.orientation[3]), *m.orientation[:3].tolist()])]
-            for m in _messages(material, truth, Pose, done)
+            for m in messages_as(material, truth, Pose, done)
             if isinstance(m, Pose)
         )
-        _write_rows(root / "state_groundtruth_estimate0" / "data.csv", head, states, done)
+        write_rows(root / "state_groundtruth_estimate0" / "data.csv", head, states, done)
     if not done.files:
         raise RecordingError(f"{material.path}: EuRoC takes IMU readings, images or poses; there are none")
 
@@ -119,19 +121,19 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
 
     The first camera's frames count; a frame without its partner ends the command. Times begin at 0.
     """
-    cameras = material.of_type(*_IMAGES)[:2]
+    cameras = material.of_type(*IMAGES)[:2]
     if not cameras:
         raise RecordingError(f"{material.path}: KITTI odometry takes images; there are none")
     stamps: list[list[int]] = []
     for k, stream in enumerate(cameras):
         stamps.append([])
-        for message in _messages(material, stream, Image, done):
-            _write_png(folder / f"image_{k}" / f"{len(stamps[k]):06d}.png", message, None)
+        for message in messages_as(material, stream, Image, done):
+            write_png(folder / f"image_{k}" / f"{len(stamps[k]):06d}.png", message, None)
             stamps[k].append(message.stamp)
     if len(cameras) == 2 and stamps[0] != stamps[1]:
         raise RecordingError(f"{material.path}: the two cameras' images do not have the same stamps")
     first = stamps[0][0] if stamps[0] else 0
-    _write(folder / "times.txt", "".join(f"{(s - first) * 1e-9:e}\n" for s in stamps[0]), done)
+    write_text(folder / "times.txt", "".join(f"{(s - first) * 1e-9:e}\n" for s in stamps[0]), done)
     infos = [m for name in material.of_type(CameraInfo) for m in material.messages([name])][: len(cameras)]
     lines = []
     for k, found in enumerate(infos):
@@ -140,15 +142,15 @@ def export_kitti(material: Material, folder: Path, done: Exported) -> None:
         P = np.hstack([info.K, np.zeros((3, 1))]) if info.P is None else info.P
         lines.append(f"P{k}: " + " ".join(f"{v:.12e}" for v in P.ravel()))
     if lines:
-        _write(folder / "calib.txt", "\n".join(lines) + "\n", done)
-    truth = {m.stamp: m for m in _messages(material, _optional(material, *_POSES), Pose, done)}
+        write_text(folder / "calib.txt", "\n".join(lines) + "\n", done)
+    truth = {m.stamp: m for m in messages_as(material, optional(material, *POSES), Pose, done)}
     if truth:
-        poses = [_nearest(truth, stamp) for stamp in stamps[0]]
+        poses = [nearest(truth, stamp) for stamp in stamps[0]]
         if any(pose is None for pose in poses):
             done.left_out["poses.txt"] = "some images have no pose within 20 ms"
         else:
             rows = [transform_matrix(p.position, p.orientation)[:3].ravel() for p in poses if isinstance(p, Pose)]
-            _write(folder / "poses.txt", "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), done)
+            write_text(folder / "poses.txt", "".join(" ".join(f"{v:.9e}" for v in row) + "\n" for row in rows), done)
 
 
 DATASETS: dict[str, Callable[[Material, Path, Exported], None]] = {
@@ -156,45 +158,12 @@ DATASETS: dict[str, Callable[[Material, Path, Exported], None]] = {
     "7scenes": export_7scenes,
     "euroc": export_euroc,
     "kitti": export_kitti,
+    "kitti-raw": export_kitti_raw,
 }
-
-
-def _optional(material: Material, *types: type[Message]) -> str | None:
-    """The one stream of some types, None where there is none; raises `RecordingError` for several."""
-    return material.only("the format", *types) if material.of_type(*types) else None
-
-
-def _messages(material: Material, stream: str | None, kind: type[Message], done: Exported) -> Iterator[Any]:
-    """The messages of a stream as one type."""
-    for recorded in material.messages([stream]) if stream is not None else ():
-        done.count(material.names[recorded.stream])
-        yield convert(recorded.message, kind)
-
-
-def _nearest(messages: dict[int, Any], stamp: int) -> Any | None:
-    if stamp in messages:
-        return messages[stamp]
-    near: int | None = min(messages, key=lambda s: abs(s - stamp), default=None)
-    return messages[near] if near is not None and abs(near - stamp) <= PAIR_WITHIN else None
 
 
 def _seconds(stamp: int) -> str:
     return f"{stamp // 10**9}.{stamp % 10**9:09d}"
-
-
-def _write_png(path: Path, message: Image | DepthImage, units: float | None) -> None:
-    """Writes an image as it is, or depth as 16-bit `units` a metre (0: no return, or too far to be written)."""
-    import cv2
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if units is None:
-        pixels: Any = message.data[..., ::-1] if message.data.ndim == 3 else message.data
-    else:
-        metres = np.nan_to_num(message.data.astype(np.float64), nan=0.0, posinf=0.0)
-        scaled = np.rint(metres * units)
-        pixels = np.where(scaled <= 65535, scaled, 0).astype(np.uint16)
-    if not cv2.imwrite(str(path), pixels):
-        raise RecordingError(f"{path} cannot be written")
 
 
 def _matrix_text(rows: Any) -> str:
@@ -204,10 +173,10 @@ def _matrix_text(rows: Any) -> str:
 def _intrinsics(material: Material, folder: Path, done: Exported) -> None:
     """The calibration of the depth camera (the one whose frame depth images have), or of the only one."""
     infos = [m.message for name in material.of_type(CameraInfo) for m in material.messages([name])]
-    frames = {r.message.frame for name in material.of_type(*_DEPTHS) for r in _some(material, name)}
+    frames = {r.message.frame for name in material.of_type(*DEPTHS) for r in _some(material, name)}
     found = [i for i in infos if isinstance(i, CameraInfo) and (i.frame in frames or len(infos) == 1)]
     if found:
-        _write(folder / "camera-intrinsics.txt", _matrix_text(found[0].K), done)
+        write_text(folder / "camera-intrinsics.txt", _matrix_text(found[0].K), done)
     elif infos:
         done.left_out["camera-intrinsics.txt"] = "no calibration has the frame of the depth images"
 
@@ -216,19 +185,3 @@ def _some(material: Material, name: str) -> Iterator[Any]:
     """The first message of a stream."""
     first = next(material.messages([name]), None)
     return iter(() if first is None else (first,))
-
-
-def _write(path: Path, text: str, done: Exported | None) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    if done is not None:
-        done.files.append(str(path))
-
-
-def _write_rows(path: Path, head: str, rows: Iterator[list[str]], done: Exported) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", encoding="utf-8") as file:
-        file.write(head + "\n")
-        for row in rows:
-            file.write(",".join(row) + "\n")
-    done.files.append(str(path))

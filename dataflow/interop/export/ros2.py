@@ -12,7 +12,8 @@ from mcap.writer import CompressionType, Writer
 from dataflow.interop.bag import Topic
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.interop.ros.outward import OUTWARD, typestore
+from dataflow.interop.ros.made import typestore
+from dataflow.interop.ros.outward import OUTWARD
 from dataflow.interop.typestores import RosType
 from dataflow.messages import Transforms
 from dataflow.recording.codecs import SchemaText

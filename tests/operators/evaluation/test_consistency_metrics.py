@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dataflow.messages import Odometry, Pose
+from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.testing import play
 from operators.evaluation import ConsistencyMetrics
 
@@ -79,3 +79,24 @@ def test_frames_that_differ_are_named() -> None:
     operator.process(pose, ())
     operator.finish()
     assert operator.summary()["estimates without finite covariance"] == 1
+
+
+@pytest.mark.parametrize(("noise", "word"), [(1.0, "in"), (2.0, "out")], ids=["honest", "too sure"])
+def test_innovations_of_a_filter_are_judged_by_sensor(noise: float, word: str) -> None:
+    total = float(np.square(np.random.default_rng(0).normal(0, noise, 300)).sum())
+    status = Diagnostics(
+        stamp=SECOND,
+        names=("filter", "robot/fix", "robot/silent"),
+        messages=("", "", ""),
+        levels=np.zeros(3, np.uint8),
+        keys=("nis", "freedom", "nis", "freedom"),
+        values=(f"{total:.3f}", "300", "0.000", "0"),
+        owners=np.array([1, 1, 2, 2], np.int32),
+    )
+    pose = Pose(stamp=2 * SECOND, frame="world", position=[0, 0, 0], orientation=[0, 0, 0, 1], covariance=np.eye(6))
+    operator = ConsistencyMetrics()
+    play(operator, {"estimate": [pose], "ground_truth": [pose], "status": [status]})
+    found = operator.summary()
+    assert found["robot/fix, nis"] == pytest.approx(total / 300, abs=1e-5)
+    assert str(found["robot/fix, nis_band_95_percent"]).endswith(f", {word}")
+    assert not any(name.startswith("robot/silent") for name in found)

@@ -1,4 +1,4 @@
-"""Fusion of places and poses as operators: combined, cross-checked, any sensor missing, bad input named."""
+"""Fusion of places as an operator: triangulated, combined, cross-checked, bad input named."""
 
 from __future__ import annotations
 
@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
-from dataflow.messages import Diagnostics, Imu, LandmarkSightings, Pose, Transforms
+from dataflow.messages import Diagnostics, LandmarkSightings, Transforms
 from dataflow.operator import Context
 from dataflow.testing import Played, play
-from operators.fusion import PoseFusion, PositionFusion
+from operators.fusion import PositionFusion
 
 THINGS = np.array([[4.0, 1.0, 0.5], [6.0, -2.0, 1.0]])
 EYES = {"left": np.array([0.0, 0.4, 1.0]), "right": np.array([0.0, -0.4, 1.0])}
@@ -115,91 +114,40 @@ def test_a_camera_that_was_knocked_is_named_and_left_out() -> None:
     assert texts["sightings/lidar"] == "used"
 
 
-def poses(count: int, rng: np.random.Generator, off: float = 0.0, turned: float = 0.0) -> list[Pose]:
-    """Poses of a body at rest, 2 cm and 0.02 rad."""
-    made = []
-    for k in range(count):
-        R = Rotation.from_rotvec(rng.normal(0, 0.02, 3) + np.array([0, 0, turned])) * Rotation.from_euler("z", 3.1)
-        made.append(
-            Pose(
-                stamp=(k + 1) * 100_000_000,
-                frame="world",
-                child_frame="base_link",
-                position=np.array([1.0, 2.0, 0.0]) + rng.normal(0, 0.02, 3) + [off, 0, 0],
-                orientation=R.as_quat(),
-                covariance=np.diag([0.02**2] * 6),
-            )
-        )
-    return made
+def process(operator: PositionFusion, message: LandmarkSightings) -> None:
+    operator.process({"ns/lidar/things": message}, Context(message.stamp), mounts())
 
 
-def orientations(count: int, rng: np.random.Generator) -> list[Imu]:
-    return [
-        Imu(
-            stamp=(k + 1) * 100_000_000,
-            frame="base_link",
-            angular_velocity=[0, 0, 0],
-            linear_acceleration=[0, 0, 9.8],
-            orientation=(Rotation.from_rotvec(rng.normal(0, 0.005, 3)) * Rotation.from_euler("z", 3.1)).as_quat(),
-            orientation_covariance=np.eye(3) * 0.005**2,
-        )
-        for k in range(count)
-    ]
-
-
-def body(streams: dict[str, Any]) -> tuple[Played, PoseFusion]:
-    operator = PoseFusion()
-    return play(operator, {"estimates": streams}), operator
-
-
-def turned(pose: Any) -> float:
-    return float((Rotation.from_quat(pose.orientation) * Rotation.from_euler("z", -3.1)).magnitude())
-
-
-def test_poses_and_an_orientation_near_half_a_turn_are_averaged_on_the_manifold() -> None:
-    rng = [np.random.default_rng(k) for k in range(3)]
-    played, _ = body({"camera": poses(50, rng[0]), "lidar": poses(50, rng[1]), "imu": orientations(50, rng[2])})
-    assert len(played["pose"]) == 50
-    assert np.sqrt(np.mean([turned(p) ** 2 for p in played["pose"]])) < 0.01
-    missing, operator = body({"imu": orientations(3, rng[2])})
-    assert not missing["pose"]
-    assert operator.summary()["ignored, position or orientation unknown"] == 3
-
-
-def test_two_poses_that_contradict_each_other_are_a_diagnostic_and_the_covariance_holds_both() -> None:
-    rng = [np.random.default_rng(k) for k in range(2)]
-    played, operator = body({"camera": poses(5, rng[0]), "lidar": poses(5, rng[1], off=0.5)})
-    assert operator.summary()["two sensors contradicted each other"] == 5
-    for pose, status in zip(played["pose"], played["status"], strict=True):
-        assert pose.covariance[0, 0] > 0.08**2  # type: ignore[attr-defined]
-        assert status.messages[0] == "sensors contradict each other"  # type: ignore[attr-defined]
-
-
-def test_a_sensor_noisier_than_it_says_loses_its_say() -> None:
-    rng = np.random.default_rng(4)
-    noisy = [p.replace(position=p.position + rng.normal(0, 0.05, 3)) for p in poses(200, rng)]
-    played, _ = body({"a": poses(200, rng), "b": poses(200, rng), "noisy": noisy})
-    last = played["status"][-1]
-    assert isinstance(last, Diagnostics)
-    noise = {name: float(dict(last.pairs(k))["noise"]) for k, name in enumerate(last.names) if k}
-    assert noise["estimates/noisy"] > 2.0
-    assert max(noise["estimates/a"], noise["estimates/b"]) < 1.7
-
-
-def test_bad_input_is_named() -> None:
-    operator = PoseFusion()
+def test_sightings_that_cannot_be_used_are_counted_with_the_reason_and_the_others_serve() -> None:
+    operator = PositionFusion()
     operator.setup()
-    pose = poses(1, np.random.default_rng(0))[0]
-    with pytest.raises(ValueError, match="its poses are in 'odom', the fused one is in 'world'"):
-        operator.process({"ns/camera/pose": pose.replace(frame="odom")}, Context(pose.stamp))
-    with pytest.raises(ValueError, match="camera/pose: its messages have no covariance"):
-        operator.process({"ns/camera/pose": pose.replace(covariance=None)}, Context(pose.stamp))
-    operator = PoseFusion()
+    good = lidar(1, np.random.default_rng(0))[0]
+    positions, covariances = np.array(good.positions), np.array(good.covariances)
+    positions[0, 0] = np.nan
+    covariances[1] = 0.0
+    process(operator, good.replace(positions=positions))
+    process(operator, good.replace(stamp=good.stamp + 1, covariances=covariances))
+    process(operator, good.replace(stamp=good.stamp + 2, ids=[-1, 8]))
+    assert operator.summary()["ignored, lidar/things: not finite, or covariance not positive"] == 2
+    assert operator.summary()["ignored, lidar/things: no identity"] == 1
+    with pytest.raises(ValueError, match="lidar/things: sightings have no covariances"):
+        process(operator, good.replace(stamp=good.stamp + 3, covariances=None))
+    with pytest.raises(ValueError, match="no transform between 'arm' and 'base_link'"):
+        process(operator, good.replace(stamp=good.stamp + 4, frame="arm"))
+
+
+def test_sightings_that_do_not_come_after_the_last_are_counted() -> None:
+    operator = PositionFusion()
     operator.setup()
-    operator.process({"ns/camera/pose": pose.replace(covariance=np.zeros((6, 6)))}, Context(pose.stamp))
-    assert operator.summary()["ignored, camera/pose: covariance not positive"] == 1
-    places = PositionFusion()
-    places.setup()
-    blind = LandmarkSightings(stamp=1, frame="base_link", ids=[1], positions=[[1.0, 2.0, 3.0]])
-    with pytest.raises(ValueError, match="sightings have no covariances"):
-        places.process({"ns/lidar/things": blind}, Context(1))
+    good = lidar(1, np.random.default_rng(0))[0]
+    for stamp in (good.stamp, good.stamp, good.stamp - 1):
+        operator.process({"ns/lidar/things": good.replace(stamp=stamp)}, Context(good.stamp), mounts())
+    assert operator.summary()["ignored, lidar/things: stamp not later than the last"] == 2
+
+
+def test_two_plays_give_equal_bits() -> None:
+    plays = []
+    for _ in range(2):
+        eyes = {name: camera(name, 10, np.random.default_rng(i)) for i, name in enumerate(EYES)}
+        plays.append(fused({**eyes, "lidar": lidar(10, np.random.default_rng(5))})[0].digests())
+    assert plays[0] == plays[1]

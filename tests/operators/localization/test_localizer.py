@@ -170,6 +170,41 @@ def test_what_cannot_be_used_is_counted_with_its_reason() -> None:
     assert operator.summary()["poses waiting"] == 19
 
 
+def test_odometry_and_rates_that_are_not_finite_or_late_are_counted_and_the_robot_is_followed() -> None:
+    drive = Drive(4.0)
+    odometry: list[Any] = drive.odometry()
+    for k in (30, 31, 50):
+        odometry[k] = odometry[k].replace(position=[math.nan, 0, 0])
+    gyro: list[Any] = drive.gyro()
+    gyro[100] = gyro[100].replace(angular_velocity=[0, 0, math.nan])
+    operator = ParticleFilterLocalizer(modality_particles=0)
+    streams = {
+        "odometry": odometry,
+        "measurements": {"scan": drive.scans(), "imu": gyro},
+        "map": [drive.grid],
+        "extrinsics": [mounts()],
+    }
+    played = play(operator, streams, static=("map", "extrinsics"), paranoid=False)
+    assert operator.summary()["ignored, odometry: not finite"] == 3
+    assert operator.summary()["ignored, measurements/imu: not finite"] == 1
+    far, turned, count = errors(drive, played["pose"])
+    assert far < 0.1
+    assert turned < 2.0
+    assert count > 50
+    assert operator.process(odometry[-1], {}, map=drive.grid) is None
+    assert operator.summary()["ignored, odometry: stamp not later than the last"] == 1
+
+
+def test_a_position_whose_heading_has_no_variance_counts_without_heading() -> None:
+    drive = Drive(4.0)
+    C = np.diag([0.05**2, 0.05**2, 1.0, 100.0, 100.0, 0.0])
+    places = [p.replace(covariance=C) for p in drive.positions()]
+    empty = places[3].replace(stamp=places[3].stamp, covariance=np.zeros((6, 6)))
+    played, operator = localized(drive, {"scan": drive.scans(), "place": [*places[:3], empty, *places[4:]]})
+    assert operator.summary()["ignored, measurements/place: covariance not positive"] == 1
+    assert errors(drive, played["pose"])[0] < 0.1
+
+
 def test_maps_that_do_not_fit_are_refused() -> None:
     operator = ParticleFilterLocalizer(map_frame="hall")
     operator.setup()

@@ -189,7 +189,7 @@ def test_wrong_calibration_is_refused() -> None:
         rig_of(left.replace(P=None, K=K * [[2.0], [2.0], [1.0]]), right)
 
 
-# -- the operator and the source -----------------------------------------------------------------------------
+# -- the operator -----------------------------------------------------------------------------------------
 
 
 def infos() -> tuple[CameraInfo, CameraInfo]:
@@ -218,49 +218,6 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
         a, b = one.process(*given(i)), other.process(*given(i))
         assert {port: m.digest() for port, m in a.items()} == {port: m.digest() for port, m in b.items()}
     assert one.summary() == other.summary() == {"tracking": 15}
-
-
-def kitti_folder(folder: Path) -> Path:
-    for name in ("image_0", "image_1"):
-        (folder / name).mkdir()
-    for i, pair in enumerate(sequence(25)[0][:3]):
-        for name, image in zip(("image_0", "image_1"), pair, strict=True):
-            cv2.imwrite(str(folder / name / f"{i:06}.png"), image)
-    rows = [np.column_stack([K, [x, 0, 0]]).ravel() for x in (0.0, -K[0, 0] * RIG.baseline)]
-    lines = [f"P{i}: {' '.join(map(str, row))}" for i, row in enumerate(rows)]
-    (folder / "calib.txt").write_text("\n".join(lines))
-    (folder / "poses.txt").write_text("\n".join(" ".join(map(str, T[:3].ravel())) for T in driving(3)))
-    return folder
-
-
-def test_kitti_folder_is_read(tmp_path: Path) -> None:
-    source = KittiOdometry(path=str(kitti_folder(tmp_path)), first_stamp=7)
-    source.setup()
-    statics, steps = source.static_outputs(), list(source.stream())
-    rig = rig_of(statics["left_info"], statics["right_info"])  # type: ignore[arg-type]
-    assert (rig.K[0, 0], rig.baseline) == (300.0, 0.5)
-    assert [step["left"].stamp for step in steps] == [7, 100_000_007, 200_000_007]
-    np.testing.assert_array_equal(steps[1]["right"].data, sequence(25)[0][1][1])  # type: ignore[attr-defined]
-    np.testing.assert_allclose(steps[2]["ground_truth"].matrix(), driving(3)[2], atol=1e-9)  # type: ignore[attr-defined]
-    assert source.length() == 3
-
-
-@pytest.mark.parametrize(
-    ("file", "text", "message"),
-    [
-        ("calib.txt", "P0: 1 2 3", "projection P0"),
-        ("poses.txt", "1 0 0", "line 1"),
-        ("image_1/000001.png", None, "no file"),
-    ],
-)
-def test_kitti_folder_that_is_broken_is_named(tmp_path: Path, file: str, text: str | None, message: str) -> None:
-    folder = kitti_folder(tmp_path)
-    if text is None:
-        (folder / file).unlink()
-    else:
-        (folder / file).write_text(text)
-    with pytest.raises(ValueError, match=message):
-        KittiOdometry(path=str(folder)).setup()
 
 
 # -- recorded data -------------------------------------------------------------------------------------------

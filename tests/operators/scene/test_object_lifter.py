@@ -9,7 +9,7 @@ import pytest
 from made_scene import INFO, Solid, camera, look
 
 from dataflow.firing.failure import OperatorFailure
-from dataflow.messages import Boxes3D, CameraInfo, Clusters, Diagnostics, PointCloud, Transforms
+from dataflow.messages import Boxes3D, CameraInfo, Clusters, Detections2D, Diagnostics, PointCloud, Transforms
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter
@@ -110,3 +110,25 @@ def test_a_lidar_beside_the_camera_serves_as_well() -> None:
 
 def test_equal_input_gives_equal_output() -> None:
     assert lifted(CRATE, BEHIND, MUG)[0].digests() == lifted(CRATE, BEHIND, MUG)[0].digests()
+
+
+def test_neighbours_whose_boxes_overlap_each_keep_their_points() -> None:
+    """Two books side by side: each box reaches over a third of the other book."""
+    books: list[Solid] = [((2.4, y, 0.12), (0.16, 0.05, 0.24), 0.0, 0) for y in (0.0, 0.052)]
+    pose = camera(1)
+    cloud, detections, masks = look(pose, books, noise=0.004)
+    wider = detections.boxes + np.array([-2.0, 0, 2.0, 0], np.float32)
+    streams = {
+        "detections": [detections.replace(boxes=wider)],
+        "cloud": [cloud],
+        "image_info": [INFO],
+        "pose": [pose],
+        "segmentation": [masks],
+    }
+    played = play(ObjectLifter(), streams, static=["image_info"])
+    (boxes,), (images,) = played["boxes"], played["images"]
+    assert isinstance(boxes, Boxes3D)
+    assert isinstance(images, Detections2D)
+    np.testing.assert_array_equal(images.boxes, wider)
+    center = transform_points(pose.matrix(), boxes.centers)
+    assert abs(center[1, 1] - center[0, 1]) == pytest.approx(0.052, abs=0.015)

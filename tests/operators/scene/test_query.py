@@ -13,6 +13,7 @@ from dataflow.messages import SceneGraph
 from dataflow.recording import RecordingWriter
 from operators.scene.commands import scene
 from operators.scene.query import Clause, QueryError, as_json, ask, parse
+from operators.scene.spark import as_spark_dsg
 
 NAMES = ("mug", "table", "person", "floor", "room")
 NODES = ((-2, 4), (0, 3), (1, 1), (2, 0), (3, 0), (4, 2), (5, 1))
@@ -124,3 +125,26 @@ def test_the_command_says_what_is_wrong(recording: Path, tmp_path: Path) -> None
     assert (code, "there is no file" in out) == (2, True)
     code, out = asked(str(recording), "--stream", "other")
     assert (code, "robot1/scene/graph" in " ".join(out.split())) == (2, True)
+
+
+def test_the_export_has_every_node_its_layer_and_one_edge_for_two_nodes(tmp_path: Path) -> None:
+    exported = as_spark_dsg(graph())
+    names = {node["id"]: node["attributes"]["name"] for node in exported["nodes"]}
+    assert len(names) == len(NODES)
+    assert [node["attributes"]["name"] for node in exported["nodes"] if node["layer"] == 4] == ["room -2"]
+    pairs = [frozenset((edge["source"], edge["target"])) for edge in exported["edges"]]
+    assert len(pairs) == len(set(pairs)) == len(RELATIONS) + len(NODES) - 1
+    told = [relation for edge in exported["edges"] for relation in edge["info"]["metadata"]["relations"]]
+    assert "mug 2 on table 1" in told
+
+
+def test_spark_dsg_opens_the_export(tmp_path: Path) -> None:
+    spark_dsg = pytest.importorskip("spark_dsg", reason="spark-dsg is not installed")
+    file = tmp_path / "graph.json"
+    file.write_text(json.dumps(as_spark_dsg(graph())))
+    opened = spark_dsg.DynamicSceneGraph.load(str(file))
+    assert opened.num_nodes() == len(NODES)
+    mug = opened.get_node(spark_dsg.NodeSymbol("O", 2).value)
+    assert mug.attributes.name == "mug 2"
+    np.testing.assert_allclose(mug.attributes.position, graph().positions[3])
+    assert opened.get_labelspace(2, 0).get_category(mug.attributes.semantic_label) == "mug"

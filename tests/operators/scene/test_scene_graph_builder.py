@@ -16,7 +16,8 @@ from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import Played, play
 from operators.scene import SceneGraphBuilder
 from operators.scene.agents import GoalInference
-from operators.scene.relations import Body, Hysteresis, footprint_share, gap
+from operators.scene.bodies import Body, footprint_share, gap
+from operators.scene.relations import Hysteresis
 
 STEP = 200_000_000  # ns
 Thing = tuple[int, str, Sequence[float], Sequence[float]]

@@ -15,12 +15,16 @@ from dataflow.messages.geometry import yaw_of
 from dataflow.testing import Played, play
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.box_overlap import upright_iou
-from operators.scene.cells import Cells, completed
+from operators.scene.cells import Cells
+from operators.scene.class_sizes import Usual
+from operators.scene.map_object import completed
 
 SECOND = 1_000_000_000
 CRATE: Solid = ((2.5, 0.5, 0.25), (0.5, 0.4, 0.5), 0.3, 0)
 OTHER: Solid = ((2.8, -0.8, 0.2), (0.4, 0.4, 0.4), 0.0, 0)
 AROUND = [((0.3 * np.sin(k), 0.9 * np.sin(0.7 * k), 1.0), 0.15 * np.sin(k)) for k in range(12)]
+
+BOOK = Usual((0.04, 0.17, 0.22), (0.3, 0.1, 0.1))
 
 View = tuple[Boxes3D, Clusters, PointCloud, Pose]
 
@@ -151,10 +155,10 @@ def test_two_plays_are_equal_and_a_restored_map_goes_on_the_same() -> None:
 def test_a_box_grows_away_from_the_viewer_by_what_is_usual() -> None:
     """The spine of a book in a shelf, seen along x: 4 cm wide, no depth."""
     seen = (np.array([2.0, 0, 1]), np.array([0.0, 0.04, 0.22]), 0.0)
-    center, size, _ = completed(seen, np.array([1.0, 0.0]), (0.04, 0.17))
+    center, size, _ = completed(seen, np.array([1.0, 0.0]), BOOK)
     np.testing.assert_allclose(size, [0.17, 0.04, 0.22])
     np.testing.assert_allclose(center, [2.085, 0, 1])
-    center, size, _ = completed(seen, np.array([0.0, 0.0]), (0.04, 0.17))
+    center, size, _ = completed(seen, np.array([0.0, 0.0]), BOOK)
     np.testing.assert_allclose(size, seen[1])
 
 

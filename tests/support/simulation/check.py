@@ -131,7 +131,7 @@ def _explained(report: VerifyReport) -> str:
 def verified(path: Path) -> VerifyReport:
     """Verifies in this process: the workers' functions are called, one after the other."""
     bindings = {
-        ("dataflow.verification.task", "machine_facts"): lambda environment: {"threads": {}},
+        ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
         ("dataflow.reexecution.recorded_run", "load_bundle"): _load_bundle,
     }
     importlib.import_module("dataflow.verification.verify")

@@ -101,9 +101,9 @@ class HighFrontier(Mutant):
 
 
 class SpinningWait(Mutant):
-    """A live operator gives up waiting for a static stream, which cannot be given up: it spins (C1)."""
+    """A live operator gives up waiting for a static stream, which cannot be given up: it spins."""
 
-    said = "C1: an operator spins on a static input that has not come"
+    said = "an operator spins on a static input that has not come"
 
     def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
         def exhausted(self: Patience, stamp: int, needs: Mapping[str, int]) -> dict[str, int]:
@@ -129,9 +129,9 @@ class SpinningWait(Mutant):
 
 
 class BlockingSupervisor(Mutant):
-    """The supervisor waits until a process has taken what is sent to it, each version of it (C8)."""
+    """The supervisor waits until a process has taken what is sent to it, each version of it."""
 
-    said = "C8: the supervisor waits for a process that is frozen"
+    said = "the supervisor waits for a process that is frozen"
 
     def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
         right = QueuedChannel.send
@@ -179,8 +179,8 @@ MUTANTS: Mapping[str, Mutant] = {
     "acknowledgement": EarlyAcknowledgement(),
     "record": LateRecord(),
     "frontier": HighFrontier(),
-    "C1": SpinningWait(),
-    "C8": BlockingSupervisor(),
+    "static_wait": SpinningWait(),
+    "frozen": BlockingSupervisor(),
     "gap": SilentGap(),
     "drop": SilentDrop(),
 }

@@ -1,0 +1,196 @@
+"""Merges recordings: the parts of one run into one again, or streams of several into one file."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dataflow.editing.joins import joined
+from dataflow.editing.part import copy_messages, graph_of, kept_stamps, outputs_of, write_firings
+from dataflow.editing.report import Edited, Watch, unwatched
+from dataflow.editing.rolling import once
+from dataflow.recording import Recorded, Recording
+from dataflow.recording.copying import Copy, Mask, Origin, framing
+from dataflow.recording.cutting import Cut, cut_of
+from dataflow.recording.errors import RecordingError
+from dataflow.recording.layout import CUT, DIGESTS, ENDS, GRAPH, RECORDING, RUN, Kind
+from dataflow.records.cuts import taken_by
+from dataflow.records.firing import CALLS, FiringRecord
+from dataflow.records.reading import FiringLog
+from dataflow.sync.stamps import format_stamp
+
+Records = Mapping[str, Sequence[FiringRecord]]
+
+
+def merge(
+    origins: Sequence[Origin],
+    out: Path,
+    *,
+    prefixes: Sequence[str] = (),
+    overwrite: bool = False,
+    watch: Watch = unwatched,
+) -> Edited:
+    """Writes what all of `origins` hold into one file.
+
+    Parts of one run are joined: what several hold is taken once, and their firing records become one log. Of other
+    recordings the run of the first one counts, with its graph and firing records; the others give their streams.
+    `prefixes` are put before the names of the streams of each. Raises `RecordingError` for names that clash.
+    """
+    done = Edited(str(out))
+    prefixes = [*prefixes, *[""] * (len(origins) - len(prefixes))]
+    if not any(prefixes) and are_of_one_run(origins):
+        origins = sorted(origins, key=_begin)
+        records = _joined_records(origins)
+        metadata = _joined_metadata(origins, records, done)
+        kept = _taken_once(origins)
+    else:
+        _refuse_clashes(origins, prefixes)
+        records = {} if prefixes[0] else _records_of(origins[0])
+        metadata = {name: dict(values) for name, values in origins[0].metadata.items()}
+        kept = [_all_of(origin, run=not k and not prefixes[0]) for k, origin in enumerate(origins)]
+        _tell_clocks(origins, done)
+        _tell_runs(origins, prefixes, done)
+    total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
+    with Copy(out, origins[0], overwrite=overwrite) as copy:
+        for name, values in metadata.items():
+            copy.writer.add_metadata(name, values)
+        write_firings(copy, origins, records)
+        done.firings = sum(r.kind in CALLS for listed in records.values() for r in listed)
+        before = 0
+        for origin, masks, prefix in zip(origins, kept, prefixes, strict=True):
+            topics = {c: prefix + origin.channels[c].topic for c in masks} if prefix else {}
+            copy_messages(copy, origin, masks, _further(watch, before, total), topics)
+            before += sum(int(mask.sum()) for mask in masks.values())
+        copy.frames(prefixes[0] + origins[0].namespace, _framing(origins, kept))
+    done.bytes = out.stat().st_size
+    with Origin(out) as made:
+        done.streams, done.span = {s: n for s, n in sorted(made.counts().items()) if n}, made.span()
+    return done
+
+
+def are_of_one_run(origins: Sequence[Origin]) -> bool:
+    """Tells whether recordings hold parts of one run: the same run of the same graph, by what they say of it."""
+    said = [[o.metadata.get(name) for name in (RUN, GRAPH, RECORDING)] for o in origins]
+    return len(origins) > 1 and said[0][0] is not None and all(one == said[0] for one in said)
+
+
+def _begin(origin: Origin) -> tuple[int, int]:
+    part, span = cut_of(origin.metadata), origin.span() or (0, 0)
+    return (span[0], span[1]) if part is None or part.start is None else (part.start, span[1])
+
+
+def _further(watch: Watch, before: int, total: int) -> Watch:
+    return lambda done, _: watch(before + done, total)
+
+
+def _records_of(origin: Origin) -> Records:
+    if not origin.of_kind(Kind.FIRINGS):
+        return {}
+    with Recording(origin.path) as recording:
+        log = FiringLog.read(recording)
+        return {operator: log.of(operator) for operator in sorted(log.operators)}
+
+
+def _joined_records(origins: Sequence[Origin]) -> Records:
+    with Recording(origins[0].path) as recording:
+        outputs = outputs_of(graph_of(recording))
+    logs = [_records_of(origin) for origin in origins]
+    names = sorted({name for log in logs for name in log})
+    return {name: joined([log.get(name, ()) for log in logs], outputs.get(name, ())) for name in names}
+
+
+def _joined_metadata(origins: Sequence[Origin], records: Records, done: Edited) -> dict[str, dict[str, str]]:
+    """The run's metadata: streams end where they end in the last part; a part stays one unless all of it is there."""
+    metadata = {name: dict(values) for origin in origins for name, values in origin.metadata.items()}
+    metadata.pop(DIGESTS, None)
+    ends: dict[str, dict[str, Any]] = {}
+    for origin in origins:
+        for stream, text in origin.metadata.get(ENDS, {}).items():
+            end, known = json.loads(text), ends.get(stream)
+            if known is None or (end["final"] or 0) >= (known["final"] or 0):
+                ends[stream] = end
+    if ends:
+        metadata[ENDS] = {stream: json.dumps(end) for stream, end in ends.items()}
+    parts = [cut_of(o.metadata) or Cut(o.path.name, None, None) for o in origins]
+    gaps = []
+    for one, other in pairwise(parts):
+        if one.end is not None and other.start is not None and other.start > one.end + 1:
+            gaps.append((one.end, other.start))
+            done.notes.append(f"nothing is known of {format_stamp(one.end)} to {format_stamp(other.start)}")
+    start = None if any(p.start is None for p in parts) else min(p.start for p in parts if p.start is not None)
+    end_stamp = None if any(p.end is None for p in parts) else max(p.end for p in parts if p.end is not None)
+    left_out = any(taken_by(r) is not None for listed in records.values() for r in listed if r.kind == "cut")
+    metadata.pop(CUT, None)
+    if gaps or left_out or start is not None or end_stamp is not None:
+        metadata[CUT] = Cut(parts[0].of, start, end_stamp).metadata()
+    return metadata
+
+
+def _taken_once(origins: Sequence[Origin]) -> list[dict[int, Mask]]:
+    """The messages of each part that none before it holds."""
+    kept = once(origins, [_all_of(origin, run=True) for origin in origins])
+    reached: dict[str, int] = {}
+    for origin, masks in zip(origins, kept, strict=True):
+        said = origin.of_kind(Kind.EVENTS, Kind.LOGS)
+        for channel in said.values():
+            masks[channel.id] = origin.entries(channel.id).times > reached.get(channel.topic, -1)
+        for channel in said.values():
+            reached[channel.topic] = max(reached.get(channel.topic, -1), _begin(origin)[1])
+    return kept
+
+
+def _all_of(origin: Origin, *, run: bool) -> dict[int, Mask]:
+    """All messages of streams; `run`: what happened in the run, too."""
+    kinds = (Kind.STREAM, Kind.COMPANION, *((Kind.EVENTS, Kind.LOGS) if run else ()))
+    return {c: np.ones(len(origin.entries(c)), bool) for c in origin.of_kind(*kinds)}
+
+
+def _framing(origins: Sequence[Origin], kept: Sequence[Mapping[int, Mask]]) -> Iterator[Recorded]:
+    for origin, masks in zip(origins, kept, strict=True):
+        if origin.own:
+            yield from framing(origin.path, kept_stamps(origin, masks))
+
+
+def _refuse_clashes(origins: Sequence[Origin], prefixes: Sequence[str]) -> None:
+    known: dict[str, Origin] = {}
+    clashing: list[str] = []
+    files: tuple[Origin, Origin] | None = None
+    for origin, prefix in zip(origins, prefixes, strict=True):
+        for name in origin.counts():
+            other = known.setdefault(prefix + name, origin)
+            if other is not origin:
+                clashing.append(prefix + name)
+                files = files or (other, origin)
+    if files is not None:
+        more = f" and {len(clashing) - 4} more" if len(clashing) > 4 else ""
+        first, second = (origin.path for origin in files)
+        raise RecordingError(
+            f"{first} and {second} are not parts of one run, and both hold {', '.join(clashing[:4])}{more}: put"
+            " something before the names of one of them (--prefix FILE=NAME/), or leave streams out with "
+            "`dataflow filter`"
+        )
+
+
+def _tell_clocks(origins: Sequence[Origin], done: Edited) -> None:
+    """Says when each was recorded, and that streams of different times or clocks do not meet."""
+    spans = [(origin, span) for origin in origins if (span := origin.span()) is not None]
+    for origin, (first, last) in spans:
+        done.notes.append(f"{origin.path.name}: {format_stamp(first)} to {format_stamp(last)}")
+    for (one, a), (other, b) in pairwise(sorted(spans, key=lambda s: s[1])):
+        if b[0] > a[1]:
+            gap = (b[0] - a[1]) * 1e-9
+            done.notes.append(
+                f"{one.path.name} ends {gap:.3g} s before {other.path.name} begins: recorded one after the other, or "
+                "by clocks that differ; nothing is shifted"
+            )
+
+
+def _tell_runs(origins: Sequence[Origin], prefixes: Sequence[str], done: Edited) -> None:
+    left_out = [o.path.name for k, o in enumerate(origins) if (k or prefixes[0]) and o.of_kind(Kind.FIRINGS)]
+    if left_out:
+        done.notes.append(f"of {', '.join(left_out)}: streams alone, without graph, firing records and log")

@@ -1,0 +1,101 @@
+"""Stands in for firing records that were left out on purpose, in a part of a recording: `cut` records.
+
+The detail of a `cut` record holds
+
+- `left_out`: how many calls were left out just before it; absent where none were;
+- `state`: the operator's state there, packed; absent where it is not known;
+- `params`: the parameters that were changed by then: [before the last `setup()`, since];
+- `again`: whether the operator had been set up more than once by then;
+- `held`: messages of the operator that the part holds although the calls that made them are not in it:
+  [stream, incarnation, seq, stamp, digest] each.
+
+It keeps the number of the record before the one that follows it, so that firings are called by their own numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from dataflow.records.firing import CALLS, FiringRecord
+
+
+class Held(NamedTuple):
+    """A message whose maker's record was left out."""
+
+    stream: str
+    incarnation: int
+    seq: int
+    stamp: int
+    digest: bytes
+
+    @property
+    def place(self) -> tuple[int, int]:
+        """(incarnation, number) in its stream."""
+        return self.incarnation, self.seq
+
+
+class Taken(NamedTuple):
+    """Place where an operator is to be taken up: its changed parameters, and its state (None: not known)."""
+
+    again: bool
+    at_setup: Mapping[str, Any]
+    since: Mapping[str, Any]
+    state: bytes | None
+
+
+def cut_record(
+    before: FiringRecord, *, left_out: int, taken: Taken | None, held: Iterable[Held], stamp: int
+) -> FiringRecord:
+    """The record that takes the place of `before` and of those in front of it."""
+    detail: dict[str, Any] = {"held": [list(message) for message in held]}
+    if taken is not None:
+        detail |= {"left_out": left_out, "again": taken.again, "params": [dict(taken.at_setup), dict(taken.since)]}
+        if taken.state is not None:
+            detail["state"] = taken.state
+    return FiringRecord(before.operator, before.incarnation, before.index, "cut", stamp, detail=detail)
+
+
+def held_by(record: FiringRecord) -> Iterator[Held]:
+    """The messages that a `cut` record accounts for."""
+    if record.kind == "cut":
+        for message in record.detail.get("held", ()):
+            yield Held(*message)
+
+
+def taken_by(record: FiringRecord) -> Taken | None:
+    """Returns where a `cut` record takes an operator up; None where no calls were left out."""
+    detail = record.detail
+    if "left_out" not in detail:
+        return None
+    at_setup, since = detail["params"]
+    return Taken(bool(detail["again"]), at_setup, since, detail.get("state"))
+
+
+def is_known(record: FiringRecord) -> bool:
+    """Tells whether a record holds the operator's state."""
+    return record.kind == "snapshot" or (record.kind == "cut" and "state" in record.detail)
+
+
+def without_unknown(records: Iterable[FiringRecord]) -> tuple[list[FiringRecord], int]:
+    """The records of an operator with a state, without the calls that follow a cut at which it is not known.
+
+    From the next snapshot on it is known again. Returns how many calls cannot be repeated, too.
+    """
+    kept: list[FiringRecord] = []
+    unknown, waiting = 0, False
+    for record in records:
+        if record.kind == "cut" and taken_by(record) is not None:
+            waiting = "state" not in record.detail
+        elif waiting and record.kind == "snapshot":
+            waiting = False
+            kept.append(replace(record, kind="restore"))
+            continue
+        elif waiting and record.kind == "setup":
+            waiting = False
+        if waiting and record.kind in (*CALLS, "reset"):
+            unknown += record.kind in CALLS
+            continue
+        kept.append(record)
+    return kept, unknown

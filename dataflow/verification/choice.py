@@ -1,0 +1,132 @@
+"""Chooses what of a recording is verified: operators, and the streams that can be held against their records."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+
+from dataflow.graph.model import Graph
+from dataflow.recording import Recording
+from dataflow.recording.layout import OUTCOME
+from dataflow.records.firing import FiringRecord
+from dataflow.records.reading import FiringLog
+from dataflow.reexecution.engine import plan_feeding
+from dataflow.reexecution.recorded_run import NotRecorded, ReplayError
+from dataflow.verification.ledger import COMPLETE
+
+
+def chosen_operators(graph: Graph, first: str | None, only: str | None) -> set[str]:
+    """The operators to verify: all that are neither sources nor external, or those asked for."""
+    able = {name for name, node in graph.nodes.items() if not node.source and not node.external}
+    if not able:
+        raise ReplayError(
+            f"graph {graph.name!r} holds nothing to verify: all its operators ({', '.join(graph.nodes)}) are sources "
+            "or external, whose recorded output is taken as it is; name a graph with further operators with --graph"
+        )
+    for asked in (first, only):
+        if asked is not None and asked not in able:
+            raise ReplayError(
+                f"{asked!r} cannot be verified: it is "
+                + ("a source or external" if asked in graph.nodes else "no operator of the graph")
+                + f"; those that can: {', '.join(sorted(able))}"
+            )
+    if only is not None:
+        return {only}
+    if first is None:
+        return able
+    following, edges = {first}, list(graph.edges())
+    while new := {e.consumer for e in edges if e.producer in following} - following:
+        following |= new
+    return following & able
+
+
+def with_makers(held: Collection[str], graph: Graph, chosen: set[str]) -> set[str]:
+    """The operators with those that make what they take, as far as it is not held in the recording."""
+    wanted, left = set(chosen), list(chosen)
+    while left:
+        for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
+            maker = graph.nodes[graph.streams[stream].node]
+            if stream not in held and not (maker.source or maker.external or maker.name in wanted):
+                wanted.add(maker.name)
+                left.append(maker.name)
+    return wanted
+
+
+def unfed_operators(
+    recording: Recording, graph: Graph, operators: Collection[str], incomplete: Collection[str]
+) -> dict[str, str]:
+    """The operators whose inputs are not in the recording and cannot be made again, with the stream that is missing."""
+    found: dict[str, str] = {}
+    for name in operators:
+        try:
+            plan_feeding(recording, graph, [name], incomplete=incomplete)
+        except NotRecorded as error:
+            found[name] = error.stream
+    return found
+
+
+def require_records(recording: Recording, log: FiringLog, operators: Iterable[str]) -> None:
+    """Raises `ReplayError` for the first operator without firing records."""
+    outcome = recording.metadata.get(OUTCOME, {}).get("outcome", "")
+    for name in operators:
+        if log.batches(name):
+            continue
+        if recording.torn or outcome not in ("", COMPLETE):
+            why = "the recording has no proper end" if recording.torn else f"it {outcome}"
+            raise ReplayError(
+                f"{recording.path}: the recorded run ended before operator {name!r} began ({why}): "
+                "there is nothing to verify"
+            )
+        raise ReplayError(
+            f"{recording.path}: operator {name!r} left no firing records there; "
+            "name the graph that made the recording with --graph, or record with --record"
+        )
+
+
+def require_ports(recording: Recording, graph: Graph, log: FiringLog, operators: Iterable[str]) -> None:
+    """Raises `ReplayError` for the first operator whose outputs are not those it was recorded with."""
+    for name in operators:
+        node = graph.nodes[name]
+        if not same_ports(log.of(name), node.outputs):
+            recorded = next(len(r.outputs) for r in log.of(name) if r.outcome == "ok" and r.outputs)
+            raise ReplayError(
+                f"{recording.path}: operator {name!r} was recorded with {recorded} output ports and has "
+                f"{len(node.outputs)} now ({', '.join(node.outputs)}), so its firings cannot be compared: verify with "
+                f"the operator as it was, or record anew"
+            )
+
+
+def accountable(recording: Recording, graph: Graph, log: FiringLog, name: str) -> bool:
+    """Tells whether the records of a node can be held against its streams.
+
+    Not where another operator made them (with another graph), nor where a replay did of a stream whose clock had
+    jumped: its records count one incarnation, its messages several.
+    """
+    node = graph.nodes[name]
+    streams = [s for s in node.outputs.values() if s in recording.streams]
+    makers = {recording.streams[s].metadata.get("operator", name) for s in streams}
+    records = log.of(name)
+    replayed = bool(records) and bool(records[0].detail.get("replayed"))
+    jumped = any(len(recording.counts(s)) > 1 for s in streams)
+    return makers == {name} and not (replayed and jumped) and same_ports(records, node.outputs)
+
+
+def stored_checks(
+    recording: Recording, graph: Graph, log: FiringLog, nodes: Iterable[str]
+) -> tuple[list[str], tuple[str, ...]]:
+    """The recorded streams of `nodes` that can be compared with their records, and those that cannot be read as the
+    messages that they were."""
+    able: list[str] = []
+    unable: list[str] = []
+    for name in nodes:
+        if not log.of(name):
+            continue
+        for stream in graph.nodes[name].outputs.values():
+            info = recording.streams.get(stream)
+            if info is not None:
+                (able if info.message_type is not None and not info.declared_otherwise else unable).append(stream)
+    return able, tuple(unable)
+
+
+def same_ports(records: Iterable[FiringRecord], outputs: Collection[str]) -> bool:
+    record = next((r for r in records if r.outcome == "ok" and r.outputs), None)
+    return record is None or len(record.outputs) == len(outputs)

@@ -1,0 +1,58 @@
+"""Several estimates side by side: how they are united, reduced to those that are likely, and given clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from operators.fusion.error_state import ROTATION, SIZE, State, difference
+from operators.fusion.nodes import Hypothesis, Node
+
+
+def with_clocks(node: Node, sigmas: Sequence[float]) -> Node:
+    """Returns the node with a time offset of 0 for each standard deviation (s), unless it has them."""
+    made = []
+    for h in node.hypotheses:
+        known = len(h.state.covariance)
+        covariance = np.zeros((SIZE + len(sigmas),) * 2)
+        covariance[:known, :known] = h.state.covariance
+        fresh = range(known, len(covariance))
+        covariance[fresh, fresh] = np.square(sigmas[known - SIZE :])
+        offsets = np.concatenate([h.state.offsets, np.zeros(len(fresh))])
+        made.append(replace(h, state=replace(h.state, covariance=covariance, offsets=offsets)))
+    return replace(node, hypotheses=tuple(made))
+
+
+def combined(hypotheses: Sequence[Hypothesis]) -> State:
+    """Returns the likeliest state, with a covariance that holds the others too."""
+    best = max(hypotheses, key=lambda h: h.weight)
+    if len(hypotheses) == 1:
+        return best.state
+    weights = np.exp([h.weight - best.weight for h in hypotheses])
+    weights /= weights.sum()
+    covariance = np.zeros_like(best.state.covariance)
+    for weight, h in zip(weights, hypotheses, strict=True):
+        apart = difference(best.state, h.state)
+        covariance += weight * (h.state.covariance + np.outer(apart, apart))
+    return replace(best.state, covariance=covariance)
+
+
+def reduced(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Drops hypotheses that have become unlikely, and unites those that have become alike."""
+    if len(hypotheses) == 1:
+        return (replace(hypotheses[0], weight=0.0),)
+    ordered = sorted(hypotheses, key=lambda h: -h.weight)
+    kept: list[Hypothesis] = []
+    for h in ordered:
+        if h.weight < ordered[0].weight - 14.0:  # one in a million
+            continue
+        for k, other in enumerate(kept):
+            apart = difference(other.state, h.state)[ROTATION]
+            if float(apart @ np.linalg.solve(other.state.covariance[ROTATION, ROTATION], apart)) < 1.0:
+                kept[k] = replace(other, weight=float(np.logaddexp(other.weight, h.weight)))
+                break
+        else:
+            kept.append(h)
+    return tuple(replace(h, weight=h.weight - kept[0].weight) for h in kept)

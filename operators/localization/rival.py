@@ -1,0 +1,168 @@
+"""The likeliest other place: tells a pose from one that a mirrored place would explain as well.
+
+A cloud settles in one of several places that look alike, and its spread does not tell of the others. So when the robot
+has been looked for, places elsewhere that explain the observation are tried, and the best is followed beside the cloud
+until the observations decide between the two. Multiple-hypothesis localisation: Jensfelt and Kristensen, "Active global
+localization for a mobile robot using multiple hypothesis tracking", 2001.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.localization.motion import composed, moved
+from operators.localization.observations import Observation
+from operators.localization.particles import effective_size, evidence_of, moments, normalised, systematic, wrapped
+
+Array = NDArray[np.float64]
+_FAR, _TURNED = 1.0, 0.5
+"""Metres or radians from the pose at which a place is another one."""
+_DECIDED = 8.0
+"""Logarithm of the ratio of likelihoods that decides between two places."""
+_FORGETTING = 0.02
+"""Share of the evidence that each observation ages by: what neighbouring scans say is much alike."""
+_WORSE = 5.0
+"""Logarithm of the ratio above which a place that was found explains the observation too badly to be followed."""
+_SEARCHES, _TRIED, _FOLLOWED = 3, 200, 100
+_NEAR = (0.1, 0.1, 0.05)
+
+
+@dataclass(eq=False)
+class _Other:
+    """A cloud (N, 3) about another place with logarithms of weights, and the evidence for the pose against it."""
+
+    poses: Array
+    logarithms: Array
+    lead: float = 0.0
+
+    def hear(self, observation: Observation, count: float, rng: np.random.Generator) -> float:
+        """Weighs the cloud; returns the logarithm of the observation's likelihood in it."""
+        logarithms, _ = observation.score(self.poses)
+        evidence = evidence_of(normalised(self.logarithms), count * logarithms)
+        self.logarithms = self.logarithms + count * logarithms
+        weights = normalised(self.logarithms)
+        if effective_size(weights) < 0.5 * len(weights):
+            self.poses = self.poses[systematic(weights, len(weights), float(rng.random()))]
+            self.logarithms = np.zeros(len(weights))
+        return evidence
+
+
+class Rival:
+    """Looks for another place until a few searches found none, and follows the one that it found."""
+
+    def __init__(self) -> None:
+        self._other: _Other | None = None
+        self._searched = 0
+        self._expected: Array | None = None
+        self._refuted = np.zeros((0, 3))  # places that were decided against
+
+    @property
+    def decided(self) -> bool:
+        """Tells that the place was looked for elsewhere, and that nowhere else explains what was observed."""
+        return self._other is None and self._searched >= _SEARCHES
+
+    @property
+    def mean(self) -> Array | None:
+        """The other place (3,), if there is one."""
+        if self._other is None:
+            return None
+        return moments(self._other.poses, normalised(self._other.logarithms))[0]
+
+    @property
+    def lead(self) -> float:
+        """Logarithm of how much likelier the pose is than the other place."""
+        return 0.0 if self._other is None else self._other.lead
+
+    def settle(self) -> None:
+        """Takes the pose as known: nowhere else is looked for it."""
+        self._other, self._searched = None, _SEARCHES
+
+    def forget(self) -> None:
+        """Begins anew: the pose is another one than before."""
+        self._other, self._searched, self._expected = None, 0, None
+        self._refuted = np.zeros((0, 3))
+
+    def move(self, step: Array, covariance: Array, rng: np.random.Generator) -> None:
+        """Moves by a step (3,) in the robot's frame, with noise."""
+        if self._expected is not None:
+            self._expected = composed(self._expected[None], step)[0]
+        self._refuted = composed(self._refuted, step)
+        if self._other is not None:
+            self._other.poses = moved(self._other.poses, step, covariance, rng)
+
+    def hear(
+        self, mean: Array, evidence: float, observation: Observation, count: float, rng: np.random.Generator
+    ) -> Array | None:
+        """Takes an observation that has the given evidence, a logarithm, where the pose's mean (3,) is.
+
+        `count`: what its sensor counts. Returns the cloud (N, 3) of the other place where that explains all so much
+        better that it is the pose.
+        """
+        if self._expected is not None and apart(self._expected, mean):
+            self.forget()
+        self._expected = mean
+        if self._other is None:
+            if self._searched < _SEARCHES:
+                self._search(mean, evidence, observation, count, rng)
+            return None
+        gained = evidence - self._other.hear(observation, count, rng)
+        self._other.lead = (1.0 - _FORGETTING) * self._other.lead + gained
+        place = self.mean
+        assert place is not None
+        if not apart(place, mean):
+            self._other = None
+        elif self._other.lead > _DECIDED:
+            self._other, self._refuted = None, np.vstack([self._refuted, place])
+        elif self._other.lead < -_DECIDED:
+            poses = self._other.poses[systematic(normalised(self._other.logarithms), _FOLLOWED, float(rng.random()))]
+            self.forget()
+            return poses
+        return None
+
+    def _search(
+        self, mean: Array, evidence: float, observation: Observation, count: float, rng: np.random.Generator
+    ) -> None:
+        self._searched += 1
+        if not observation.whole:
+            return
+        tried = observation.propose(_TRIED, rng)
+        known = [mean, *self._refuted]
+        tried = tried[[all(apart(pose, one) for one in known) for pose in tried]]
+        if not len(tried):
+            return
+        logarithms = count * observation.score(tried)[0]
+        best = int(logarithms.argmax())
+        if logarithms[best] < evidence - _WORSE:
+            return
+        poses = tried[best] + np.array(_NEAR) * rng.standard_normal((_FOLLOWED, 3))
+        poses[:, 2] = wrapped(poses[:, 2])
+        self._other, self._searched = _Other(poses, np.zeros(_FOLLOWED)), 0
+
+    def snapshot(self) -> dict[str, Any]:
+        other = self._other
+        return {
+            "other": None if other is None else [other.poses, other.logarithms, other.lead],
+            "searched": self._searched,
+            "expected": self._expected,
+            "refuted": self._refuted,
+        }
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Goes on where a snapshot was taken; one without this state begins anew."""
+        self.forget()
+        if state.get("other") is not None:
+            poses, logarithms, lead = state["other"]
+            self._other = _Other(poses, logarithms, float(lead))
+        self._searched, self._expected = int(state.get("searched", 0)), state.get("expected")
+        self._refuted = np.asarray(state.get("refuted", np.zeros((0, 3))), np.float64).reshape(-1, 3)
+
+
+def apart(one: Array, other: Array) -> bool:
+    """Tells whether two poses (3,) are of different places."""
+    far = float(np.hypot(one[0] - other[0], one[1] - other[1])) > _FAR
+    return far or abs(float(wrapped(one[2] - other[2]))) > _TURNED

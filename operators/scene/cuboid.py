@@ -1,0 +1,218 @@
+"""Upright boxes that agree with the image boxes of several views, with points on them, and with usual sizes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.scene.class_sizes import Usual
+
+Array = NDArray[np.float64]
+Box = tuple[Array, Array, float]
+"""Centre (3,), full size (3,) and heading about the vertical of an upright box."""
+
+_SIGNS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+_AROUND = np.radians(22.5 + 45 * np.arange(8))
+_ELLIPSE = np.array([[0.52 * np.cos(a), 0.52 * np.sin(a), z] for a in _AROUND for z in (-0.5, 0.5)])
+_STEPS = np.array([0.01, 0.01, 0.01, 0.05, 0.05, 0.05, 0.02])  # of centre, m; of log sizes; of heading, rad
+_PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
+_NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
+_PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
+_INSIDE = 0.02  # metres by which points stray from a box that they are of
+_TAIL = 2.0  # standard deviations of noise by which the outermost points are beyond a side
+_ASKEW = 8.0  # cost of lying otherwise than most things around
+_TURN = 0.1  # radians by which the heading that points show strays
+_BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
+_ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
+
+
+@dataclass(frozen=True, eq=False)
+class ImageView:
+    """One view of an object: `P` (3, 4) maps the world to pixels; `box` (4,) is the object's in the image.
+
+    `edges` (4,) are those of the box, left, upper, right, lower, that are the object's and not the image's; `eye` (3,)
+    is where the camera was.
+    """
+
+    P: Array
+    box: Array
+    edges: NDArray[np.bool_]
+    eye: Array
+
+
+def fit_cuboid(
+    start: Box,
+    views: Sequence[ImageView],
+    points: Array,
+    usual: Sequence[Usual],
+    before: tuple[int, Box] | None = None,
+    heading: float | None = None,
+    noise: float = 0.0,
+) -> tuple[int, Box]:
+    """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
+
+    Least squares over centre, sizes and heading, by Gauss and Newton with differences: edges of the box's image against
+    those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
+    where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
+    which such things stand is tried, along the heading of `start` and along `heading`, that of most things around, and
+    the best is returned with its number; with `before`, an earlier result, only that one.
+
+    `noise` is that of ranges at one metre, m; it grows by the square.
+    After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
+    """
+    logs, spreads = _priors(usual)
+    if before is None:
+        x = _starts(start, views, logs)
+        if heading is not None:
+            turned = _nearest_turn(start[2], heading)
+            x = np.concatenate([x, _starts(_along(points, turned), views, logs)])
+            logs, spreads = np.tile(logs, (2, 1)), np.tile(spreads, (2, 1))
+        headings = x[:, 6].copy()
+    else:
+        form, box = before
+        logs, spreads = logs[form % len(logs), None], spreads[form % len(logs), None]
+        x = np.array([[*box[0], *np.log(box[1]), box[2]]])
+        towards = heading if heading is not None and form >= len(_priors(usual)[0]) else start[2]
+        headings = np.array([_nearest_turn(box[2], towards)])
+    outline = _ELLIPSE if usual and usual[0].round else _SIGNS
+    P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
+    boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
+    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / 4))
+
+    def residuals(rows: Array) -> Array:
+        """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
+        flat = rows.reshape(-1, 7)
+        image = ((_images(flat, P, outline) - boxes) * weights).reshape(len(flat), -1)
+        image[np.isnan(image)] = 0.0
+        turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
+        size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
+        parts = [image, _surface(flat, points, eyes, noise), turn, size]
+        return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
+
+    forms = np.arange(len(x)) if before is None else np.array([before[0]])
+    askew = np.where(forms < len(x) // 2, _ASKEW, 0.0) if heading is not None else np.zeros(len(x))
+    for turn in range(_ROUNDS if before is None else 2):
+        values = residuals(x[:, None] + _PROBES)
+        r, J = values[:, 0], (values[:, 1:] - values[:, :1]) / _STEPS[:, None]
+        if turn == _CHOICE and len(x) > 1:
+            kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
+            x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
+            forms, askew = forms[kept], askew[kept]
+        weighted = J * np.minimum(1.0, _BOUND / np.maximum(np.abs(r), 1e-9))[:, None]  # Huber
+        A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
+        step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
+        x = x + step
+        if (np.abs(step) < 0.1 * _STEPS).all():
+            break
+    best = 0 if len(x) == 1 else int(np.argmin(_cost(residuals(x[:, None])[:, 0]) + askew))
+    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6]))
+
+
+def _cost(r: Array) -> Array:
+    """Returns the cost (A,) of residuals (A, R), after Huber."""
+    size = np.abs(r)
+    return np.asarray(np.where(size < _BOUND, 0.5 * size * size, _BOUND * (size - 0.5 * _BOUND)).sum(axis=1))
+
+
+def _nearest_turn(yaw: float, towards: float) -> float:
+    """Returns the heading nearest to `yaw` that is `towards` or turned from it by quarters."""
+    return float(yaw + np.remainder(towards - yaw + np.pi / 4, np.pi / 2) - np.pi / 4)
+
+
+def _along(points: Array, yaw: float) -> Box:
+    """Returns the upright box with a heading around points (N, 3)."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    local = points @ turn.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    return (low + high) / 2 @ turn, high - low, yaw
+
+
+def _priors(usual: Sequence[Usual]) -> tuple[Array, Array]:
+    """Returns the usual log sizes (A, 3) and their spreads, with the sides on the ground either way round."""
+    rows = []
+    for each in usual:
+        a, b, c = each.size
+        rows.append(((a, b, c), each.spread))
+        if b > 1.3 * a:
+            rows.append(((b, a, c), (each.spread[1], each.spread[0], each.spread[2])))
+    if not rows:
+        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0)))
+    return np.log([row[0] for row in rows]), np.array([row[1] for row in rows])
+
+
+def _starts(start: Box, views: Sequence[ImageView], logs: Array) -> Array:
+    """Returns the beginnings (A, 7): boxes that are as deep as usual away from the viewers."""
+    center, size, yaw = start
+    eye = np.mean([v.eye for v in views], axis=0)
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    along = axes @ (center - eye)[:2]
+    deep = int(np.argmax(np.abs(along)))
+    rows = []
+    for usual in np.exp(logs):
+        own, middle = np.maximum(size, 0.01), center.copy()
+        lack = max(0.0, float(usual[deep] - own[deep]))
+        own[deep] += lack
+        middle[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
+        rows.append([*middle, *np.log(own), yaw])
+    return np.array(rows)
+
+
+def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
+    """Returns the image boxes (K, 4) of upright boxes (K, 7), centre, sizes and heading, NaN where partly behind.
+
+    `rounded` (K,) says which hold something of round outline.
+    """
+    rows = boxes.copy()
+    rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
+    image = _images(rows, P, _SIGNS)[:, 0]
+    if rounded.any():
+        image[rounded] = _images(rows[rounded], P, _ELLIPSE)[:, 0]
+    return image
+
+
+def _images(rows: Array, P: Array, outline: Array) -> Array:
+    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V * 3, 4), NaN where partly behind the camera.
+
+    `outline` (C, 3) are the places in a box of side 1 that are looked at.
+    """
+    c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
+    local = outline[None] * np.exp(rows[:, None, 3:6])
+    corners = np.empty_like(local)
+    corners[..., 0] = c[:, None] * local[..., 0] - s[:, None] * local[..., 1]
+    corners[..., 1] = s[:, None] * local[..., 0] + c[:, None] * local[..., 1]
+    corners[..., 2] = local[..., 2]
+    corners += rows[:, None, :3]
+    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), len(outline), -1, 3)
+    depth = np.maximum(seen[..., 2], 1e-6)
+    u, v = seen[..., 0] / depth, seen[..., 1] / depth
+    image = np.stack([u.min(axis=1), v.min(axis=1), u.max(axis=1), v.max(axis=1)], axis=-1)
+    image[depth.min(axis=1) < _NEAREST] = np.nan
+    return np.asarray(image)
+
+
+def _surface(rows: Array, points: Array, eyes: Array, noise: float) -> Array:
+    """Returns by how much the points' extents differ from the sides of boxes (K, 7): (K, 6), in standard deviations.
+
+    Sides that no view sees may be farther out than the points.
+    """
+    c, s = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
+    count, half = len(points), np.exp(rows[:, 3:6]) / 2
+    places = np.concatenate([points, eyes])
+    x, y = places[None, :, 0] - rows[:, :1], places[None, :, 1] - rows[:, 1:2]
+    local = np.stack([c * x + s * y, c * y - s * x, places[None, :, 2] - rows[:, 2:3]], axis=1)
+    cut = count // 40
+    ranked = np.partition(local[..., :count], (cut, count - 1 - cut), axis=2)
+    residual = np.concatenate([ranked[..., cut] + half, half - ranked[..., count - 1 - cut]], axis=1)
+    eye = local[..., count:]
+    way = np.abs(eye).mean(axis=2)
+    distance = np.sqrt((way * way).sum(axis=1, keepdims=True))
+    stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
+    residual = residual + np.concatenate([stray, stray], axis=1)
+    shown = np.concatenate([(eye < -half[..., None]).mean(axis=2), (eye > half[..., None]).mean(axis=2)], axis=1) > 0.3
+    # positive: the side is beyond the points
+    return np.asarray(np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE)

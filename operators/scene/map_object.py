@@ -1,0 +1,147 @@
+"""One object of the map: its voxels, the views of it, and the box that they give."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.scene.cells import Cells, standing_box
+from operators.scene.class_sizes import Usual
+from operators.scene.cuboid import ImageView, fit_cuboid
+
+Array = NDArray[np.float64]
+
+MOST_EVIDENCE = 6.0
+_BRINK = 0.012  # metres that masks and clouds lose of each side of an object
+_KEPT = 10  # views of an object
+_APART = 0.05  # angle, rad, and a third of the change of the distance, from which two views tell different things
+_SETTLED = 5  # views after which the way in which it stands is settled
+_POINTS = 45  # points of an object that a fit uses
+_PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most", "form")
+_ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
+
+
+@dataclass
+class MapObject:
+    """One object of the map, in an upright box. Times in nanoseconds.
+
+    `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
+    of voxels that it had; `images` are the views that its box is fitted to, `form` which of
+    the ways in which its class stands, -1 while that is open.
+    """
+
+    id: int
+    cells: Cells
+    votes: Array
+    evidence: float
+    born: int
+    seen: int
+    views: int = 1
+    color: Array = field(default_factory=lambda: np.full(3, np.nan))
+    center: Array = field(default_factory=lambda: np.zeros(3))
+    size: Array = field(default_factory=lambda: np.zeros(3))
+    yaw: float = 0.0
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    view: Array = field(default_factory=lambda: np.zeros(2))
+    most: int = 0
+    images: list[ImageView] = field(default_factory=list)
+    form: int = -1
+
+    @property
+    def class_id(self) -> int:
+        return int(self.votes.argmax())
+
+    @property
+    def score(self) -> float:
+        """Probability that the object is there."""
+        return 1 / (1 + math.exp(-self.evidence))
+
+    @property
+    def box(self) -> tuple[Array, Array, float]:
+        return self.center, self.size, self.yaw
+
+    def look(self, view: ImageView) -> bool:
+        """Keeps a view that tells something new; returns whether it does."""
+        if not view.edges.any():
+            return False
+        way = view.eye - self.center
+        if len(self.images) >= 3:
+            ways = np.array([v.eye for v in self.images]) - self.center
+            lengths, length = np.sqrt((ways * ways).sum(axis=1)), float(np.sqrt(way @ way))
+            apart = _APART * (1 + len(ways) / 4)  # the more are known, the less do others tell
+            turned = ways @ way < np.cos(apart) * lengths * length
+            if not (turned | (np.abs(lengths - length) > 3 * apart * lengths)).all():
+                return False
+        self.images.append(view)
+        if len(self.images) > _KEPT:
+            self.images.pop(_most_alike([v.eye - self.center for v in self.images]))
+        return True
+
+    def fit(self, usual: Mapping[int, Sequence[Usual]], heading: float | None = None, noise: float = 0.0) -> None:
+        """Puts the box around what is surely the object's, in agreement with its images and with its class.
+
+        `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square.
+        """
+        sure = self.cells.sure()
+        if not len(sure):
+            return
+        center, size, yaw = standing_box(sure)
+        box = (center, size + 2 * _BRINK, yaw)
+        known = usual.get(self.class_id, ())
+        if self.images:
+            before = (self.form, self.box) if self.form >= 0 else None
+            form, box = fit_cuboid(box, self.images, sure[:: -(-len(sure) // _POINTS)], known, before, heading, noise)
+            self.form = form if len(self.images) >= _SETTLED else -1
+        elif known:
+            box = completed(box, self.view / max(self.views, 1), known[0])
+        self.center, self.size, self.yaw = box
+
+    def snapshot(self) -> dict[str, Any]:
+        rows = self.images
+        images = [np.stack([getattr(v, name) for v in rows]) for name in ("P", "box", "edges", "eye")] if rows else []
+        plain = {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)}
+        return plain | {"cells": self.cells.snapshot(), "images": images}
+
+    @classmethod
+    def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
+        cells = Cells(side)
+        cells.restore(state["cells"])
+        fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
+        made = cls(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
+        for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():
+            view = ImageView(np.array(P), np.array(box), np.array(edges, np.bool_), np.array(eye))
+            made.images.append(view)
+        return made
+
+
+def _most_alike(ways: Sequence[Array]) -> int:
+    """Returns the view, of all but the newest, that is nearest in direction to another; the older one of two."""
+    units = np.array([w / max(float(np.linalg.norm(w)), 1e-9) for w in ways])
+    near = units @ units.T - 2 * np.eye(len(units))
+    return int(np.argmax(near[:-1].max(axis=1)))
+
+
+def completed(box: tuple[Array, Array, float], view: Array, usual: Usual) -> tuple[Array, Array, float]:
+    """Returns a box that is as deep as usual where only its near side was seen.
+
+    `view` (2,) is the mean horizontal direction of the views, of length 1 where all were from one side. Of the usual
+    sides on the ground, that across the view tells which of the two lies along it. The box grows away from the viewer,
+    less where views differ. No side is much shorter than is usual.
+    """
+    center, size, yaw = box[0].copy(), box[1].copy(), box[2]
+    axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
+    along = axes @ view
+    deep = int(np.argmax(np.abs(along)))
+    short, long, _ = usual.size
+    across = float(size[1 - deep])
+    size[1 - deep] = max(across, 0.8 * short)  # narrower things are seen in part
+    target = long if across < np.sqrt(short * long) else short
+    lack = max(0.0, target - float(size[deep])) * min(1.0, abs(float(along[deep])) * 1.2)
+    size[deep] += lack
+    center[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
+    return center, size, yaw

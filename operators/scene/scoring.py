@@ -1,0 +1,178 @@
+"""Scores a scene graph against the true one: its nodes by overlap in space, its relations by pairs of nodes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Detections2D, SceneGraph
+from dataflow.messages.geometry import yaw_of
+from operators.scene.box_overlap import upright_iou
+from operators.scene.relations import FLOOR
+
+Array = NDArray[np.float64]
+Box = tuple[Array, Array, float]
+Triple = tuple[int, str, int]
+
+MOVERS = ("person", "robot", "ball")
+PREDICATES = ("on", "in", "sitting_on", "holding", "near", "left_of", "in_front_of")
+"""Relations that are scored: those that the simulator's truth has too."""
+
+
+class PlainlySeen:
+    """Counts in how many images each true object was plainly seen: so much of it, with so many pixels."""
+
+    def __init__(self, visible: float = 0.6, pixels: int = 200, images: int = 5) -> None:
+        self._visible, self._pixels, self._images = visible, pixels, images
+        self._plain: Counter[int] = Counter()
+        self.last: dict[int, int] = {}
+
+    def add(self, objects: Detections2D) -> None:
+        """Takes the true objects of one image. Raises ValueError where they have no ids, or not how much is visible."""
+        if objects.ids is None or objects.visible is None or objects.pixel_counts is None:
+            raise ValueError("the true objects need ids, what share of them is visible, and their pixels")
+        self.last |= dict.fromkeys(objects.ids.tolist(), objects.stamp)
+        plain = (objects.visible >= self._visible) & (objects.pixel_counts >= self._pixels)
+        self._plain.update(objects.ids[plain].tolist())
+
+    def countable(self) -> set[int]:
+        """Returns the ids of objects that a map must have."""
+        return {i for i, n in self._plain.items() if n >= self._images}
+
+
+@dataclass(frozen=True)
+class NodeScore:
+    """A map's nodes against the truth. Lists name classes and ids; overlaps are IoUs.
+
+    `match` gives the true id of each node that is an object of its class; `doubles` are nodes beside such a one of the
+    same thing, `wrong` the other false ones with their greatest overlap and least distance (m), `ignored` those of
+    things that do not count.
+    """
+
+    must: int
+    found: int
+    match: dict[int, int]
+    ious: list[float]
+    missed: list[tuple[str, int]]
+    doubles: list[tuple[str, int]] = field(default_factory=list)
+    wrong: list[tuple[str, int, float, float]] = field(default_factory=list)
+    ignored: int = 0
+
+    @property
+    def recall(self) -> float:
+        return self.found / max(self.must, 1)
+
+    @property
+    def precision(self) -> float:
+        return self.found / max(self.found + len(self.doubles) + len(self.wrong), 1)
+
+
+def score_nodes(nodes: SceneGraph, truth: SceneGraph, must: Collection[int], iou: float = 0.25) -> NodeScore:
+    """Matches nodes with true objects, class by class, best overlap first, and scores them.
+
+    `must` are the ids of the true objects that count. Others are neither a miss nor, where the map has them, false.
+    Both graphs are in one frame. Nodes that are not objects (floor, room, robot) are not scored.
+    """
+    mine, labels = boxes_of(nodes)
+    true, names = boxes_of(truth)
+    match = match_nodes(nodes, truth, iou)
+    taken = set(match.values())
+    doubles, wrong, ignored = [], [], 0
+    for i, box in mine.items():
+        if i in match or i <= FLOOR:
+            continue
+        same = [t for t in true if names[t] == labels[i] and t > FLOOR]
+        best = max((upright_iou(true[t], box) for t in same), default=0.0)
+        gap, nearest = min(((float(np.linalg.norm(true[t][0] - box[0])), t) for t in same), default=(9.0, 0))
+        if gap < 0.5 * float(box[1].max()) + 0.2 and nearest > FLOOR and nearest not in must and nearest not in taken:
+            ignored += 1
+        elif gap < 0.5 and nearest in taken:
+            doubles.append((labels[i], i))
+        else:
+            wrong.append((labels[i], i, round(best, 2), round(gap, 2)))
+    return NodeScore(
+        must=len(must),
+        found=len(taken & set(must)),
+        match=match,
+        ious=[upright_iou(true[t], mine[i]) for i, t in match.items()],
+        missed=[(names[t], t) for t in sorted(must) if t not in taken],
+        doubles=doubles,
+        wrong=wrong,
+        ignored=ignored,
+    )
+
+
+def match_nodes(nodes: SceneGraph, truth: SceneGraph, iou: float = 0.25) -> dict[int, int]:
+    """Returns the true id of each node that is an object of its class, best overlap first."""
+    mine, labels = boxes_of(nodes)
+    true, names = boxes_of(truth)
+    rows = sorted(
+        (
+            (upright_iou(true[t], mine[m]), t, m)
+            for t in true
+            for m in mine
+            if t > FLOOR and m > FLOOR and names[t] == labels[m] and np.abs(true[t][0] - mine[m][0]).max() < 2
+        ),
+        reverse=True,
+    )
+    match: dict[int, int] = {}
+    used: set[int] = set()
+    for value, t, m in rows:
+        if value >= iou and t not in used and m not in match:
+            match[m] = t
+            used.add(t)
+    return match
+
+
+def boxes_of(graph: SceneGraph) -> tuple[dict[int, Box], dict[int, str]]:
+    """Returns the box and the class of each node, by id."""
+    yaws = np.zeros(graph.count) if graph.orientations is None or not graph.count else yaw_of(graph.orientations)
+    ids = graph.ids.tolist()
+    boxes = {i: (graph.positions[k], graph.sizes[k], float(yaws[k])) for k, i in enumerate(ids)}
+    return boxes, {i: graph.class_names[c] for i, c in zip(ids, graph.class_ids.tolist(), strict=True)}
+
+
+class RelationScore:
+    """Counts relations that are right, false and missed, by predicate, over several times.
+
+    *mapped*: of pairs whose nodes are both matched; *all*: every relation of ours, and every true one between objects
+    that must be mapped. The floor counts as matched.
+    """
+
+    def __init__(self) -> None:
+        self.counts: Counter[str] = Counter()
+
+    def add(self, graph: SceneGraph, truth: SceneGraph, match: dict[int, int], must: Iterable[int]) -> None:
+        """Takes the relations of one time; `match` is the true id of our nodes."""
+        of, wanted = match | {FLOOR: FLOOR}, {*must, FLOOR}
+        known, ours = set(of.values()), _triples(graph)
+        true = {_ordered(t) for t in _triples(truth)}
+        mine = {_ordered((of[s], p, of[o])) for s, p, o in ours if s in of and o in of}
+        for triple in mine | {t for t in true if t[0] in known and t[2] in known}:
+            kind = "hit" if triple in mine and triple in true else "false" if triple in mine else "miss"
+            self.counts[f"mapped {kind} {triple[1]}"] += 1
+        self.counts["all hit"] += len(mine & true)
+        self.counts["all false"] += len([t for t in ours if not (t[0] in of and t[2] in of)]) + len(mine - true)
+        self.counts["all miss"] += len([t for t in true - mine if {t[0], t[2]} <= wanted])
+
+    def f1(self, scope: str, predicate: str = "") -> float:
+        """Returns the F1 of `mapped` or `all` relations, of one predicate where one is given; NaN without any."""
+        hit, false, miss = (
+            sum(n for k, n in self.counts.items() if k.startswith(f"{scope} {kind}") and k.endswith(predicate))
+            for kind in ("hit", "false", "miss")
+        )
+        return 2 * hit / (2 * hit + false + miss) if hit + false + miss else float("nan")
+
+
+def _triples(graph: SceneGraph) -> set[Triple]:
+    ids = graph.ids.tolist()
+    return {(ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES}
+
+
+def _ordered(triple: Triple) -> Triple:
+    s, p, o = triple
+    return (min(s, o), p, max(s, o)) if p == "near" else triple

@@ -1,0 +1,142 @@
+"""Views that a map keeps of its places: what a camera is recognised by there, and what its pose is measured against."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import transform_points
+from operators.geometry.pinhole import project
+from operators.geometry.se3 import Matrix
+from operators.odometry.camera import RgbdCamera
+from operators.odometry.fitting import Fitter
+from operators.odometry.frame import Frame
+from operators.odometry.keyframe import Keyframe
+from operators.odometry.local_map import LocalMap
+from operators.odometry.motion import Motion
+from operators.odometry.recognition import Description, match
+from operators.odometry.relocalizer import rough_points
+from operators.odometry.surface import Surface
+from operators.odometry.watch import Watch
+from operators.slam.place_index import Words, words_of
+
+STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
+SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
+PIXELS = 3.0  # working pixels by which a recognised feature may be off
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """Features of a working image: pixels (N, 2), descriptors (N, 128), points (N, 3) in the depth camera, NaN where
+    depth is unknown; and the surface that the depth camera saw, with the brightness of every `STRIDE`th patch."""
+
+    pixels: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    points: NDArray[np.float32]
+    surface: Surface
+    shades: NDArray[np.uint8]
+
+    @staticmethod
+    def of(keyframe: Keyframe, camera: RgbdCamera) -> View:
+        """Returns the view of a keyframe, whose working image the camera's K_color is of."""
+        described = keyframe.description
+        everything = np.arange(len(described.pixels))
+        points, known = rough_points(keyframe, everything, camera)
+        patches = transform_points(camera.T_color_depth, keyframe.surface.points(STRIDE))
+        u, v = np.rint(project(patches, camera.K_color)).astype(np.int64).T
+        height, width = keyframe.gray.shape
+        return View(
+            described.pixels.astype(np.float32),
+            np.clip(np.rint(described.descriptors), 0, 255).astype(np.uint8),
+            np.where(known[:, None], points, np.nan).astype(np.float32),
+            keyframe.surface,
+            keyframe.gray[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)],
+        )
+
+    @cached_property
+    def words(self) -> Words:
+        return words_of(self.descriptors)
+
+    @cached_property
+    def description(self) -> Description:
+        return Description(self.pixels.astype(np.float64), self.descriptors.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """Holds how a camera's view was measured against a known one, and what supports it.
+
+    `inliers` features agree with the pose; `overlap` is the share of the depth image that the known view could see,
+    `agreement` the share of that which lies on its surfaces.
+    """
+
+    T_known_seen: Matrix
+    covariance: Matrix  # (6, 6), right perturbation
+    matched: int
+    inliers: int
+    overlap: float
+    agreement: float
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Decides what makes a sight certain enough to correct a map by it."""
+
+    inliers: int = 20
+    overlap: float = 0.2
+    agreement: float = 0.8
+
+    def doubt(self, sight: Sight) -> str:
+        """Returns why a sight is not to be believed; nothing for one that is."""
+        if sight.inliers < self.inliers:
+            return "too few features agree"
+        if sight.overlap < self.overlap:
+            return "too little of the depth overlaps"
+        if sight.agreement < self.agreement:
+            return "too little of the depth agrees"
+        return ""
+
+
+def sight(known: View, seen: View, fitter: Fitter, fewest: int) -> Sight | None:
+    """Measures the pose of a view in the depth camera of a known one; None where fewer than `fewest` features agree.
+
+    RANSAC PnP on matched descriptors, then reprojections and point-to-plane distances together.
+    """
+    pairs = match(known.description, seen.description)
+    if len(pairs) < fewest:
+        return None
+    points = known.points[pairs[:, 0]].astype(np.float64)
+    there = np.isfinite(points[:, 2])
+    pixels = seen.pixels[pairs[there, 1]].astype(np.float64)
+    sighting = fitter.solve(points[there], pixels, np.zeros(len(pixels), np.int64), PIXELS, fewest)
+    if sighting is None:
+        return None
+    T = sighting.T_world_camera
+    fit = fitter.refine(
+        _frame(seen, fitter.camera), replace(sighting, recognised=True), Motion(0, T, np.zeros(6)), T, _alone(known), 0
+    )
+    if fit.inliers < fewest:
+        return None
+    overlap = fit.compared / fit.offered if fit.offered else 0.0
+    return Sight(fit.T_world_camera, SURE * fit.covariance, len(pairs), fit.inliers, overlap, fit.depth_inliers)
+
+
+def _frame(view: View, camera: RgbdCamera) -> Frame:
+    nothing = np.zeros((1, 1), np.uint8)
+    return Frame(1_000_000_000, nothing, camera.K_color, view.surface.depth, view.surface, None, None, Watch())
+
+
+def _alone(view: View) -> LocalMap:
+    """Returns a map of one view, whose camera is the origin."""
+    known = LocalMap(1)
+    none = np.zeros((0, 3))
+    known.add(
+        Keyframe(
+            0, np.eye(4), np.zeros((6, 6)), np.zeros((1, 1), np.uint8), view.surface,
+            np.zeros((0, 2)), none, np.zeros(0, np.int64),
+        )
+    )  # fmt: skip
+    return known

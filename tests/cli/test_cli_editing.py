@@ -1,0 +1,97 @@
+"""Cut, filter, split and recover on the command line: files, words, exit codes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from dataflow.recording import Recording
+
+Recorded = tuple[Path, dict[str, Any]]
+
+
+def test_a_cut_is_written_and_says_what_goes_along(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+    path = tmp_path / "part.mcap"
+
+    told = json.loads(dataflow("cut", recorded[0], "--from", "50ms", "--duration", "0.1", "-o", path, "--json").stdout)
+
+    assert told["path"] == str(path)
+    assert told["unknown"] == ["gripper", "smooth", "sum"]
+    assert told["span"][1] - told["span"][0] <= 100_000_000
+    words = dataflow("cut", recorded[0], "--from", "0.05", "-o", tmp_path / "b.mcap")
+    assert "no recorded state at or before the cut: gripper, smooth, sum" in " ".join(words.stderr.split())
+    assert "is a part of run.mcap" in " ".join(dataflow("verify", path, code=1).stdout.split())
+    dataflow("replay", path, "--one-process", "--quiet")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--from", "1", "--to", "0.5"], "before the beginning"),
+        (["--from", "1e6"], "ends"),
+        (["--to", "1", "--duration", "1"], "name one of them"),
+        ([], "nothing to cut"),
+        (["--from", "2026-03-01T12:00:00"], "which time zone"),
+        (["--from", "soon"], "--from soon"),
+    ],
+)
+def test_a_cut_that_cannot_be_is_refused(
+    dataflow, recorded: Recorded, tmp_path: Path, words: list[str], said: str
+) -> None:
+    assert said in dataflow("cut", recorded[0], *words, "-o", tmp_path / "part.mcap", code=2).stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_filter_keeps_what_it_is_told_to(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+    path = tmp_path / "part.mcap"
+
+    dataflow("filter", recorded[0], "--streams", "left/*", "-o", path)
+
+    with Recording(path) as opened:
+        assert {s for s, i in opened.streams.items() if i.count} == {
+            "test/left/constant",
+            "test/left/fast",
+            "test/left/slow",
+        }
+    assert "identical" in dataflow("verify", path).stdout
+    dataflow("filter", recorded[0], "--without", "left/fast", "-o", tmp_path / "b.mcap")
+    told = json.loads(dataflow("verify", tmp_path / "b.mcap", "--json", code=1).stdout)
+    assert {o["operator"]: o["verdict"] for o in told["operators"]}["sum"] == "identical"
+    assert {o["operator"]: o["missing"] for o in told["operators"]}["smooth"] == "test/left/fast"
+    words = ("--streams", "left/*", "--without", "**", "-o", tmp_path / "c.mcap")
+    assert "no stream is left" in dataflow("filter", recorded[0], *words, code=2).stderr
+
+
+def test_a_split_is_as_long_and_as_large_as_asked(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+    told = json.loads(dataflow("split", recorded[0], "--every", "100ms", "-o", tmp_path / "t", "--json").stdout)
+    assert [Path(one["path"]).name for one in told] == [f"run_{k:03}.mcap" for k in range(len(told))]
+    by_size = json.loads(dataflow("split", recorded[0], "--size", "4kB", "-o", tmp_path / "s", "--json").stdout)
+    assert len(by_size) > 1
+    assert "say how" in dataflow("split", recorded[0], code=2).stderr
+    assert "--size 5XB" in dataflow("split", recorded[0], "--size", "5XB", code=2).stderr
+
+
+def test_a_torn_file_is_recovered_and_what_is_lost_is_counted(dataflow, recorded: Recorded, tmp_path: Path) -> None:
+    torn, saved = tmp_path / "torn.mcap", tmp_path / "saved.mcap"
+    data = recorded[0].read_bytes()
+    torn.write_bytes(data[: len(data) * 2 // 3])
+
+    told = json.loads(dataflow("recover", torn, "-o", saved, "--json", code=1).stdout)
+
+    assert told["torn"]
+    with Recording(torn) as broken, Recording(saved) as opened:
+        assert not opened.torn
+        assert [(r.stream, r.sequence, r.data) for r in opened.raw()] == [
+            (r.stream, r.sequence, r.data) for r in broken.raw()
+        ]
+    assert "no file" in dataflow("recover", tmp_path / "none.mcap", "-o", saved, code=2).stderr
+
+
+def test_a_bag_that_is_no_mcap_is_answered_with_what_makes_one(dataflow, tmp_path: Path) -> None:
+    bag = tmp_path / "drive.bag"
+    bag.write_bytes(b"#ROSBAG V2.0\n")
+
+    assert "dataflow convert" in dataflow("cut", bag, "--to", "1", "-o", tmp_path / "a.mcap", code=2).stderr

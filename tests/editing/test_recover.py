@@ -1,0 +1,94 @@
+"""What is saved of torn and damaged files, and what is said to be lost."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from made_parts import messages
+from mcap.opcode import Opcode
+
+from dataflow.editing.recover import recover
+from dataflow.messages import Text
+from dataflow.recording import Recording, RecordingError, RecordingWriter
+
+HEAD = 9
+
+
+def written(path: Path, count: int = 40) -> Path:
+    """Two streams in chunks of a few messages each."""
+    with RecordingWriter(path, metadata={"note": {"robot": "kitchen"}}, chunk_bytes=300) as writer:
+        for stream in ("a", "b"):
+            writer.add_stream(stream, Text)
+        for k in range(count):
+            for stream in ("a", "b"):
+                writer.write(stream, Text(stamp=1 + k, text=f"{stream}{k}"), seq=k)
+    return path
+
+
+def chunks(data: bytes) -> list[tuple[int, int]]:
+    """(begin, end) of each chunk record."""
+    at, found = 8, []
+    while at < len(data) - 8:
+        opcode, length = data[at], int.from_bytes(data[at + 1 : at + HEAD], "little")
+        if opcode == Opcode.CHUNK:
+            found.append((at, at + HEAD + length))
+        at += HEAD + length
+    return found
+
+
+def test_a_damaged_chunk_is_left_out_and_its_messages_are_counted(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    _, end = chunks(bytes(data))[3]
+    data[end - 5] ^= 0xFF
+    path.write_bytes(data)
+
+    done = recover(path, tmp_path / "saved.mcap")
+
+    found = messages(tmp_path / "saved.mcap")
+    lost = {loss.stream: loss.messages for loss in done.lost}
+    assert not done.whole
+    assert lost
+    for stream, present in found.items():
+        assert len(present) + lost.get(stream, 0) == 40
+    assert any("chunk 3" in note for note in done.damage)
+    with Recording(tmp_path / "saved.mcap") as saved:
+        assert not saved.torn
+        assert saved.metadata["note"] == {"robot": "kitchen"}
+        assert saved.metadata["dataflow:recovered"]["of"] == "a.mcap"
+
+
+@pytest.mark.parametrize("share", [0.35, 0.6, 0.9])
+def test_a_torn_file_with_a_damaged_chunk_is_saved_around_it(tmp_path: Path, share: float) -> None:
+    whole = messages(written(tmp_path / "whole.mcap"))
+    data = bytearray((tmp_path / "whole.mcap").read_bytes())
+    del data[int(len(data) * share) :]
+    _, end = chunks(bytes(data))[1]
+    data[end - 5] ^= 0xFF
+    (tmp_path / "a.mcap").write_bytes(data)
+
+    done = recover(tmp_path / "a.mcap", tmp_path / "saved.mcap")
+
+    assert done.torn
+    for stream, found in messages(tmp_path / "saved.mcap").items():
+        assert found
+        assert found.items() <= whole[stream].items()
+
+
+def test_a_sound_file_is_saved_whole(tmp_path: Path) -> None:
+    path = written(tmp_path / "a.mcap")
+
+    done = recover(path, tmp_path / "saved.mcap")
+
+    assert done.whole
+    assert messages(tmp_path / "saved.mcap") == messages(path)
+
+
+def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"nothing of the kind")
+    with pytest.raises(RecordingError, match="magic"):
+        recover(tmp_path / "a.mcap", tmp_path / "saved.mcap")
+    path = written(tmp_path / "b.mcap")
+    with pytest.raises(RecordingError, match="to be recovered"):
+        recover(path, path, overwrite=True)

@@ -1,0 +1,114 @@
+"""Split recordings are recordings; merged, they are the whole again. Others are merged as streams."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from example_messages import example
+from made_parts import cut, messages
+
+from dataflow.editing.merge import merge
+from dataflow.editing.part import Part, write_part
+from dataflow.editing.split import split
+from dataflow.messages import Imu, Odometry
+from dataflow.recording import Recording, RecordingError, RecordingWriter
+from dataflow.recording.copying import Origin
+from dataflow.records.reading import FiringLog
+from dataflow.verification.verify import verify
+
+SECOND = 1_000_000_000
+
+
+def records(path: Path) -> dict[str, list[object]]:
+    with Recording(path) as recording:
+        log = FiringLog.read(recording)
+        return {name: list(log.of(name)) for name in log.operators}
+
+
+def merged(paths: list[Path], out: Path, *prefixes: str) -> list[str]:
+    origins = [Origin(path) for path in paths]
+    try:
+        return merge(origins, out, prefixes=prefixes).notes
+    finally:
+        for origin in origins:
+            origin.close()
+
+
+@pytest.mark.parametrize("how", [{"every": SECOND // 4}, {"size": 20_000}], ids=["time", "size"])
+def test_the_merge_of_a_split_is_the_whole(recorded: Path, tmp_path: Path, how: dict[str, int]) -> None:
+    with Origin(recorded) as origin:
+        parts = [Path(done.path) for done in split(origin, tmp_path / "parts", **how)]  # type: ignore[arg-type]
+
+    merged(list(reversed(parts)), tmp_path / "whole.mcap")
+
+    assert len(parts) > 2
+    assert messages(tmp_path / "whole.mcap") == messages(recorded)
+    assert records(tmp_path / "whole.mcap") == records(recorded)
+    assert verify(tmp_path / "whole.mcap").identical
+
+
+def test_every_message_is_in_the_part_of_its_time(recorded: Path, tmp_path: Path) -> None:
+    with Origin(recorded) as origin:
+        first, last = origin.span()  # type: ignore[misc]
+        done = list(split(origin, tmp_path / "parts", every=SECOND // 3))
+
+    spans = [one.span for one in done]
+    assert all(b[0] > a[1] for a, b in pairwise(spans))  # type: ignore[index]
+    assert (spans[0][0], spans[-1][1]) == (first, last)  # type: ignore[index]
+
+
+def test_parts_with_a_gap_between_stay_a_part_and_verify_around_it(stateful: Path, tmp_path: Path) -> None:
+    parts = [cut(stateful, tmp_path / "a.mcap", None, 0.3), cut(stateful, tmp_path / "b.mcap", 0.6, None)]
+
+    notes = merged(parts, tmp_path / "both.mcap")
+
+    report = verify(tmp_path / "both.mcap")
+    assert any("nothing is known of" in note for note in notes)
+    assert {v.verdict for v in report.operators} == {"identical"}
+    assert report.cut
+    assert not report.identical
+
+
+def test_overlapping_parts_hold_everything_once(recorded: Path, tmp_path: Path) -> None:
+    parts = [cut(recorded, tmp_path / "a.mcap", None, 0.6), cut(recorded, tmp_path / "b.mcap", 0.4, None)]
+
+    merged(parts, tmp_path / "both.mcap")
+
+    assert messages(tmp_path / "both.mcap") == messages(recorded)
+    assert verify(tmp_path / "both.mcap").identical
+
+
+def test_streams_of_another_recording_join_a_run_that_still_verifies(stateful: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other.mcap"
+    with RecordingWriter(other, metadata={}, namespace="test") as writer:
+        for name, kind in (("test/imu/data", Imu), ("test/odometry/pose", Odometry)):
+            writer.add_stream(name, kind)
+            writer.write(name, example(kind).replace(stamp=5 * SECOND), seq=0)
+
+    notes = merged([stateful, other], tmp_path / "both.mcap")
+
+    assert messages(tmp_path / "both.mcap") == messages(stateful) | messages(other)
+    assert verify(tmp_path / "both.mcap").identical
+    assert any("clocks that differ" in note for note in notes)
+    with pytest.raises(RecordingError, match="both hold test/imu/data"):
+        merged([other, other], tmp_path / "twice.mcap")
+    merged([other, other], tmp_path / "twice.mcap", "", "rear/")
+    assert set(messages(tmp_path / "twice.mcap")) == {
+        f"{prefix}test/{name}" for prefix in ("", "rear/") for name in ("imu/data", "odometry/pose")
+    }
+
+
+def test_a_filtered_recording_says_what_it_cannot_verify(recorded: Path, tmp_path: Path) -> None:
+    with Origin(recorded) as origin:
+        names = [name for name in origin.counts() if not name.startswith("test/right/")]
+        write_part(origin, Part(streams=names), tmp_path / "part.mcap")
+
+    report = verify(tmp_path / "part.mcap")
+
+    assert not report.culprits
+    verdicts = {v.operator: (v.verdict, v.missing) for v in report.operators}
+    assert verdicts["mix"] == ("unverifiable", "test/right/fast") or verdicts["mix"][1].startswith("test/right/")
+    assert verdicts["slow"][0] == "identical"
+    assert not report.identical

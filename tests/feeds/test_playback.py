@@ -1,0 +1,104 @@
+"""Playback: what may pass while it is paused, and what keys mean."""
+
+from __future__ import annotations
+
+import os
+import pty
+import termios
+import threading
+
+import pytest
+import typer
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.cli.playback import _steered, looped, pressed
+from dataflow.feeds.playback import ACTIONS, Playback
+
+
+def test_paused_holds_everything_until_it_goes_on() -> None:
+    playback = Playback(paused=True)
+    assert playback.holds
+    playback.do("toggle")
+    assert not playback.holds
+    playback.do("toggle")
+    assert playback.holds
+
+
+def test_steps_pass_one_by_one_without_the_clock() -> None:
+    playback = Playback()
+    playback.do("step", 2)
+    for left in (True, False):
+        assert playback.stepping
+        playback.passed()
+        assert playback.stepping is left
+    assert playback.holds
+
+
+@given(st.lists(st.sampled_from([*ACTIONS, "passed"])))
+def test_it_holds_or_plays_and_steps_are_only_made_while_paused(actions: list[str]) -> None:
+    playback = Playback()
+    for action in actions:
+        if action != "passed":
+            playback.do(action)  # type: ignore[arg-type]
+        elif not playback.holds:
+            playback.passed()
+        assert not (playback.stepping and not playback.paused)
+        assert playback.holds == (playback.paused and not playback.stepping)
+
+
+def test_an_unknown_action_is_refused() -> None:
+    with pytest.raises(ValueError, match="expected one of"):
+        Playback().do("rewind")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        (b" ", ["toggle"]),
+        (b"\x1b[C\x1b[C", ["step", "step"]),
+        (b"nq", ["step", "quit"]),
+        (b"\x1b[A\x1b[D?", []),  # up, left
+        (b"x n", ["toggle", "step"]),
+    ],
+)
+def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
+    assert list(pressed(typed)) == meant
+
+
+def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+    done: list[str] = []
+    came = threading.Event()
+
+    class Steered:
+        def play(self, action: str) -> None:
+            done.append(action)
+
+        def stop(self) -> None:
+            done.append("stop")
+            came.set()
+
+    with os.fdopen(slave, "r") as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        before = termios.tcgetattr(terminal)
+        with _steered(Steered()):  # type: ignore[arg-type]
+            os.write(master, b" n\x1b[Cq")
+            assert came.wait(10)
+        after = termios.tcgetattr(terminal)
+    os.close(master)
+
+    assert done == ["toggle", "step", "step", "stop"]
+    assert after == before
+
+
+def test_passes_of_a_loop_are_compared(capsys: pytest.CaptureFixture[str]) -> None:
+    digests = iter([{"s": "a"}, {"s": "a"}, {"s": "b"}])
+
+    looped(2, lambda: next(digests))
+    assert "2 passes, the same digests in each" in capsys.readouterr().out
+
+    digests = iter([{"s": "a"}, {"s": "b"}])
+    with pytest.raises(typer.Exit) as ended:
+        looped(2, lambda: next(digests))
+    assert ended.value.exit_code == 1

@@ -1,0 +1,163 @@
+"""Datasets that are read back by what others read them with: pyarrow, numpy, and this project's own KITTI reader."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from dataflow.interop.export.kitti_raw import export_kitti_raw
+from dataflow.interop.export.lerobot import export_lerobot
+from dataflow.interop.export.material import Material
+from dataflow.interop.export.report import Exported
+from dataflow.messages import CameraInfo, Image, JointState, Message, PointCloud, Text, Transforms, Twist
+from dataflow.recording import RecordingError, RecordingWriter
+from operators.sources.kitti_raw import KittiRaw
+
+SECOND = 1_000_000_000
+START = 1_700_000_000 * SECOND
+
+
+def write(path: Path, streams: dict[str, list[Message]], static: tuple[str, ...] = ()) -> Path:
+    with RecordingWriter(path, metadata={}, namespace="robot1") as writer:
+        for name, messages in streams.items():
+            writer.add_stream(f"robot1/{name}", type(messages[0]), static=name in static)
+            for seq, message in enumerate(messages):
+                writer.write(f"robot1/{name}", message, seq=seq)
+    return path
+
+
+def arm(frames: int = 6) -> dict[str, list[Message]]:
+    """A camera at 10 Hz, joints at 50 Hz and commands that begin after the first image."""
+    rng = np.random.default_rng(0)
+    joints = [
+        JointState(stamp=START + k * SECOND // 50, names=("a", "b"), positions=np.array([k, -k], float))
+        for k in range(frames * 5)
+    ]
+    commands = [
+        Twist(
+            stamp=START + SECOND // 20 + k * SECOND // 10, frame="b", linear=np.array([k, 0, 0.0]), angular=np.zeros(3)
+        )
+        for k in range(frames)
+    ]
+    images = [
+        Image(stamp=START + k * SECOND // 10, frame="c", data=rng.integers(0, 256, (12, 16, 3), np.uint8))
+        for k in range(frames)
+    ]
+    return {"camera/image": images, "arm/joints": joints, "cmd/twist": commands, "said": [Text(stamp=START, text="go")]}
+
+
+def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: Path) -> None:
+    material_of = arm()
+    path, done = write(tmp_path / "a.mcap", material_of), Exported()
+
+    with Material(path) as material:
+        export_lerobot(material, tmp_path / "set", done, action="cmd/twist", task="pick it up")
+
+    info = json.loads((tmp_path / "set/meta/info.json").read_text())
+    table = pq.read_table(tmp_path / "set" / info["data_path"].format(episode_chunk=0, episode_index=0))
+    rows = table.to_pylist()
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v2.1", 10, 5)
+    assert [row["stamp"] for row in rows] == [m.stamp for m in material_of["camera/image"][1:]]
+    assert [row["observation.state"] for row in rows] == [[5.0 * k, -5.0 * k] for k in range(1, 6)]
+    assert [row["action"][0] for row in rows] == [0.0, 1.0, 2.0, 3.0, 4.0]
+    assert np.allclose([row["timestamp"] for row in rows], np.arange(5) / 10)
+    picture = rows[0]["observation.images.camera.image"]["bytes"]
+    decoded = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR_RGB)
+    assert np.array_equal(decoded, material_of["camera/image"][1].data)  # type: ignore[attr-defined]
+    assert set(info["features"]) == set(table.column_names)
+    assert info["features"]["observation.images.camera.image"]["shape"] == [12, 16, 3]
+    assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
+
+
+def test_the_statistics_of_a_lerobot_dataset_are_those_of_its_columns(tmp_path: Path) -> None:
+    with Material(write(tmp_path / "a.mcap", arm())) as material:
+        export_lerobot(material, tmp_path / "set", Exported())
+
+    table = pq.read_table(tmp_path / "set/data/chunk-000/episode_000000.parquet")
+    states = np.array(table["observation.state"].to_pylist())
+    stats = json.loads((tmp_path / "set/meta/episodes_stats.jsonl").read_text())["stats"]
+    found = stats["observation.state"]
+    for name, expected in (
+        ("min", states.min(0)),
+        ("max", states.max(0)),
+        ("mean", states.mean(0)),
+        ("std", states.std(0)),
+    ):
+        assert np.allclose(found[name], expected)
+    assert found["count"] == [len(states)]
+    assert np.array(stats["observation.images.camera.image"]["mean"]).shape == (3, 1, 1)
+    assert json.loads((tmp_path / "set/meta/episodes.jsonl").read_text())["length"] == len(states)
+    assert b"huggingface" in table.schema.metadata
+
+
+def test_a_dataset_without_images_or_with_another_action_is_refused(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", {"said": [Text(stamp=START, text="go")]})
+    with Material(path) as material, pytest.raises(RecordingError, match="takes images"):
+        export_lerobot(material, tmp_path / "set", Exported())
+    with Material(write(tmp_path / "b.mcap", arm())) as material, pytest.raises(RecordingError, match="no stream 'go'"):
+        export_lerobot(material, tmp_path / "set", Exported(), action="go")
+
+
+def drive() -> dict[str, list[Message]]:
+    """A camera and a LiDAR whose scans come 5 ms later, and where the camera is."""
+    rng = np.random.default_rng(0)
+    K = np.array([[50.0, 0, 8], [0, 50, 6], [0, 0, 1]])
+    R = np.array([0.5, -0.5, 0.5, -0.5])
+    images = [
+        Image(stamp=START + k * SECOND // 10, frame="c", data=rng.integers(0, 256, (12, 16, 3), np.uint8))
+        for k in range(4)
+    ]
+    scans = [
+        PointCloud(
+            stamp=START + 5_000_000 + k * SECOND // 10,
+            frame="velodyne",
+            points=rng.normal(size=(20, 3)).astype(np.float32),
+            intensities=rng.uniform(size=20).astype(np.float32),
+        )
+        for k in range(5)  # the last one has no image
+    ]
+    placed = Transforms(
+        stamp=0, frames=("velodyne",), child_frames=("c",), translations=np.array([[0.1, 0.2, 0.3]]), rotations=R[None]
+    )
+    info = CameraInfo(stamp=0, frame="c", width=16, height=12, K=K)
+    return {"camera/image": images, "lidar/points": scans, "camera/info": [info], "tf": [placed]}
+
+
+def test_a_kitti_raw_drive_is_read_back_by_its_reader(tmp_path: Path) -> None:
+    streams, done = drive(), Exported()
+    with Material(write(tmp_path / "a.mcap", streams, ("camera/info", "tf"))) as material:
+        export_kitti_raw(material, tmp_path / "out", done)
+
+    folder = tmp_path / "out/2023_11_14/2023_11_14_drive_0001_sync"
+    source = KittiRaw(path=str(folder))
+    source.setup()
+    static, steps = source.static_outputs(), list(source.stream())
+    assert len(steps) == 4
+    for step, image, scan in zip(steps, streams["camera/image"], streams["lidar/points"], strict=False):
+        assert step["points"].stamp == scan.stamp
+        assert np.array_equal(step["points"].points, scan.points)  # type: ignore[attr-defined]
+        assert np.array_equal(step["points"].intensities, scan.intensities)  # type: ignore[attr-defined]
+        assert np.array_equal(step["image"].data, image.data)  # type: ignore[attr-defined]
+    placed = static["extrinsics"]
+    assert np.allclose(placed.translations, [[0.1, 0.2, 0.3]])  # type: ignore[attr-defined]
+    assert np.allclose(np.abs(placed.rotations), 0.5)  # type: ignore[attr-defined]
+    assert np.allclose(static["image_info"].K[0, 0], 50.0)  # type: ignore[attr-defined]
+    assert not done.left_out
+
+
+def test_what_a_kitti_raw_drive_lacks_is_said(tmp_path: Path) -> None:
+    streams, done = drive(), Exported()
+    del streams["camera/info"], streams["tf"]
+    with Material(write(tmp_path / "a.mcap", streams)) as material:
+        export_kitti_raw(material, tmp_path / "out", done)
+
+    assert set(done.left_out) == {"calib_cam_to_cam.txt", "calib_velo_to_cam.txt"}
+    assert (
+        len((tmp_path / "out/2023_11_14/2023_11_14_drive_0001_sync/image_02/timestamps.txt").read_text().splitlines())
+        == 4
+    )

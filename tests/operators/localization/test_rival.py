@@ -1,0 +1,101 @@
+"""Another place that explains as much: found, followed, decided, and said before a pose is believed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from made_room import CELL, Drive, mounts
+
+from dataflow.messages import OccupancyGrid
+from dataflow.testing import Played, play
+from operators.localization import ParticleFilterLocalizer
+from operators.localization.rival import Rival, apart
+
+
+def hall(*, notch: bool = False) -> OccupancyGrid:
+    """A hall of 8 by 6 m that looks the same from the other end; a notch makes the ends differ."""
+    rows, columns = np.mgrid[0:128, 0:168]
+    x, y = columns * CELL - 4.2, rows * CELL - 3.2
+    inside = (np.abs(x) < 4) & (np.abs(y) < 3)
+    inside &= ~((np.abs(x) > 2.6) & (np.abs(y) > 2.2)) & ~((np.abs(x) < 0.3) & (np.abs(y) < 0.2))
+    if notch:
+        inside &= ~((x > 1.8) & (y > 1.2))
+    cells = np.where(inside, 0, 100).astype(np.int8)
+    return OccupancyGrid(stamp=0, frame="world", resolution=CELL, cells=cells, position=[-4.2, -3.2, 0.0])
+
+
+class HallDrive(Drive):
+    """A loop around the middle of the hall."""
+
+    def __init__(self, seconds: float, *, notch: bool = False, seed: int = 0) -> None:
+        super().__init__(seconds, seed)
+        self.grid = hall(notch=notch)
+
+    def pose(self, t: float) -> np.ndarray:
+        a = 0.35 * t + 0.4
+        return np.array([2.0 * math.cos(a), 1.4 * math.sin(a), math.atan2(1.4 * math.cos(a), -2.0 * math.sin(a))])
+
+
+def localized(drive: Drive, sensors: dict[str, Any], **params: Any) -> tuple[Played, ParticleFilterLocalizer]:
+    operator = ParticleFilterLocalizer(modality_particles=0, **params)
+    streams = {"odometry": drive.odometry(), "measurements": sensors, "map": [drive.grid], "extrinsics": [mounts()]}
+    return play(operator, streams, static=("map", "extrinsics"), paranoid=False), operator
+
+
+def off(drive: Drive, played: Played) -> list[float]:
+    return [float(np.hypot(*(p.position[:2] - drive.pose(p.stamp * 1e-9)[:2]))) for p in played["pose"]]  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hall_that_looks_the_same_from_both_ends_is_ambiguous_and_both_places_are_named(seed: int) -> None:
+    drive = HallDrive(5.0, seed=seed)
+    played, operator = localized(drive, {"scan": drive.scans()})
+    assert not played["pose"]
+    assert operator.summary()["poses ambiguous"] > 80
+    last = played["status"][-1]
+    assert last.messages[0] == "ambiguous: another place explains as much"  # type: ignore[attr-defined]
+    other = np.array([float(word) for word in dict(last.pairs(0))["other place"].split()])  # type: ignore[attr-defined]
+    true = drive.pose(last.stamp * 1e-9)
+    both = [true, [-true[0], -true[1], true[2] + math.pi]]
+    assert min(float(np.hypot(*(other[:2] - place[:2]))) for place in both) < 0.2
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_what_makes_the_ends_differ_decides(seed: int) -> None:
+    drive = HallDrive(5.0, notch=True, seed=seed)
+    played, _ = localized(drive, {"scan": drive.scans()})
+    assert len(played["pose"]) > 50
+    assert max(off(drive, played)) < 0.15
+
+
+def test_a_known_start_or_a_position_decides() -> None:
+    drive = HallDrive(4.0)
+    known, _ = localized(drive, {"scan": drive.scans()}, start=tuple(drive.pose(0.05).tolist()))
+    assert len(known["pose"]) > 70
+    placed, _ = localized(drive, {"scan": drive.scans(), "place": drive.positions()})
+    for played in (known, placed):
+        assert len(played["pose"]) > 50
+        assert max(off(drive, played)) < 0.2
+
+
+def test_what_is_followed_comes_back_from_a_snapshot() -> None:
+    drive = HallDrive(2.0)
+    _, operator = localized(drive, {"scan": drive.scans()})
+    rival = operator._fused.rival
+    other = Rival()
+    other.restore(rival.snapshot())
+    assert other.mean is not None
+    np.testing.assert_array_equal(other.mean, rival.mean)
+    assert (other.lead, other.decided) == (rival.lead, False)
+    other.restore({})
+    assert other.mean is None
+
+
+def test_places_are_apart_by_way_or_turn() -> None:
+    here = np.array([1.0, 2.0, 3.1])
+    assert not apart(here, np.array([1.3, 2.3, -3.1]))
+    assert apart(here, np.array([2.5, 2.0, 3.1]))
+    assert apart(here, np.array([1.0, 2.0, 2.4]))

@@ -1,0 +1,72 @@
+"""Boxes from the image boxes of several views."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from made_scene import FOCAL, camera
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert
+from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.cells import standing_box
+from operators.scene.class_sizes import CLASS_SIZES
+from operators.scene.cuboid import Box, ImageView, fit_cuboid, image_boxes
+
+K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
+ALL = np.ones(4, np.bool_)
+BOOK: Box = (np.array([2.5, 0.1, 1.0]), np.array([0.16, 0.04, 0.23]), 0.1)
+SIDEWAYS = [0.0, 0.25, -0.3, 0.5, -0.5]
+
+
+def view_of(box: Box, y: float, noise: float = 0.0) -> ImageView:
+    pose = camera(1, (0.2, y, 1.0), pitch=0.0)
+    P = K @ invert(pose.matrix())[:3]
+    image = image_boxes(np.array([[*box[0], *box[1], box[2]]]), P, np.array([False]))[0]
+    stray = np.random.default_rng(int(1000 + 100 * y)).normal(0, noise, 4)
+    return ImageView(P, image + stray, ALL, np.array(pose.position))
+
+
+def spine(box: Box) -> NDArray[np.float64]:
+    """Points on the side of a box that faces the cameras."""
+    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 4), np.linspace(-0.4, 0.4, 9)), axis=-1).reshape(-1, 2)
+    local = np.column_stack([np.full(len(grid), -0.5), grid]) * box[1]
+    c, s = np.cos(box[2]), np.sin(box[2])
+    return np.asarray(local @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) + box[0])
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.7], ids=["exact", "noisy"])
+def test_a_book_of_which_the_spine_is_seen_gets_its_depth_and_stays_apart_from_its_neighbour(noise: float) -> None:
+    beside: Box = (BOOK[0] + [0, 0.045, 0], BOOK[1], BOOK[2])
+    found = []
+    for box in (BOOK, beside):
+        points = spine(box)
+        views = [view_of(box, y, noise) for y in SIDEWAYS]
+        found.append(fit_cuboid(standing_box(points), views, points, CLASS_SIZES["book"])[1])
+        assert upright_iou(found[-1], box) > (0.7 if noise == 0 else 0.45)
+    assert shared_volume(found[0], found[1]) < 0.35 * float(np.prod(BOOK[1]))
+
+
+def test_without_a_usual_size_views_from_all_around_give_the_box() -> None:
+    crate: Box = (np.array([2.5, 0.0, 0.9]), np.array([0.4, 0.3, 0.5]), 0.3)
+    views = [view_of(crate, y) for y in (-1.5, -0.7, 0.0, 0.7, 1.5)]
+    points = spine(crate)
+    fitted = fit_cuboid(standing_box(points), views, points, ())[1]
+    assert upright_iou(fitted, crate) > 0.6
+
+
+def test_edges_that_the_image_cuts_off_do_not_count() -> None:
+    table: Box = (np.array([2.5, 0.0, 0.4]), np.array([0.7, 1.5, 0.75]), 0.0)
+    whole = [view_of(table, y) for y in (-0.4, 0.0, 0.4)]
+    cut = [
+        ImageView(v.P, np.minimum(v.box, [500, 500, 150, 500]), ALL & ([True] * 2 + [False, True]), v.eye)
+        for v in whole
+    ]
+    points = spine(table)
+    first, second = (fit_cuboid(standing_box(points), v, points, CLASS_SIZES["table"])[1] for v in (whole, cut))
+    assert upright_iou(first, second) > 0.7
+
+
+def test_a_box_that_is_partly_behind_the_camera_has_no_image() -> None:
+    P = view_of(BOOK, 0.0).P
+    assert np.isnan(image_boxes(np.array([[0.2, 0, 1, 0.5, 0.5, 0.5, 0]]), P, np.array([False]))).all()

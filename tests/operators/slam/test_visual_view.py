@@ -1,0 +1,90 @@
+"""Views of a made room measured against each other, with known truth."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
+from operators.geometry.se3 import Matrix
+from operators.odometry.camera import RgbdCamera
+from operators.odometry.fitting import Fitter
+from operators.odometry.noise import Noise
+from operators.odometry.rgbd_odometry import RgbdOdometry
+from operators.odometry.settings import RgbdOdometryConfig
+from operators.slam.visual_view import STRIDE, Judge, Sight, View, sight
+from operators.sources.room import Room, camera_path, look_at
+
+K = np.array([[158.0, 0.0, 95.5], [0.0, 158.0, 71.5], [0.0, 0.0, 1.0]])
+CAMERA = RgbdCamera(K, K)
+FITTER = Fitter(CAMERA, RgbdOdometryConfig(), Noise(0.3, 1.0))
+
+
+@cache
+def room(seed: int) -> Room:
+    return Room(seed)
+
+
+def view(T: Matrix, seed: int = 0, lit: bool = True) -> View:
+    seen = room(seed).render(T, K, (192, 144))
+    odometry = RgbdOdometry(CAMERA)
+    rng = np.random.default_rng(int(1e6 * abs(T[0, 3])))
+    depth = seen.depth + 0.0015 * seen.depth**2 * rng.standard_normal(seen.depth.shape)
+    odometry.track(seen.image if lit else np.zeros_like(seen.image), depth.astype(np.float32), 0)
+    return View.of(odometry.snapshot().keyframes[-1], CAMERA)
+
+
+FIRST = camera_path(0.0, 36.0)
+BESIDE = look_at(np.array([1.3, 0.5, 1.4]), np.array([0.0, 0.0, 0.6]))
+OPPOSITE = camera_path(18.0, 36.0)
+
+
+def test_a_view_from_elsewhere_is_placed_and_believed() -> None:
+    seen = sight(view(FIRST), view(BESIDE), FITTER, 20)
+    assert seen is not None
+    assert Judge().doubt(seen) == ""
+    off = se3.log(invert(invert(FIRST) @ BESIDE) @ seen.T_known_seen)
+    assert np.linalg.norm(off[:3]) < 0.015
+    assert np.linalg.norm(off[3:]) < 0.006
+    assert off @ np.linalg.solve(seen.covariance + 1e-6 * np.eye(6), off) / 6 < 5
+
+
+def test_measured_from_either_end_the_motion_is_the_same() -> None:
+    a, b = view(FIRST), view(BESIDE)
+    there, back = sight(a, b, FITTER, 20), sight(b, a, FITTER, 20)
+    assert there is not None
+    assert back is not None
+    assert np.abs(se3.log(there.T_known_seen @ back.T_known_seen)).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("other", "seed", "lit"),
+    [(OPPOSITE, 0, True), (FIRST, 5, True), (FIRST, 0, False)],  # across the room, another room, in the dark
+)
+def test_a_view_of_something_else_is_not_believed(other: Matrix, seed: int, lit: bool) -> None:
+    seen = sight(view(FIRST), view(other, seed, lit), FITTER, 8)
+    assert seen is None or Judge().doubt(seen)
+
+
+def test_doubts_have_reasons() -> None:
+    def doubt(inliers: int, overlap: float, agreement: float) -> str:
+        return Judge().doubt(Sight(np.eye(4), np.eye(6), 99, inliers, overlap, agreement))
+
+    assert doubt(19, 0.9, 0.9) == "too few features agree"
+    assert doubt(99, 0.1, 0.9) == "too little of the depth overlaps"
+    assert doubt(99, 0.9, 0.7) == "too little of the depth agrees"
+    assert doubt(20, 0.2, 0.8) == ""
+
+
+def test_a_view_holds_points_where_the_camera_saw_them_and_shades_of_its_cloud() -> None:
+    seen = view(FIRST)
+    known = np.isfinite(seen.points[:, 2])
+    assert known.mean() > 0.8
+    x, y, z = seen.points[known].T.astype(np.float64)
+    np.testing.assert_allclose(x / z * K[0, 0] + K[0, 2], seen.pixels[known, 0], atol=0.01)
+    np.testing.assert_allclose(y / z * K[1, 1] + K[1, 2], seen.pixels[known, 1], atol=0.01)
+    assert len(seen.shades) == len(seen.surface.points(STRIDE))
+    assert seen.shades.std() > 5

@@ -1,0 +1,258 @@
+"""The flight recorder: what it keeps is re-executed exactly, and what it takes of the disk is bounded."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dataflow.graph import Graph, load_graph
+from dataflow.graph.sections import Flight, Trigger
+from dataflow.messages import Diagnostics, FeatureVector
+from dataflow.process.flight import FlightSink
+from dataflow.process.triggers import Triggers
+from dataflow.recording import Recording
+from dataflow.records.firing import encode_batch
+from dataflow.records.reading import FiringLog
+from dataflow.supervision.run import replay, run
+from dataflow.verification.verify import verify
+
+RUNTIME = Path(__file__).resolve().parent.parent / "runtime"
+SECOND = 1_000_000_000
+GRAPH = """
+graph: flown
+namespace: test
+operators:
+  left: {use: runtime_operators:Counter, params: {count: 600, period: 50000000, ratio: 300}}
+  first: {use: runtime_operators:Tuned, inputs: {x: left/fast}}
+  second: {use: runtime_operators:Tuned, inputs: {x: first/y}, params: {factor: 0.5}}
+  slow: {use: runtime_operators:Tuned, inputs: {x: left/slow}}
+record: {keep: 4s, after: 2s, snapshots: 1s}
+"""
+
+
+@pytest.fixture(scope="module")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Graph:
+    sys.path.append(str(RUNTIME))
+    path = tmp_path_factory.mktemp("flown") / "flown.yaml"
+    path.write_text(GRAPH)
+    return load_graph(path)
+
+
+@pytest.fixture(scope="module")
+def recorded(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """All of a run of 30 s, of which the flight recorder is to keep a part."""
+    path = tmp_path_factory.mktemp("flown") / "run.mcap"
+    run(graph, placement="one_process", record=path)
+    return path
+
+
+def flown(
+    recorded: Path, graph: Graph, folder: Path, *, when: tuple[Trigger, ...] = (), asks: Any = (), **more: Any
+) -> Any:
+    """Gives a flight recorder what a recorder was given; `asks`: stamps (s) at which somebody triggers it."""
+    flight = replace(graph.record.flight, when=when, **more)  # type: ignore[type-var]
+    made = replace(graph, record=replace(graph.record, flight=flight))
+    history: list[tuple[int, int]] = []
+    asks = sorted(asks)
+    with Recording(recorded) as recording:
+        metadata = {n: dict(v) for n, v in recording.metadata.items() if n not in ("recording", "digests")}
+        options = {"metadata": metadata, "compression": "zstd", "overwrite": True, "label": "ring", "settle": 0.0}
+        sink = FlightSink(folder, made, list(made.record.streams), options)
+        records = _records(recording)
+        at = next(records, None)
+        for found in recording.messages():
+            while at is not None and at.stamp < found.stamp:
+                sink.firings(at.operator, at.stamp, encode_batch([at]))
+                at = next(records, None)
+            sink.message(found.stream, found.message, found.seq, found.incarnation)
+            history.append((sink.ring_bytes, len(list((folder / ".ring").iterdir()))))
+            if asks and found.stamp >= asks[0] * SECOND and found.stamp < 10**14:
+                asks = asks[1:]
+                sink.event("trigger", found.stamp, {"text": "a test"})
+        while at is not None:
+            sink.firings(at.operator, at.stamp, encode_batch([at]))
+            at = next(records, None)
+    return sink, history
+
+
+def _records(recording: Recording) -> Iterator[Any]:
+    log = FiringLog.read(recording)
+    return iter(sorted((r for name in log.operators for r in log.of(name)), key=lambda r: r.stamp))
+
+
+@pytest.mark.parametrize("asked", [3.0, 12.0, 21.7, 29.5])
+def test_what_is_kept_verifies_from_its_beginning(recorded: Path, graph: Graph, tmp_path: Path, asked: float) -> None:
+    sink, _ = flown(recorded, graph, tmp_path, asks=[asked])
+    facts = sink.close("complete")
+
+    assert [one.get("error") for one in facts["kept"]] == [None]
+    path = facts["kept"][0]["path"]
+    report = verify(Path(path))
+    assert {v.operator: v.verdict for v in report.operators} == dict.fromkeys(("first", "second", "slow"), "identical")
+    assert report.cut
+    assert all(s.whole for s in report.stand_ins)
+    assert not [s for s in report.stored if not s.as_recorded or s.missing]
+    with Recording(path) as kept:
+        stamps = [m.stamp for m in kept.messages(["test/left/fast"])]
+        assert max(stamps) >= min(asked + 2, 30.9) * SECOND - 60_000_000
+        assert min(stamps) <= max(1.0, asked - 4) * SECOND
+        assert json.loads(kept.metadata["dataflow:flight"]["triggers"])[0]["what"] == "a test"
+    assert not (tmp_path / ".ring").exists()
+
+
+def test_what_is_kept_replays_with_the_states_of_then(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    sink, _ = flown(recorded, graph, tmp_path, asks=[20.0])
+    path = Path(sink.close("complete")["kept"][0]["path"])
+
+    replay(path, placement="one_process", record=tmp_path / "again.mcap")
+
+    with Recording(tmp_path / "again.mcap") as again, Recording(recorded) as whole:
+        made = {m.stamp: m.message.digest() for m in again.messages(["test/second/y"])}
+        was = {m.stamp: m.message.digest() for m in whole.messages(["test/second/y"])}
+    assert len(made) > 80
+    assert made.items() <= was.items()
+
+
+def test_the_disk_that_the_ring_takes_does_not_grow_with_the_run(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    sink, history = flown(recorded, graph, tmp_path)
+    sink.close("complete")
+
+    half = len(history) // 2
+    longest = 4 + 2 * 1 + 2 * 1 + 3 + 8  # s: kept, needed for it, files at both ends of 1 s each, waiting to be deleted
+    assert max(files for _, files in history) <= longest
+    assert max(size for size, _ in history[half:]) <= 1.1 * max(size for size, _ in history[:half])
+    assert not list(tmp_path.glob("*.mcap"))  # nobody asked
+
+
+def test_the_ring_keeps_less_time_where_it_may_take_less_of_the_disk(
+    recorded: Path, graph: Graph, tmp_path: Path
+) -> None:
+    _, history = flown(recorded, graph, tmp_path / "a")
+    most = max(size for size, _ in history) // 2
+    sink, bounded = flown(recorded, graph, tmp_path / "b", disk=most, asks=[20.0])
+    (one,) = sink.close("complete")["kept"]
+
+    assert max(size for size, _ in bounded) < 1.5 * most
+    assert not verify(Path(one["path"])).culprits
+
+
+def test_no_more_is_kept_than_the_graph_allows(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    sink, _ = flown(recorded, graph, tmp_path, asks=[4.0, 12.0, 20.0, 25.0], files=2)
+    facts = sink.close("complete")
+
+    assert len(list(tmp_path.glob("*.mcap"))) == len(facts["kept"]) == 2
+    assert facts["not_kept"] == 2
+
+
+def test_triggers_that_come_together_keep_one_recording(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    sink, _ = flown(recorded, graph, tmp_path, asks=[12.0, 13.0])
+    (one,) = sink.close("complete")["kept"]
+
+    assert len(one["reasons"]) == 2
+    with Recording(one["path"]) as kept:
+        assert max(m.stamp for m in kept.messages(["test/left/fast"])) >= 14.9 * SECOND
+
+
+def test_a_field_of_a_stream_triggers_once_while_it_holds(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    above = Trigger("field", stream="test/left/fast", field="vectors", above=250.0)
+    sink, _ = flown(recorded, graph, tmp_path, when=(above,))
+    (one,) = sink.close("complete")["kept"]
+
+    assert one["reasons"] == [
+        {"what": "test/left/fast vectors above 250", "stream": "test/left/fast", "stamp": SECOND + 251 * 50_000_000}
+    ]
+
+
+def test_a_run_that_fails_keeps_its_end(recorded: Path, graph: Graph, tmp_path: Path) -> None:
+    sink, _ = flown(recorded, graph, tmp_path, when=(Trigger("raise"),))
+    (one,) = sink.close("failed: operator 'second' failed in firing 3: boom")["kept"]
+
+    assert "boom" in one["reasons"][0]["what"]
+    assert not verify(Path(one["path"])).culprits
+
+
+def test_drops_trigger_above_their_rate_by_operator() -> None:
+    triggers = Triggers([Trigger("drops", above=5.0), Trigger("drops", operator="slow", above=1.0)])
+
+    def fares(**rates: float) -> Diagnostics:
+        return Diagnostics(
+            stamp=1,
+            names=tuple(rates),
+            messages=("",) * len(rates),
+            keys=("drop_rate_hz",) * len(rates),
+            values=tuple(str(rate) for rate in rates.values()),
+            levels=np.zeros(len(rates), np.uint8),
+            owners=np.arange(len(rates), dtype=np.int32),
+        )
+
+    assert not list(triggers.diagnostics(fares(slow=0.5, fast=5.0)))
+    assert [r["operator"] for r in triggers.diagnostics(fares(slow=2.0, fast=6.0))] == ["fast", "slow"]
+    assert not list(triggers.diagnostics(fares(slow=2.0, fast=6.0)))  # they go on
+
+
+@pytest.mark.parametrize(
+    ("trigger", "values", "expected"),
+    [
+        (Trigger("field", stream="s", field="vectors", below=0.0), [[1.0, -1.0]], 1),
+        (Trigger("field", stream="s", field="vectors", above=2.0), [[1.0, 1.5]], 0),
+        (Trigger("field", stream="s", field="model", equals="m"), [[1.0]], 1),
+        (Trigger("field", stream="s", field="nothing", above=1.0), [[5.0]], 0),
+        (Trigger("field", stream="other", field="vectors", above=1.0), [[5.0]], 0),
+    ],
+)
+def test_a_field_or_any_of_its_elements_meets_a_condition(trigger: Trigger, values: Any, expected: int) -> None:
+    message = FeatureVector(stamp=1, vectors=values, model="m")
+    assert len(list(Triggers([trigger]).message("s", message))) == expected
+
+
+def test_a_graph_says_what_its_flight_recorder_keeps(tmp_path: Path) -> None:
+    sys.path.append(str(RUNTIME))
+    text = GRAPH.replace(
+        "record: {keep: 4s, after: 2s, snapshots: 1s}",
+        "record:\n  keep: 60s\n  folder: kept\n  when:\n    - raise\n    - {drops: 5, operator: first}\n"
+        "    - {stream: left/fast, field: vectors, above: 3}\n",
+    )
+    (tmp_path / "a.yaml").write_text(text)
+    record = load_graph(tmp_path / "a.yaml").record
+
+    assert record.snapshots == 10 * SECOND
+    assert record.flight == Flight(
+        60 * SECOND,
+        10 * SECOND,
+        (
+            Trigger("raise"),
+            Trigger("drops", operator="first", above=5.0),
+            Trigger("field", stream="test/left/fast", field="vectors", above=3.0),
+        ),
+        "kept",
+    )
+    loaded = load_graph(tmp_path / "a.yaml")
+    assert Graph.from_json(json.loads(json.dumps(loaded.to_json()))).record == record
+
+
+@pytest.mark.parametrize(
+    ("said", "fault"),
+    [
+        ("{after: 2s}", "say how much it keeps"),
+        ("{keep: 4s, when: [raises]}", "when must be"),
+        ("{keep: 4s, when: [{drops: many}]}", "drops must be a number"),
+        ("{keep: 4s, when: [{drops: 1, operator: frist}]}", "no operator 'frist'"),
+        ("{keep: 4s, when: [{stream: left/fast}]}", "when must be"),
+        ("{keep: 4s, when: [{stream: left/fats, field: vectors, above: 1}]}", "left/fats"),
+        ("{keep: 0s}", "more than 0"),
+    ],
+)
+def test_a_flight_recorder_that_cannot_be_is_refused_where_it_stands(tmp_path: Path, said: str, fault: str) -> None:
+    from dataflow.graph import GraphError
+
+    sys.path.append(str(RUNTIME))
+    (tmp_path / "a.yaml").write_text(GRAPH.replace("{keep: 4s, after: 2s, snapshots: 1s}", said))
+    with pytest.raises(GraphError, match=fault):
+        load_graph(tmp_path / "a.yaml")
