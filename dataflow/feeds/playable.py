@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
-from dataflow.recording.reader import Recorded
+from dataflow.recording.entries import Recorded
 from dataflow.recording.streams import StreamInfo
 
 

@@ -6,14 +6,16 @@ from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
     from dataflow.graph.load import load_bundle, load_graph, load_text
-    from dataflow.graph.model import Edge, Graph, Live, Network, Node, OperatorImportError, Placement, Stream
+    from dataflow.graph.model import Edge, Graph, Live, Node, OperatorImportError, Placement, Stream
     from dataflow.graph.problems import GraphError, Place, Problem
+    from dataflow.graph.sections import Network
 else:
     __getattr__, __dir__ = lazily(
         __name__,
         {
             "load": ("load_bundle", "load_graph", "load_text"),
-            "model": ("Edge", "Graph", "Live", "Network", "Node", "OperatorImportError", "Placement", "Stream"),
+            "model": ("Edge", "Graph", "Live", "Node", "OperatorImportError", "Placement", "Stream"),
+            "sections": ("Network",),
             "problems": ("GraphError", "Place", "Problem"),
         },
     )

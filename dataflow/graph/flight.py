@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from dataflow.graph.fields import Fields
-from dataflow.graph.model import Flight, Trigger
 from dataflow.graph.problems import did_you_mean
+from dataflow.graph.sections import Flight, Trigger
 from dataflow.graph.tree import Items, Leaf, Table, Tree
 
 KEYS = ("keep", "after", "when", "folder", "files", "disk")

@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
+from dataflow.graph.sections import Network, Record, View, record_from_json, record_to_json, view_from_json
 from dataflow.messages.base import Message, MessageError, import_type, message_type
 from dataflow.messages.declaration import Declaration
 
@@ -154,85 +155,6 @@ class Stream:
 
 
 @dataclass(frozen=True, slots=True)
-class Trigger:
-    """A condition on which a flight recorder keeps what was.
-
-    `kind`: "raise" (an operator fails), "drops" (more than `above` messages a second are dropped, by `operator` or by
-    any), "field" (a field of a stream's messages, or one of its elements, is `above`, `below` or `equals` something).
-    """
-
-    kind: Literal["raise", "drops", "field"]
-    operator: str = ""
-    stream: str = ""
-    field: str = ""
-    above: float | None = None
-    below: float | None = None
-    equals: str | float | bool | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Flight:
-    """A flight recorder: event time to keep before a trigger and after it (ns), where, and how many files at most.
-
-    `disk`: bytes that what is not kept yet may take; None: as much as the time needs. With less, less time is there.
-    """
-
-    keep: int
-    after: int
-    when: tuple[Trigger, ...] = ()
-    folder: str = "flight"
-    files: int = 20
-    disk: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Record:
-    """Choice of the streams that a recording holds. `thin`: not all of them; firing records are always written.
-
-    `snapshots`: nanoseconds of event time between two snapshots of an operator's state; None for none. `flight`: the
-    flight recorder of runs that are not recorded whole; None for none.
-    """
-
-    streams: tuple[str, ...]
-    thin: bool = False
-    snapshots: int | None = None
-    flight: Flight | None = None
-
-
-PANELS = ("world", "cameras", "scene", "map", "plots", "status", "log")
-"""Parts of the viewer's window that a graph may choose."""
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """Choices for the viewer: streams left out, panels (none: all), a layout saved from it (empty: derived)."""
-
-    hide: tuple[str, ...] = ()
-    panels: tuple[str, ...] = ()
-    layout: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class Network:
-    """Addresses by which processes listen and connect beyond loopback. The default opens nothing.
-
-    `listen` and `connect` are Zenoh endpoints (`"tcp/192.168.1.2:7447"`); `tls` and `access_control` are handed to
-    Zenoh's own configuration (`transport/link/tls`, `access_control`) as they are.
-    """
-
-    listen: tuple[str, ...] = ()
-    connect: tuple[str, ...] = ()
-    shared_memory: bool = True
-    scouting: bool = False
-    tls: Mapping[str, Any] = field(default_factory=dict)
-    access_control: Mapping[str, Any] = field(default_factory=dict)
-
-    @property
-    def loopback_only(self) -> bool:
-        return not (self.listen or self.connect or self.scouting)
-
-
-@dataclass(frozen=True, slots=True)
 class Edge:
     """One stream into one input."""
 
@@ -271,8 +193,8 @@ class Graph:
     sources_bundle: Bundle
     seed: int = 0
     threads: int = 1
-    view: View = View()
-    network: Network = Network()
+    view: View = field(default_factory=View)
+    network: Network = field(default_factory=Network)
     aliases: Mapping[str, str] = field(default_factory=dict)
     """Exported outputs of nested graphs: alias key → stream name."""
     types: Mapping[str, Declaration] = field(default_factory=dict)
@@ -300,7 +222,7 @@ class Graph:
             "streams": [asdict(stream) for stream in self.streams.values()],
             "aliases": dict(self.aliases),
             "types": [declaration.to_json() for declaration in self.types.values()],
-            "record": _record_to_json(self.record),
+            "record": record_to_json(self.record),
             "view": asdict(self.view),
             "network": asdict(self.network),
             "bundle": asdict(self.sources_bundle),
@@ -322,8 +244,8 @@ class Graph:
             streams={stream.name: stream for stream in streams},
             aliases=dict(data["aliases"]),
             types={declaration.schema: declaration for declaration in types},
-            record=_record_from_json(data["record"]),
-            view=_view_from_json(data["view"]),
+            record=record_from_json(data["record"]),
+            view=view_from_json(data["view"]),
             network=Network(
                 **{**network, "listen": tuple(network["listen"]), "connect": tuple(network["connect"])},
             ),
@@ -400,23 +322,6 @@ class Graph:
     def relative(self, stream: str) -> str:
         """`stream` without the namespace, for people."""
         return stream.removeprefix(f"{self.namespace}/")
-
-
-def _record_to_json(record: Record) -> dict[str, Any]:
-    """Without a flight recorder, that is what it was before there were any."""
-    return {name: value for name, value in asdict(record).items() if name != "flight" or value is not None}
-
-
-def _record_from_json(data: Mapping[str, Any]) -> Record:
-    flight = data.get("flight")
-    if flight is not None:
-        flight = Flight(**{**flight, "when": tuple(Trigger(**trigger) for trigger in flight["when"])})
-    return Record(**{**data, "streams": tuple(data["streams"]), "flight": flight})
-
-
-def _view_from_json(data: Mapping[str, Any]) -> View:
-    """Sections that older recordings lack are as they were: every panel, no saved layout."""
-    return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""))
 
 
 def _node_from_json(values: Mapping[str, Any]) -> Node:

@@ -6,8 +6,8 @@ import json
 import re
 
 from dataflow.graph.fields import Fields
-from dataflow.graph.model import Network
 from dataflow.graph.problems import did_you_mean
+from dataflow.graph.sections import Network
 from dataflow.graph.tree import Table, Tree, plain
 
 _ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws|unixsock-stream|vsock|serial|unixpipe)/[^\s#?]+([?#][^\s]*)?")

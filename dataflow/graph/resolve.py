@@ -9,18 +9,12 @@ from dataflow.graph.fields import Fields
 from dataflow.graph.flight import KEYS as FLIGHT_KEYS
 from dataflow.graph.flight import read_flight
 from dataflow.graph.keys import canonical, has_wildcard, key_fault
-from dataflow.graph.model import (
-    PANELS,
-    Bundle,
-    Graph,
-    Node,
-    Record,
-    View,
-)
+from dataflow.graph.model import Bundle, Graph, Node
 from dataflow.graph.network import read_network
 from dataflow.graph.order import fed_by_devices, in_order, refuse_stuck_cycles
 from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
 from dataflow.graph.problems import Problems, did_you_mean
+from dataflow.graph.sections import PANELS, Record, View
 from dataflow.graph.streams import Streams
 from dataflow.graph.tree import Leaf, Tree
 from dataflow.operator import InputPort, is_source

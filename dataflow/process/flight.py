@@ -21,7 +21,8 @@ from typing import Any
 from dataflow.editing.part import Part
 from dataflow.editing.rolling import keep_span
 from dataflow.editing.spans import folded
-from dataflow.graph.model import Flight, Graph
+from dataflow.graph.model import Graph
+from dataflow.graph.sections import Flight
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 from dataflow.process.recorder import RecorderSink

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dataflow.graph.model import Network
+from dataflow.graph.sections import Network
 from dataflow.transport import NetworkConfig
 
 BLOCKED, BLOCKED_LIVE = 30.0, 2.0

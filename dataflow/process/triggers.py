@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.graph.model import Trigger
+from dataflow.graph.sections import Trigger
 from dataflow.messages import Diagnostics
 from dataflow.messages.base import Message
 

@@ -18,13 +18,14 @@ from dataflow.messages import Odometry, Transforms
 from dataflow.recording.codecs import codec_for
 from dataflow.recording.container import ContainerWriter
 from dataflow.recording.contents import Entries
+from dataflow.recording.entries import Recorded
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.frames import FrameTree
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.layout import RECORDING, Kind, firings_topic, frames_topic
 from dataflow.recording.ordering import in_file_order
 from dataflow.recording.packing import Compression
-from dataflow.recording.reader import Recorded, Recording
+from dataflow.recording.reader import Recording
 
 Mask = npt.NDArray[np.bool_]
 RUN_KINDS = (Kind.FIRINGS, Kind.EVENTS, Kind.LOGS)

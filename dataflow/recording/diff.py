@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from dataflow.messages.base import Message
 from dataflow.messages.declaration import Declaration
+from dataflow.recording.entries import Recorded
 from dataflow.recording.errors import RecordingError
-from dataflow.recording.reader import Recorded, Recording
+from dataflow.recording.reader import Recording
 
 Outcome = Literal["same", "within tolerance", "different", "only in A", "only in B"]
 

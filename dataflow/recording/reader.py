@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -12,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from mcap.records import Channel
 
-from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.access import StreamIndex
 from dataflow.recording.codecs import codec_for
+from dataflow.recording.entries import Event, RawRecord, Recorded
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.index import McapFile, RawMessage
 from dataflow.recording.json_codec import decode_object
@@ -33,42 +32,6 @@ from dataflow.recording.streams import (
     unordered,
     unreadable,
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Recorded:
-    """One message of a recording and its place in its stream."""
-
-    stream: str
-    message: Message
-    seq: int
-    incarnation: int
-
-    @property
-    def stamp(self) -> int:
-        """The timestamp of the message, nanoseconds since the epoch."""
-        return self.message.stamp
-
-
-@dataclass(frozen=True, slots=True)
-class RawRecord:
-    """One message as it stands in the file, decoded or not."""
-
-    stream: str
-    schema: str
-    encoding: str
-    log_time: int
-    sequence: int
-    data: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """Something that happened to the run."""
-
-    name: str
-    stamp: int
-    data: Mapping[str, Any]
 
 
 class Recording:

@@ -10,7 +10,8 @@ from typing import Any
 from dataflow.feeds.playable import PlayableStreams
 from dataflow.firing.seeding import version_of
 from dataflow.graph import load_bundle
-from dataflow.graph.model import Graph, Network
+from dataflow.graph.model import Graph
+from dataflow.graph.sections import Network
 from dataflow.messages.base import message_type
 from dataflow.messages.declaration import Declaration
 from dataflow.recording import Recording, RecordingError

@@ -9,7 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.api import VisualizerLike
 
-from dataflow.graph.model import PANELS, Graph
+from dataflow.graph.model import Graph
+from dataflow.graph.sections import PANELS
 from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
 from dataflow.view.canvas import Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout

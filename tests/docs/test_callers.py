@@ -12,11 +12,13 @@ FOR_TESTS = {
     "pid_of",  # a process of a run, to stop it
     "slerp",  # for operators to come, held against scipy
     "SPATIAL",  # the page about the simulator is held against it
+    "visualizers",  # the message types that have one of their own
     "TO_PROCESSES",  # the page about faults is held against it
 }
 CALLED_BY_OTHERS = {
+    "list_commands",  # Typer asks a group for the commands of its help
     "get_next",  # onnxruntime asks a calibration reader
-    "list_commands",  # click asks a group
+    # click asks a group
     "on_playback_control_request",  # Foxglove's server tells its listener
     "on_subscribe",
 }

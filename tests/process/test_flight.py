@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dataflow.graph import Graph, load_graph
-from dataflow.graph.model import Flight, Trigger
+from dataflow.graph.sections import Flight, Trigger
 from dataflow.messages import Diagnostics, FeatureVector
 from dataflow.process.flight import FlightSink
 from dataflow.process.triggers import Triggers

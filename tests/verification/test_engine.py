@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from dataflow.graph import Graph
-from dataflow.graph.model import Network
+from dataflow.graph.sections import Network
 from dataflow.recording import Recording
 from dataflow.reexecution.recorded_run import recorded_graph
 from dataflow.supervision.report import RunFailed, Status

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from dataflow.graph.model import Bundle, Graph, Live, Node, Record, Stream, View
+from dataflow.graph.model import Bundle, Graph, Live, Node, Stream
+from dataflow.graph.sections import Record, View
 from dataflow.messages import (
     Boxes3D,
     CameraInfo,

@@ -11,7 +11,8 @@ import pytest
 import rerun.blueprint as rrb
 from rrd_rows import at, blueprint_rows, rows
 
-from dataflow.graph.model import Bundle, Graph, Record, View
+from dataflow.graph.model import Bundle, Graph
+from dataflow.graph.sections import Record, View
 from dataflow.messages import (
     CameraInfo,
     DepthImage,
