@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -32,6 +33,8 @@ _WINDOW = 1.0  # seconds of the past that tell how an agent moves
 _WALKING, _ROLLING, _DRIVING = 0.25, 0.12, 0.07  # m/s
 _RISING = 0.15  # m/s, of the head
 _NEARNESS = 4.0  # log odds that a goal loses for each metre that it is farther away than the nearest
+_ARM = (0.5, -0.19)  # metres ahead and to the left at which somebody has what the right hand takes
+_EFFORT = 0.25  # metres that reaching for something counts as farther than walking up to something
 
 
 class Motion:
@@ -100,10 +103,27 @@ def _sure(more: float, less: float) -> float:
     return float(1 / (1 + np.exp(-4 * (more - less) / max(more + less, 1e-6))))
 
 
+def way_to(place: Array, goal: Body, support: Body | None) -> float:
+    """Returns the metres that are left from a place (2,) to a goal.
+
+    What lies on a support is reached for, from where one stands square to the support with the thing before the right
+    hand: the nearest such place counts. Anything else is walked up to.
+    """
+    if support is None:
+        return math.hypot(*(goal.center[:2] - place))
+    ahead, left = _ARM
+    ways = []
+    for side in range(4):
+        c, s = math.cos(support.yaw + side * math.pi / 2), math.sin(support.yaw + side * math.pi / 2)
+        stand = goal.center[:2] - (ahead * c - left * s, ahead * s + left * c)
+        ways.append(math.hypot(*(stand - place)))
+    return min(ways) + _EFFORT
+
+
 class GoalInference:
     """Infers where an agent is going: a probability for each candidate, and for none of them (id -1).
 
-    Each step of the path speaks for the candidates that it brings nearer: its log likelihood is `trust` times the
+    Each step of the path speaks for the candidates to which it leaves less way: its log likelihood is `trust` times the
     way saved, less the way walked, so detours count against a goal. The past fades over `memory` seconds; so does what
     was believed when the agent stands still. After Ramirez and Geffner, "Probabilistic plan recognition using
     off-the-shelf classical planners", 2010, with straight lines for plans.
@@ -114,19 +134,25 @@ class GoalInference:
         self._belief: dict[int, float] = {}
         self._last: tuple[float, Array] | None = None
 
-    def update(self, time: float, body: Body, candidates: Sequence[Body]) -> dict[int, float]:
-        """Returns the probability of each candidate's id and of -1 after the agent's next place."""
+    def update(
+        self, time: float, body: Body, candidates: Sequence[Body], supports: Mapping[int, Body]
+    ) -> dict[int, float]:
+        """Returns the probability of each candidate's id and of -1 after the agent's next place.
+
+        `supports`: what candidates lie on, by their ids.
+        """
         here = body.center[:2]
         if self._last is not None and time > self._last[0]:
             fade = float(np.exp(-(time - self._last[0]) / self._memory))
             walked = float(np.hypot(*(here - self._last[1])))
             belief = {}
             for each in candidates:
-                saved = float(np.hypot(*(each.center[:2] - self._last[1])) - np.hypot(*(each.center[:2] - here)))
+                support = supports.get(each.id)
+                saved = way_to(self._last[1], each, support) - way_to(here, each, support)
                 belief[each.id] = fade * self._belief.get(each.id, 0.0) + self._trust * (saved - walked)
             self._belief = belief
         self._last = (time, here.copy())
-        away = {each.id: float(np.hypot(*(each.center[:2] - here))) for each in candidates}
+        away = {each.id: way_to(here, each, supports.get(each.id)) for each in candidates}
         nearest = min(away.values(), default=0.0)
         scores = {i: self._belief.get(i, 0.0) - _NEARNESS * (d - nearest) for i, d in away.items()}
         scores[-1] = -self._elsewhere

@@ -133,7 +133,9 @@ class LayeredGraph:
     ) -> dict[int, float]:
         taken = {o for (s, p, o) in now if s == agent.id and p == "sitting_on"}
         wanted = [b for b in bodies if b.label in self._settings.goals and b.id not in taken]
-        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, wanted)
+        by_id = {b.id: b for b in bodies}
+        supports = {s: by_id[o] for (s, p, o) in now if p == "on" and s in by_id and o in by_id}
+        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, wanted, supports)
 
     def _act(self, stamp: int, agent: Body, held: Mapping[Relation, float], goals: Mapping[int, float]) -> Act:
         activity, score, object = activity_of(agent, self._motions[agent.id], held)

@@ -200,9 +200,25 @@ def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
     inference = GoalInference(4.0, 4.0, 2.5)
     for k in range(15):
         walker = Body(9, "person", np.array([0.15 * k, 0.0, 0.85]), np.ones(3), 0.0, np.zeros(3))
-        beliefs = inference.update(0.2 * k, walker, goals)
+        beliefs = inference.update(0.2 * k, walker, goals, {})
     assert sum(beliefs.values()) == pytest.approx(1)
     assert beliefs[1] > 0.8
+
+
+def test_of_two_mugs_equally_near_the_one_before_the_right_hand_is_the_goal() -> None:
+    def thing(id: int, label: str, x: float, y: float, yaw: float = 0.0) -> Body:
+        return Body(id, label, np.array([x, y, 0.8]), np.full(3, 0.1), yaw, np.zeros(3))
+
+    table = thing(1, "table", 0.5, 0.0, np.pi)  # its heading is that of either side
+    mugs = [
+        thing(2, "mug", 0.5, -0.19),
+        thing(3, "mug", 0.5, 0.19),
+    ]  # right and left, looking along x
+    inference = GoalInference(2.0, 4.0, 2.5)
+    for k in range(10):
+        walker = Body(9, "person", np.array([min(-1 + 0.15 * k, 0.0), 0.0, 0.85]), np.ones(3), 0.0, np.zeros(3))
+        beliefs = inference.update(0.2 * k, walker, mugs, {2: table, 3: table})
+    assert beliefs[2] > 2 * beliefs[3]
 
 
 def test_hysteresis_forgets_what_is_no_more() -> None:
