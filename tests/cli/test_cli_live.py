@@ -163,20 +163,6 @@ def test_a_graph_that_does_not_run_is_answered_with_those_that_do(dataflow, runn
     assert running.thread.is_alive()
 
 
-def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:
-    """The last test of the file: it ends the graph."""
-    saved = tmp_path / "live.rrd"
-    threading.Timer(1.0, running.supervisor.stop).start()
-
-    told = dataflow("view", "--graph", "small", "--to", saved, "--stream", "left/*")
-
-    assert f"following small (process {os.getpid()})" in told.stderr
-    assert f"wrote {saved} (" in told.stdout
-    running.end()
-    assert "no graph runs" in dataflow("list").stderr
-    assert json.loads(dataflow("list", "--json").stdout) == []
-
-
 @pytest.mark.usefixtures("running")
 def test_a_running_graph_is_recorded_by_pattern_and_what_it_lacks_is_said(dataflow, tmp_path: Path) -> None:
     told = dataflow("record", "left/*", "-o", tmp_path / "a.mcap", "--seconds", 1)
@@ -194,3 +180,17 @@ def test_what_plays_no_recording_and_has_no_flight_recorder_says_so(dataflow) ->
     assert "plays no recording" in dataflow("playback", "pause", code=2).stderr
     assert "has no flight recorder" in dataflow("trigger", code=2).stderr
     assert "expected pause, resume, step or status" in dataflow("playback", "rewind", code=2).stderr
+
+
+def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:
+    """The last test of the file: it ends the graph."""
+    saved = tmp_path / "live.rrd"
+    threading.Timer(1.0, running.supervisor.stop).start()
+
+    told = dataflow("view", "--graph", "small", "--to", saved, "--stream", "left/*")
+
+    assert f"following small (process {os.getpid()})" in told.stderr
+    assert f"wrote {saved} (" in told.stdout
+    running.end()
+    assert "no graph runs" in dataflow("list").stderr
+    assert json.loads(dataflow("list", "--json").stdout) == []
