@@ -1,4 +1,4 @@
-"""The state of a robot from all its sensors as an operator."""
+"""Operator for the state of a robot from all its sensors."""
 
 from __future__ import annotations
 
