@@ -11,6 +11,7 @@ from pathlib import Path
 from dataflow.graph.expand import Expander
 from dataflow.graph.limits import MAX_BUNDLE, MAX_TEXT
 from dataflow.graph.model import Bundle, Graph
+from dataflow.graph.presence import Presence
 from dataflow.graph.problems import Place, Problems
 from dataflow.graph.resolve import Resolver
 from dataflow.graph.search import add_folder
@@ -106,6 +107,7 @@ def _load(
     if expansion is None:
         problems.check()
         raise AssertionError("a graph without a shape has a problem")
+    Presence(expansion, problems).settle()
     graph = Resolver(expansion, problems, live).resolve(
         Bundle(file, texts, tuple(settings), environment, "".join(folders))
     )
