@@ -32,7 +32,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "Graphs and runs",
         "dataflow",
-        ("Graph", "run", "replay", "launch", "verify", "RunResult", "Verified"),
+        ("Graph", "run", "replay", "launch", "verify", "Session", "RunResult", "Verified"),
     ),
     ("One operator on streams", "dataflow", ("play", "Played")),
     (
@@ -52,7 +52,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 
 NOT_MADE = (
-    "RecordedStreams", "RecordedStream", "Joined", "RunResult", "Verified", "Played", "Recorded", "StreamInfo",
+    "RecordedStreams", "RecordedStream", "Joined", "RunResult", "Session", "Verified", "Played", "Recorded", "StreamInfo",
     "Context", "GraphError",
 )  # fmt: skip
 """Classes whose objects are given, not made."""

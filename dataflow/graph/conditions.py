@@ -24,8 +24,10 @@ def failed(tree: Tree | None, inputs: Mapping[str, GraphInput], problems: Proble
         if not (isinstance(leaf, Leaf) and isinstance(leaf.value, str)):
             what = f"when must be true, false or inputs of this graph, not {describe(leaf)}"
             problems.add(leaf.place, what, "such as 'imu', 'not imu' or 'imu | wheels', or a list of these")
-        elif not any([_holds(word.strip(), leaf, inputs, problems) for word in leaf.value.split(OR)]):
-            return leaf.value
+        else:
+            words = [_holds(word.strip(), leaf, inputs, problems) for word in leaf.value.split(OR)]
+            if not any(words):
+                return leaf.value
     return None
 
 

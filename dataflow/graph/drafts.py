@@ -96,7 +96,7 @@ class GraphInput:
     place: Place
     """The place where the nested graph declares it."""
     patterns: tuple[Pattern, ...] = ()
-    """What the choices come to."""
+    """The expressions that the choices come to."""
 
 
 @dataclass(slots=True)

@@ -154,11 +154,11 @@ class Expander:
             declared = {leaf.value: (leaf.place, None) for leaf in self.fields.texts(tree, "an input's name")}
         elif tree is not None and (named := self.fields.table(tree, "inputs")) is not None:
             for name, entry in named.entries.items():
-                kind = entry.value
-                if isinstance(kind, Leaf) and isinstance(kind.value, str) and kind.value.endswith(OPTIONAL):
+                carried = entry.value
+                if isinstance(carried, Leaf) and isinstance(carried.value, str) and carried.value.endswith(OPTIONAL):
                     optional.add(name)
-                    kind = replace(kind, value=kind.value.removesuffix(OPTIONAL).strip())
-                declared[name] = (entry.key.place, self.message_type(kind, name))
+                    carried = replace(carried, value=carried.value.removesuffix(OPTIONAL).strip())
+                declared[name] = (entry.key.place, self.message_type(carried, name))
         if scope.use is None:
             for name, (place, _) in declared.items():
                 self.problems.add(

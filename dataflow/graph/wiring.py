@@ -1,4 +1,4 @@
-"""What a file writes into inputs, as choices among key expressions: `camera/image`, `*/image`, `fused/pose | pose`."""
+"""Reads what a file writes into inputs as choices among key expressions: `camera/image`, `*/image`, `fused/pose | pose`."""
 
 from __future__ import annotations
 
