@@ -52,7 +52,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
 
 
 NOT_MADE = (
-    "RecordedStreams", "RecordedStream", "Joined", "RunResult", "Session", "Verified", "Played", "Recorded", "StreamInfo",
+    "RecordedStreams", "RecordedStream", "Joined", "RunResult", "Verified", "Played", "Recorded", "StreamInfo",
     "Context", "GraphError",
 )  # fmt: skip
 """Classes whose objects are given, not made."""

@@ -1,4 +1,4 @@
-"""Reads what a file writes into inputs as choices among key expressions: `camera/image`, `*/image`, `fused/pose | pose`."""
+"""Reads `inputs:` of a file as choices among key expressions: `camera/image`, `*/image`, `fused/pose | pose`."""
 
 from __future__ import annotations
 
