@@ -106,7 +106,9 @@ class ObjectMap:
             return each.points
         way = each.points[:, :2] - eye[:2]
         ranges = np.sqrt((way * way).sum(axis=1))
-        deep = max(u.size[1] * math.exp(2 * u.spread[1]) for u in usual)
+        tall = max(float(np.ptp(each.points[:, 2])), 0.01)
+        most = min(usual, key=lambda u: abs(math.log(u.size[2] / tall)))
+        deep = most.size[1] * math.exp(1 * most.spread[1])
         deep += 4 * self._settings.range_noise * float(ranges.min()) ** 2
         ranked = np.sort(ranges)
         counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
