@@ -26,7 +26,7 @@ _TAIL = 0.8  # standard deviations of noise by which the outermost points are be
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN = 0.1  # radians by which the heading that points show strays
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
-_SIZES = 3  # residuals that compare sizes with the usual ones
+_SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
 _ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
 
 

@@ -23,13 +23,20 @@ from operators.scene.matching import (
     closeness,
     color_likeness,
     in_image,
+    in_places_of_their_own,
+    outside,
     tolerance,
 )
 from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
-_COVERED = 0.3  # share of the smaller of two boxes that both have, from which they are one
+_COVERED = 0.25  # share of the smaller of two boxes that both have, from which they are one
+_PART = 0.4  # that share where the classes differ
+_LIKE = 6.0  # times smaller, and what is in the other is no part of it
+_SELDOM_BESIDE = 0.15  # share of the views in which both are seen beside each other, from which they are two
+_GONE = 1.0  # times its size away from its place, and a thing is moved
+_SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
 _SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
 _AGAIN = 8  # views after which the heading of the room is looked for once more
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
@@ -76,13 +83,14 @@ class ObjectMap:
         self._updates += 1
         self._heading = self._room.angle
         cells = [Cells.of(self._near_side(each, view.origin), s.voxel) for each in seen]
-        joined = self._joined(seen, cells, stamp)
+        joined = self._joined(seen, cells, stamp, view)
         for k, each in enumerate(seen):
             if k in joined:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 self._begin(each, cells[k], stamp, view.origin)
         shown = {i: cells[k] for k, i in joined.items()}
+        self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
@@ -93,7 +101,15 @@ class ObjectMap:
         return [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
 
     def is_mover(self, object: MapObject) -> bool:
-        return object.class_id in self._movers
+        """Tells whether an object is of a class that moves by itself; small ones lie still but while they are moved."""
+        return object.class_id in self._movers and not self._is_still(object)
+
+    def _is_still(self, object: MapObject) -> bool:
+        """Tells whether an object is small and lies still, so that it may be of any such class, also of one that moves."""
+        size = float(object.size.max())
+        if object.class_id in self._movers:
+            size = max([size, *(max(u.size) for u in self._usual.get(object.class_id, ()))])
+        return size <= _SMALL and float(np.abs(object.velocity).max()) <= _STILL
 
     def _is_large(self, object: MapObject) -> bool:
         usual = self._usual.get(object.class_id)
@@ -115,7 +131,9 @@ class ObjectMap:
         first = ranked[int(np.argmax(counts))]
         return np.asarray(each.points[(ranges >= first) & (ranges <= first + deep)])
 
-    def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
+    def _joined(
+        self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
+    ) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
         s, ids = self._settings, sorted(self.objects)
         value = np.zeros((len(seen), len(ids)))
@@ -124,6 +142,7 @@ class ObjectMap:
         known = [self.objects[i] for i in ids]
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
         moves = np.array([self.is_mover(o) for o in known])
+        still = np.array([self._is_still(o) for o in known])
         usual = [self._usual.get(o.class_id, ()) for o in known]
         images = in_image(seen, rows, np.array([bool(u) and u[0].round for u in usual]))
         for k, each in enumerate(seen):
@@ -131,16 +150,18 @@ class ObjectMap:
             more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
             near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
             near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
-            for j in np.flatnonzero((near <= more) & (moves == mover)).tolist():
-                if mover:
-                    value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
-                else:
+            for j in np.flatnonzero((near <= more) & ((moves == mover) | still)).tolist():
+                if not moves[j]:
                     image = None if images is None else images[k][j]
                     value[k, j] = alike(each, cells[k], known[j], image, s, large=self._is_large(known[j]))
+                if moves[j] or (mover and not value[k, j] and self._has_left(known[j], view)):
+                    value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         mover = self.is_mover(object)
+        if each.class_id in self._movers and outside(cells.middle, object.box) > _GONE * float(object.size.max()):
+            mover, object.images, object.form = True, [], -1  # what lay still is moved
         direction = _direction(eye, cells)
         object.views += 1
         object.view = direction * object.views if mover else object.view + direction
@@ -153,18 +174,24 @@ class ObjectMap:
             known = np.isfinite(object.color).all()
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
-            object.cells = cells
+            object.cells, object.most = cells, len(cells)
             object.fit(self._usual, self._heading, self._settings.range_noise)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
             return
         object.cells.add(cells)
+        object.velocity = np.zeros(3)
         new = each.image is not None and object.look(each.image) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
             object.fit(self._usual, self._heading, self._settings.range_noise)
+
+    def _has_left(self, object: MapObject, view: RangeView) -> bool:
+        """Tells whether a view looks through the place of an object."""
+        sight = view.of(object.cells.points, self._settings.margin)
+        return np.count_nonzero(sight.free) >= 0.6 * max(np.count_nonzero(sight.looked), 1)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
@@ -224,6 +251,18 @@ class ObjectMap:
         ):
             object.evidence -= s.missed
 
+    def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
+        """Counts for neighbours in the map in how many views both were seen, each in a place of its own in the image."""
+        rows = [(k, i) for k, i in enumerate(ids) if i is not None and seen[k].image is not None]
+        if len(rows) < 2:
+            return
+        apart = in_places_of_their_own([seen[k].image for k, _ in rows])
+        centers = np.array([self.objects[i].center for _, i in rows])
+        radii = np.array([float(self.objects[i].size.max()) for _, i in rows]) / 2
+        near = np.linalg.norm(centers[:, None] - centers[None], axis=2) <= radii[:, None] + radii[None]
+        for a, b in np.argwhere(apart & near).tolist():
+            self.objects[rows[a][1]].beside[rows[b][1]] += 1
+
     def _join_doubles(self, changed: list[int]) -> None:
         """Makes one of two objects that share their voxels."""
         if not changed:
@@ -241,33 +280,43 @@ class ObjectMap:
                     self._join_two(self.objects[i], self.objects[j])
 
     def _join_two(self, a: MapObject, b: MapObject) -> None:
+        """Makes one of two entries of the same thing: with the older one's id, and what the more often seen one knows."""
         if not self._one(a, b):
             return
-        kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
-        if not self.is_mover(kept):
-            kept.cells.add(other.cells)
+        best, other = (a, b) if (a.views, -a.id) > (b.views, -b.id) else (b, a)
+        if best.class_id == other.class_id and not self.is_mover(best):
+            best.cells.add(other.cells)
             for image in other.images:
-                kept.look(image)
-        kept.votes = kept.votes + other.votes
-        kept.evidence = min(max(kept.evidence, other.evidence), MOST_EVIDENCE)
-        kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
-        kept.view = kept.view + other.view
-        kept.fit(self._usual, self._heading, self._settings.range_noise)
-        del self.objects[other.id]
+                best.look(image)
+        best.votes = best.votes + other.votes
+        best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
+        best.seen, best.views = max(best.seen, other.seen), best.views + other.views
+        best.view = best.view + other.view
+        best.beside += other.beside
+        best.fit(self._usual, self._heading, self._settings.range_noise)
+        del self.objects[a.id], self.objects[b.id]
+        best.born, best.id = min((a.born, a.id), (b.born, b.id))
+        self.objects[best.id] = best
 
     def _one(self, a: MapObject, b: MapObject) -> bool:
+        """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
         s = self._settings
         movers = self.is_mover(a), self.is_mover(b)
-        if any(movers) and a.class_id != b.class_id:
+        if any(movers) and a.class_id != b.class_id and not (self._is_still(a) and self._is_still(b)):
             return False
         if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
             return False
         if all(movers):
             return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
+        volumes = float(np.prod(a.size)), float(np.prod(b.size))
+        apart = _beside(a, b) > _SELDOM_BESIDE * min(a.views, b.views)
+        shared = shared_volume(a.box, b.box) / max(min(volumes), 1e-9)
         if a.class_id != b.class_id:
-            return upright_iou(a.box, b.box) >= 0.5
-        least = 0.5 if a.seen == b.seen else _COVERED  # two that one view shows are seldom one
-        if shared_volume(a.box, b.box) >= least * min(float(np.prod(a.size)), float(np.prod(b.size))):
+            if upright_iou(a.box, b.box) >= 0.5:
+                return True
+            like = max(volumes) <= _LIKE * min(volumes) and not (self._is_large(a) or self._is_large(b))
+            return like and not apart and shared >= _PART
+        if shared >= (0.5 if apart else _COVERED):
             return True
         small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
         if a.images and b.images and not self._is_large(small):
@@ -317,6 +366,10 @@ class ObjectMap:
         for stamp, row in state["gone"]:
             old = MapObject.restored(row, side)
             self.gone[old.id] = (int(stamp), old)
+
+
+def _beside(a: MapObject, b: MapObject) -> int:
+    return max(a.beside[b.id], b.beside[a.id])
 
 
 def _direction(eye: Array, cells: Cells) -> Array:
