@@ -9,34 +9,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
+from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.matching import (
-    LARGE,
     MapSettings,
     Observation,
     alike,
     alike_mover,
-    closeness,
     color_likeness,
     in_image,
     in_places_of_their_own,
     outside,
-    tolerance,
 )
+from operators.scene.merging import are_one, merge
 from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
-_COVERED = 0.25  # share of the smaller of two boxes that both have, from which they are one
-_PART = 0.4  # that share where the classes differ
-_LIKE = 6.0  # times smaller, and what is in the other is no part of it
-_SELDOM_BESIDE = 0.15  # share of the views in which both are seen beside each other, from which they are two
 _GONE = 1.0  # times its size away from its place, and a thing is moved
-_SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
 _SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
 _AGAIN = 8  # views after which the heading of the room is looked for once more
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
@@ -47,10 +40,12 @@ class ObjectMap:
 
     An observation is of the object of its class whose box, seen from where it was seen, covers its own in the image,
     and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
-    other. Colour decides near ties. Two objects that come to share their place are one. Places that a view looks
+    other. Colour decides near ties. Two objects that come to share their place, of one class or not, are one, unless they
+    are seen beside each other. Places that a view looks
     through lose voxels; an object whose place is empty, or that is in plain view and not detected, loses evidence and
     at last goes. If one of its class and size appears elsewhere, that is the same object, moved.
-    `movers` are classes whose place is that of their last view; they are joined by predicted place.
+    `movers` are classes whose place is that of their last view; they are joined by predicted place. Small ones (a ball)
+    are as other things are until a view looks through their place and one of their class is near.
 
     After Hughes et al., "Hydra", 2022, and Gu et al., "ConceptGraphs", 2024; existence as in occupancy grids.
     """
@@ -63,8 +58,7 @@ class ObjectMap:
         usual: Mapping[int, Sequence[Usual]] | None = None,
     ) -> None:
         """`usual` are the sizes of classes whose size is known."""
-        self._settings, self._classes, self._movers = settings, classes, frozenset(movers)
-        self._usual = dict(usual or {})
+        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {})
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -82,7 +76,10 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
-        cells = [Cells.of(self._near_side(each, view.origin), s.voxel) for each in seen]
+        cells = [
+            Cells.of(self._kinds.near_side(each.points, each.class_id, view.origin, s.range_noise), s.voxel)
+            for each in seen
+        ]
         joined = self._joined(seen, cells, stamp, view)
         for k, each in enumerate(seen):
             if k in joined:
@@ -100,37 +97,6 @@ class ObjectMap:
         s = self._settings
         return [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
 
-    def is_mover(self, object: MapObject) -> bool:
-        """Tells whether an object is of a class that moves by itself; small ones lie still but while they are moved."""
-        return object.class_id in self._movers and not self._is_still(object)
-
-    def _is_still(self, object: MapObject) -> bool:
-        """Tells whether an object is small and lies still, so that it may be of any such class, also of one that moves."""
-        size = float(object.size.max())
-        if object.class_id in self._movers:
-            size = max([size, *(max(u.size) for u in self._usual.get(object.class_id, ()))])
-        return size <= _SMALL and float(np.abs(object.velocity).max()) <= _STILL
-
-    def _is_large(self, object: MapObject) -> bool:
-        usual = self._usual.get(object.class_id)
-        return (max(u.size[1] for u in usual) if usual else float(object.size[:2].max())) >= LARGE
-
-    def _near_side(self, each: Observation, eye: Array) -> Array:
-        """Returns an observation's points without those that are farther behind most than such a thing is deep."""
-        usual = self._usual.get(each.class_id)
-        if not usual:
-            return each.points
-        way = each.points[:, :2] - eye[:2]
-        ranges = np.sqrt((way * way).sum(axis=1))
-        tall = max(float(np.ptp(each.points[:, 2])), 0.01)
-        most = min(usual, key=lambda u: abs(math.log(u.size[2] / tall)))
-        deep = most.size[1] * math.exp(1 * most.spread[1])
-        deep += 4 * self._settings.range_noise * float(ranges.min()) ** 2
-        ranked = np.sort(ranges)
-        counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
-        first = ranked[int(np.argmax(counts))]
-        return np.asarray(each.points[(ranges >= first) & (ranges <= first + deep)])
-
     def _joined(
         self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
     ) -> dict[int, int]:
@@ -141,26 +107,25 @@ class ObjectMap:
             return {}
         known = [self.objects[i] for i in ids]
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
-        moves = np.array([self.is_mover(o) for o in known])
-        still = np.array([self._is_still(o) for o in known])
-        usual = [self._usual.get(o.class_id, ()) for o in known]
-        images = in_image(seen, rows, np.array([bool(u) and u[0].round for u in usual]))
+        moves = np.array([self._kinds.is_mover(o) for o in known])
+        still = np.array([self._kinds.is_still(o) for o in known])
+        images = in_image(seen, rows, np.array([self._kinds.is_round(o) for o in known]))
         for k, each in enumerate(seen):
-            mover = each.class_id in self._movers
+            mover = each.class_id in self._kinds.movers
             more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
             near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
             near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
             for j in np.flatnonzero((near <= more) & ((moves == mover) | still)).tolist():
                 if not moves[j]:
                     image = None if images is None else images[k][j]
-                    value[k, j] = alike(each, cells[k], known[j], image, s, large=self._is_large(known[j]))
+                    value[k, j] = alike(each, cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
                 if moves[j] or (mover and not value[k, j] and self._has_left(known[j], view)):
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
-        mover = self.is_mover(object)
-        if each.class_id in self._movers and outside(cells.middle, object.box) > _GONE * float(object.size.max()):
+        mover = self._kinds.is_mover(object)
+        if each.class_id in self._kinds.movers and outside(cells.middle, object.box) > _GONE * float(object.size.max()):
             mover, object.images, object.form = True, [], -1  # what lay still is moved
         direction = _direction(eye, cells)
         object.views += 1
@@ -175,7 +140,7 @@ class ObjectMap:
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
             object.cells, object.most = cells, len(cells)
-            object.fit(self._usual, self._heading, self._settings.range_noise)
+            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
@@ -186,12 +151,13 @@ class ObjectMap:
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
-            object.fit(self._usual, self._heading, self._settings.range_noise)
+            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
 
     def _has_left(self, object: MapObject, view: RangeView) -> bool:
         """Tells whether a view looks through the place of an object."""
         sight = view.of(object.cells.points, self._settings.margin)
-        return np.count_nonzero(sight.free) >= 0.6 * max(np.count_nonzero(sight.looked), 1)
+        looked = int(np.count_nonzero(sight.looked))
+        return int(np.count_nonzero(sight.free)) >= 0.6 * max(looked, 1)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
@@ -201,9 +167,9 @@ class ObjectMap:
             made.color = each.color
         made.view = _direction(eye, cells)
         made.center = cells.middle
-        if each.image is not None and not self.is_mover(made):  # one view alone tells less than the points
+        if each.image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
             made.look(each.image)
-        made.fit(self._usual, self._heading, self._settings.range_noise)
+        made.fit(self._kinds.usual, self._heading, self._settings.range_noise)
         self.objects[made.id] = made
         self._next += 1
 
@@ -222,7 +188,7 @@ class ObjectMap:
 
     def _look(self, object: MapObject, sight: Sight | None, eye: Array, own: Cells | None, seconds: float) -> None:
         """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any."""
-        s, mover = self._settings, self.is_mover(object)
+        s, mover = self._settings, self._kinds.is_mover(object)
         if not len(object.cells):
             object.evidence = -1.0
             return
@@ -252,13 +218,14 @@ class ObjectMap:
             object.evidence -= s.missed
 
     def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
-        """Counts for neighbours in the map in how many views both were seen, each in a place of its own in the image."""
-        rows = [(k, i) for k, i in enumerate(ids) if i is not None and seen[k].image is not None]
-        if len(rows) < 2:
+        """Counts for neighbours in how many views both were seen, each in a place of its own in the image."""
+        rows = [(k, i, each.image) for k, (i, each) in enumerate(zip(ids, seen, strict=True)) if i is not None]
+        images = [image for _, _, image in rows if image is not None]
+        if len(rows) < 2 or len(images) < len(rows):
             return
-        apart = in_places_of_their_own([seen[k].image for k, _ in rows])
-        centers = np.array([self.objects[i].center for _, i in rows])
-        radii = np.array([float(self.objects[i].size.max()) for _, i in rows]) / 2
+        apart = in_places_of_their_own(images)
+        centers = np.array([self.objects[i].center for _, i, _ in rows])
+        radii = np.array([float(self.objects[i].size.max()) for _, i, _ in rows]) / 2
         near = np.linalg.norm(centers[:, None] - centers[None], axis=2) <= radii[:, None] + radii[None]
         for a, b in np.argwhere(apart & near).tolist():
             self.objects[rows[a][1]].beside[rows[b][1]] += 1
@@ -276,54 +243,14 @@ class ObjectMap:
             k = ids.index(i)
             close = np.linalg.norm(centers - centers[k], axis=1) <= (radii + radii[k]) / 2 + 0.1
             for j in (ids[n] for n in np.flatnonzero(close).tolist()):
-                if i in self.objects and j in self.objects and i != j:
-                    self._join_two(self.objects[i], self.objects[j])
-
-    def _join_two(self, a: MapObject, b: MapObject) -> None:
-        """Makes one of two entries of the same thing: with the older one's id, and what the more often seen one knows."""
-        if not self._one(a, b):
-            return
-        best, other = (a, b) if (a.views, -a.id) > (b.views, -b.id) else (b, a)
-        if best.class_id == other.class_id and not self.is_mover(best):
-            best.cells.add(other.cells)
-            for image in other.images:
-                best.look(image)
-        best.votes = best.votes + other.votes
-        best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
-        best.seen, best.views = max(best.seen, other.seen), best.views + other.views
-        best.view = best.view + other.view
-        best.beside += other.beside
-        best.fit(self._usual, self._heading, self._settings.range_noise)
-        del self.objects[a.id], self.objects[b.id]
-        best.born, best.id = min((a.born, a.id), (b.born, b.id))
-        self.objects[best.id] = best
-
-    def _one(self, a: MapObject, b: MapObject) -> bool:
-        """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
-        s = self._settings
-        movers = self.is_mover(a), self.is_mover(b)
-        if any(movers) and a.class_id != b.class_id and not (self._is_still(a) and self._is_still(b)):
-            return False
-        if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
-            return False
-        if all(movers):
-            return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-        volumes = float(np.prod(a.size)), float(np.prod(b.size))
-        apart = _beside(a, b) > _SELDOM_BESIDE * min(a.views, b.views)
-        shared = shared_volume(a.box, b.box) / max(min(volumes), 1e-9)
-        if a.class_id != b.class_id:
-            if upright_iou(a.box, b.box) >= 0.5:
-                return True
-            like = max(volumes) <= _LIKE * min(volumes) and not (self._is_large(a) or self._is_large(b))
-            return like and not apart and shared >= _PART
-        if shared >= (0.5 if apart else _COVERED):
-            return True
-        small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
-        if a.images and b.images and not self._is_large(small):
-            return False
-        if closeness(small.cells, large.cells) <= 0.3:
-            return False
-        return large.cells.near(small.cells.points, 0.5 * tolerance(small.size) + 0.5 * s.voxel) >= 0.5
+                if i not in self.objects or j not in self.objects or i == j:
+                    continue
+                a, b = self.objects[i], self.objects[j]
+                if are_one(a, b, self._kinds, self._settings.voxel):
+                    del self.objects[i], self.objects[j]
+                    one = merge(a, b, self._kinds)
+                    one.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+                    self.objects[one.id] = one
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""
@@ -366,10 +293,6 @@ class ObjectMap:
         for stamp, row in state["gone"]:
             old = MapObject.restored(row, side)
             self.gone[old.id] = (int(stamp), old)
-
-
-def _beside(a: MapObject, b: MapObject) -> int:
-    return max(a.beside[b.id], b.beside[a.id])
 
 
 def _direction(eye: Array, cells: Cells) -> Array:
