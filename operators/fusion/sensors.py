@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Literal
@@ -35,6 +35,7 @@ from operators.fusion.measurements import (
     Range,
     Velocity,
 )
+from operators.fusion.sensor_errors import SensorErrors
 from operators.geometry import se3
 from operators.geometry.geodesy import east_north_up
 
@@ -65,6 +66,15 @@ class SensorSettings(BaseModel):
     offset: float = Field(0.0, ge=-10, le=10, description="seconds by which a measurement is older than its stamp")
     offset_sigma: float = Field(
         0.0, ge=0, le=2, description="seconds by which the offset may be wrong: if above 0, it is estimated"
+    )
+    drift: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0),
+        description="standard deviations (east, north, up, m) of an error of positions that changes slowly, a part of "
+        "what the covariance says: if above 0, it is estimated",
+    )
+    drift_time: float = Field(30.0, gt=0, description="seconds in which that error changes")
+    scale_sigma: float = Field(
+        0.0, ge=0, lt=0.5, description="share by which all speeds of wheels may be wrong: if above 0, it is estimated"
     )
     sigma: float | None = Field(
         None, gt=0, description="standard deviation of what has a length (m, m/s); the message's covariance if none"
@@ -132,6 +142,16 @@ def use_of(name: str, message: Message, settings: SensorSettings) -> str:
     return use
 
 
+def errors_of(sensors: Mapping[str, SensorSettings]) -> SensorErrors:
+    """Returns the lasting errors of sensors that settings ask to be estimated."""
+    ordered = sorted(sensors.items())
+    return SensorErrors(
+        tuple((name, s.offset_sigma) for name, s in ordered if s.offset_sigma),
+        tuple((name, s.drift, s.drift_time) for name, s in ordered if any(s.drift)),
+        tuple((name, s.scale_sigma) for name, s in ordered if s.scale_sigma),
+    )
+
+
 def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
     """Returns the settings' names that no stream ends with, each with the nearest stream that has no settings."""
     taken = [stream for stream in streams for name in names if f"/{stream}".endswith(f"/{name}")]
@@ -185,7 +205,7 @@ def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundin
     if not high:
         place[2] = np.nan
     known = np.isfinite(place)
-    noise = _covariance(name, fix.covariance, settings.sigma, "sigma")
+    noise = _white(_covariance(name, fix.covariance, settings.sigma, "sigma"), settings)
     return Position(place, around.place(fix.frame)[:3, 3]), noise[np.ix_(known, known)]
 
 
@@ -212,7 +232,8 @@ def _absolute(
     R = T[:3, :3]
     C = np.zeros((6, 6))
     if use != "orientation":
-        C[:3, :3] = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
+        told = None if given is None else given[:3, :3]
+        C[:3, :3] = _white(_covariance(name, told, settings.sigma, "sigma"), settings)
     if use == "position":
         return Position(message.position, T_body_child[:3, 3]), C[:3, :3]
     angular = _covariance(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
@@ -330,6 +351,15 @@ def _covariance(name: str, given: Array | None, sigma: float | None, setting: st
     if given is None:
         raise ValueError(f"{name}: its messages have no covariance, so its {setting} must say how good it is")
     return _positive(given)
+
+
+def _white(covariance: Array, settings: SensorSettings) -> Array:
+    """The part (3, 3) of a position's covariance that is not its drift, a tenth at least."""
+    if not any(settings.drift):
+        return covariance
+    least = 0.1 * np.diag(covariance)
+    change = np.maximum(np.diag(covariance) - np.square(settings.drift), least) - np.diag(covariance)
+    return covariance + np.diag(change)
 
 
 def _positive(covariance: Array) -> Array:
