@@ -27,13 +27,14 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.beginning import Prior, coasting_node
 from operators.fusion.control import Command
+from operators.fusion.covariances import Unusable
 from operators.fusion.error_state import POSITION, Noise
 from operators.fusion.gate import GateConfig
 from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.nodes import Measurement
 from operators.fusion.output import diagnostics, odometry_of
-from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, errors_of, measurements, unheard, use_of
+from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, unheard, use_of
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
