@@ -1,4 +1,4 @@
-"""What is known of the classes of a map: which move by themselves, and how large their things are."""
+"""Knowledge about the classes of a map: which move by themselves, and how large their things are."""
 
 from __future__ import annotations
 
