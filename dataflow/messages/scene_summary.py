@@ -140,10 +140,11 @@ def agents_in_words(graph: SceneGraph, summary: SceneSummary, activities: Activi
         if identity in acts:
             words.append(f"{spaced(acts[identity][0])} {percent(acts[identity][1])}")
         related = [r for r in summary.telling if r.subject == node]
-        if node in summary.carriers:
+        if node in summary.carriers and classes[summary.carriers[node].object] not in PLACES:
             related.insert(0, summary.carriers[node])
         words += [f"{spaced(r.predicate)} {names[r.object]}" for r in related]
-        words += [f"heads for {names[r.object]} ({percent(r.score)})" for r in summary.intentions if r.subject == node]
+        goals = [f"{names[r.object]} ({percent(r.score)})" for r in summary.intentions if r.subject == node]
+        words += ["heads for " + " or ".join(goals)] if goals else []
         rows.append(Row(name, ", ".join(words)))
     return sorted(rows, key=lambda row: (row.name.split()[0] not in PEOPLE, not row.text))
 
