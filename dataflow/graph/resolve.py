@@ -13,6 +13,7 @@ from dataflow.graph.model import Bundle, Graph, Node
 from dataflow.graph.network import read_network
 from dataflow.graph.order import fed_by_devices, in_order, refuse_stuck_cycles
 from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
+from dataflow.graph.presence import said
 from dataflow.graph.problems import Problems, did_you_mean
 from dataflow.graph.sections import PANELS, Record, View
 from dataflow.graph.streams import Streams
@@ -59,6 +60,7 @@ class Resolver:
             network=read_network(root.get("network"), self.fields),
             aliases=self.known.aliases,
             types=self.known.own_types,
+            left_out={name: said(reasons) for name, reasons in self.expansion.left_out.items()},
         )
 
     # -- streams -------------------------------------------------------------------------------------------------
