@@ -72,9 +72,7 @@ class _Waiting:
 class ViewerSink:
     """Draws messages of streams in a viewer. `open`, `log` any number of times, `close`; or a `with` block.
 
-    `outlook` is the viewpoint; without it that is decided after a second of event time, and for a file with points
-    that stay once more at its end. `report` gets one line for people about everything that goes wrong, once per stream
-    and cause.
+    `report` gets one line for people about everything that goes wrong, once per stream and cause.
     """
 
     def __init__(
@@ -83,7 +81,6 @@ class ViewerSink:
         *,
         options: ViewOptions | None = None,
         bounds: Bounds | None = None,
-        outlook: Outlook | None = None,
         report: Callable[[str], None] | None = None,
         application: str = "dataflow",
     ) -> None:
@@ -101,8 +98,7 @@ class ViewerSink:
         self._reported: set[tuple[str, str]] = set()
         self._started_at: int | None = None
         self._graph: Graph | None = None
-        self._outlook = outlook
-        self._given = outlook is not None
+        self._outlook: Outlook | None = None
         self._seen: set[str] = set()
         self._laid_out = False
 
@@ -166,11 +162,6 @@ class ViewerSink:
         if dropped:
             self._tell("", "slow", "the viewer is too slow: some messages are not shown (the oldest are dropped)")
         return True
-
-    @property
-    def outlook(self) -> Outlook | None:
-        """The viewpoint, as far as it is decided."""
-        return self._outlook
 
     def statistics(self) -> SinkStatistics:
         """Returns what became of the messages so far."""
@@ -292,7 +283,7 @@ class ViewerSink:
 
     def _look_again(self, recording: rr.RecordingStream) -> None:
         """Chooses the viewpoint once more, from which all that there is in a file is in view."""
-        if self._given or not self._scene.keeps:
+        if not self._scene.keeps:
             return
         self._outlook = self._scene.outlook()
         self._lay_out(recording)

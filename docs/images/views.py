@@ -1,4 +1,4 @@
-"""Takes the pictures of graphs in the viewer: `python docs/images/views.py [NAME ...]`; `demo.gif` is the moving one.
+"""Takes the pictures of graphs in the viewer: `python docs/images/views.py [NAME ...]`.
 
 Needs what draws a window without a display: xvfb-run and a Vulkan driver for the CPU (Debian: xvfb,
 mesa-vulkan-drivers, libxkbcommon-x11-0). Graphs that read data of others are shown by their simulated relatives, since
@@ -18,12 +18,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
-from PIL import Image
 
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.view import Save, ViewerSink, from_recording
-from dataflow.view.scene import Outlook
 
 Picture = npt.NDArray[np.uint8]
 
@@ -52,23 +50,20 @@ LATER = {"slam": 22}
 """Seconds after the start of which a picture is, where there is little to be seen at first."""
 
 GROWN = "demo"
-"""The picture of the whole perception, and, as a GIF, of how its scene graph grows."""
+"""The picture of the whole perception."""
 
 MOMENT = 9.2
 """Seconds after its start at which it is taken: a person walks to a chair."""
 
-FRAMES = tuple(np.arange(1.2, 21.0, 1.4).round(1).tolist())
-"""Seconds after the start of the pictures of the GIF."""
-
-MOVING = (880, 550)
+WIDE, HIGH = 4800, 3000
+"""The screen is so large that the pointer, in its middle, is not on the window."""
 
 
 def rendered(shown: Path) -> Picture:
     """What the viewer shows of a file, a moment after it is opened."""
     programs, large = Path(sys.executable).parent, shown.with_suffix(".png")
-    # The screen is so large that the pointer, in its middle, is not on the window.
     subprocess.run(
-        ["xvfb-run", "-a", "-s", "-screen 0 4800x3000x24", str(programs / "rerun"), "--screenshot-to", str(large),
+        ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(programs / "rerun"), "--screenshot-to", str(large),
          "--window-size", f"{SIZE[0]}x{SIZE[1]}", "--bind", "127.0.0.1", "--new", str(shown)],
         check=True, capture_output=True, timeout=180,
     )  # fmt: skip
@@ -89,37 +84,21 @@ def perceived(folder: Path) -> tuple[Path, Path]:
     return graph, recorded
 
 
-def at(seconds: float, graph: Path, recorded: Path, file: Path, outlook: Outlook | None) -> Outlook | None:
-    """Writes what the viewer shows after so many seconds; returns where it looks from."""
+def at(seconds: float, graph: Path, recorded: Path, file: Path) -> None:
+    """Writes what the viewer shows after so many seconds."""
     made = load_graph(graph)
     with Recording(recorded) as recording:
         begins = min(i.first for i in recording.streams.values() if i.first is not None and not i.static)
-        with ViewerSink(Save(file, at_end=True), outlook=outlook) as sink:
+        with ViewerSink(Save(file, at_end=True)) as sink:
             streams = [name for name, info in recording.streams.items() if info.message_type is not None]
             from_recording(recording, sink, streams, end=begins + round(seconds * 1e9), graph=made)
-        return sink.outlook
 
 
 def grown(folder: Path) -> Path:
     """The picture of the whole perception."""
     graph, recorded = perceived(folder)
-    at(MOMENT, graph, recorded, folder / "moment.rrd", None)
+    at(MOMENT, graph, recorded, folder / "moment.rrd")
     return written(rendered(folder / "moment.rrd"), f"{GROWN}.png")
-
-
-def growing(folder: Path) -> Path:
-    """The GIF of the scene graph that grows, seen from one place."""
-    graph, recorded = perceived(folder)
-    outlook = at(MOMENT, graph, recorded, folder / "moment.rrd", None)
-    frames = []
-    for seconds in FRAMES:
-        at(seconds, graph, recorded, folder / "frame.rrd", outlook)
-        pixels = cv2.resize(rendered(folder / "frame.rrd"), MOVING, interpolation=cv2.INTER_AREA)
-        frames.append(Image.fromarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB)))
-    palette = frames[len(frames) // 2].quantize(128)
-    file, few = HERE / f"{GROWN}.gif", [frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    few[0].save(file, save_all=True, append_images=few[1:], duration=[700] * (len(few) - 1) + [3000], loop=0)
-    return file
 
 
 def written(pixels: Picture, name: str) -> Path:
@@ -145,17 +124,14 @@ def picture(name: str, folder: Path) -> Path:
 
 
 def main() -> None:
-    known = [GROWN, f"{GROWN}.gif", *VIEWS]
+    known = [GROWN, *VIEWS]
     names = sys.argv[1:] or known
     unknown = [name for name in names if name not in known]
     if unknown:
         raise SystemExit(f"no view {unknown[0]!r}; there are {', '.join(known)}")
     for name in names:
         with tempfile.TemporaryDirectory() as folder:
-            if name in VIEWS:
-                print(picture(name, Path(folder)))
-            else:
-                print((grown if name == GROWN else growing)(Path(folder)))
+            print(grown(Path(folder)) if name == GROWN else picture(name, Path(folder)))
 
 
 if __name__ == "__main__":
