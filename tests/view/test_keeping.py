@@ -77,7 +77,11 @@ def test_a_kept_cloud_is_drawn_in_the_root_frame_at_the_stamp_of_its_own_pose(tm
             points = np.array([[5.0 - k, 0.0, 1.0]], np.float32)
             cloud = PointCloud(stamp=10 * k, frame="base", points=points)
             odometry = Odometry(
-                stamp=10 * k, frame="odom", child_frame="base", position=[float(k), 0, 0], orientation=[0, 0, 0, 1]
+                stamp=10 * k,
+                frame="odom",
+                child_frame="base",
+                position=np.array([float(k), 0, 0]),
+                orientation=np.array([0, 0, 0, 1.0]),
             )
             visualize(recording, "/r/cloud", cloud, state, "r/cloud")
             visualize(recording, "/r/odometry", odometry, state, "r/odometry")
