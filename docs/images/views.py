@@ -33,11 +33,12 @@ VIEWS: dict[str, tuple[str, ...]] = {
     ),
     "perception": ("replay", "recordings/demo.mcap", "--graph", "graphs/perception.yaml"),
     "slam": ("run", "graphs/slam.yaml", "--set", "duration=26s"),
+    "slam_lidar": ("run", "graphs/slam_lidar.yaml", "--set", "duration=26s"),
     "stereo": ("run", "graphs/simulated_stereo.yaml"),
 }
 """The arguments of `dataflow` by the picture's name."""
 
-LATER = {"slam": 22}
+LATER = {"slam": 22, "slam_lidar": 22}
 """Seconds after the start of which a picture is, where there is little to be seen at first."""
 
 
