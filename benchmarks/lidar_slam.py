@@ -89,20 +89,23 @@ def _wrong(off: Array) -> bool:
     return bool(np.linalg.norm(off[:3]) > WRONG[0] or np.linalg.norm(off[3:]) > WRONG[1])
 
 
-def worlds(named: list[tuple[str, int]], cache: Path, peers: Path | None, params: dict[str, Any]) -> list[Any]:
-    rows = []
+def worlds(
+    named: list[tuple[str, int]], cache: Path, peers: Path | None, first: int, params: dict[str, Any], file: Path | None
+) -> None:
     for world, seed in named:
-        whole = rendered(cache, world, seed, seconds(world), 0.8)
+        whole = rendered(cache, world, seed, seconds(world), 0.8).part(0, 10 * (first or seconds(world)))
         for motion, drive in (("deskewed", whole), ("as taken", whole.without_times())):
-            row: dict[str, Any] = {"world": f"{world} {seed}", "motion": motion, **scored(drive, params)}
+            name = f"{world} {seed}, {len(drive.clouds) / 10:.0f} s"
+            row: dict[str, Any] = {"world": name, "motion": motion, **scored(drive, params)}
             if peers is not None:
                 drive.sensor["far"] = params.get("far", drive.sensor["far"])
                 other = peer("kiss", peers)(drive)
                 row["kiss ATE"], row["kiss end"], _ = drift(other.poses, drive.truth)
                 row["kiss ms"] = 1e3 * float(np.mean(other.cpu))
-            rows.append(row)
             print(_line(row), flush=True)
-    return rows
+            if file is not None:
+                known = json.loads(file.read_text()) if file.is_file() else []
+                file.write_text(json.dumps([*known, row], indent=1) + "\n")
 
 
 def _line(row: dict[str, Any]) -> str:
@@ -177,6 +180,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("out") / "lidar_worlds", help="folder of rendered drives")
     parser.add_argument("--set", nargs="*", default=[], metavar="PARAM=VALUE", help="of LidarSlam")
     parser.add_argument("--every", type=int, default=20, help="scans from try to try")
+    parser.add_argument("--seconds", type=int, default=0, help="of a drive, if not the whole")
     parser.add_argument("--json", type=Path, help="file to which all figures are added")
     arguments = parser.parse_args()
     if arguments.what == "table":
@@ -187,10 +191,7 @@ def main() -> None:
         relocalise(named, arguments.cache, arguments.every)
         return
     params = {name: float(value) for name, value in (pair.split("=") for pair in arguments.set)}
-    rows = worlds(named, arguments.cache, arguments.peers, params)
-    if arguments.json:
-        known = json.loads(arguments.json.read_text()) if arguments.json.is_file() else []
-        arguments.json.write_text(json.dumps(known + rows, indent=1) + "\n")
+    worlds(named, arguments.cache, arguments.peers, arguments.seconds, params, arguments.json)
 
 
 if __name__ == "__main__":
