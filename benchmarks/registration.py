@@ -42,7 +42,7 @@ NEAR = 1.0
 SHARED = 2.0  # voxels within which a point has one of the other cloud
 
 DEPTH = {"voxel": 0.05}
-CAR = {"voxel": 0.5, "min_fitness": 0.8, "max_violation": 0.1}
+CAR = {"voxel": 0.5, "min_fitness": 0.8}
 
 
 def scans(world: str, seed: int, count: int) -> list[Posed]:

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from dataflow.messages.geometry import transform_points
@@ -24,7 +25,7 @@ FEWEST = 100  # voxels with a normal that a cloud must have
 _TRIED = 12  # motions that are refined
 _RIVAL = 0.03  # a second motion whose score is that near to the best one's makes the result ambiguous
 _CORRELATED = 30.0  # voxels whose errors are alike, for the covariance
-_TELLING = 0.02  # share of the surfaces that must face along every direction
+_TELLING = 0.03  # share of the surfaces that must face along every direction
 
 
 @dataclass(frozen=True)
@@ -172,13 +173,13 @@ def _told(source: Prepared, target: Prepared, T: Array, voxel: float) -> bool:
     near = np.isfinite(distance)
     points, normals = moved[near], target.normals[index[near]]
     centred = points - points.mean(axis=0)
-    arms = np.cross(centred, normals) / max(float(np.sqrt(np.square(centred).sum(axis=1).mean())), 1e-9)
-    for lean in (normals, arms):
-        _, axes = np.linalg.eigh(lean.T @ lean)
-        along = np.abs(lean @ axes)
-        if (np.where(along > 0.3, along**2, 0).mean(axis=0) < _TELLING).any():
-            return False
-    return True
+    arms = np.cross(centred, normals)
+    _, axes = np.linalg.eigh(arms.T @ arms)
+    # Over the points' distance from each axis: what is long is thin about its length.
+    aside = np.square(centred).sum(axis=1, keepdims=True) - np.square(centred @ axes)
+    turning = arms @ axes / np.sqrt(np.maximum(aside.mean(axis=0), 1e-12))
+    moving = normals @ np.linalg.eigh(normals.T @ normals)[1]
+    return not any((np.where(np.abs(x) > 0.3, x**2, 0).mean(axis=0) < _TELLING).any() for x in (moving, turning))
 
 
 def apart(A: Array, B: Array, voxel: float) -> bool:
@@ -188,6 +189,7 @@ def apart(A: Array, B: Array, voxel: float) -> bool:
 
 
 _CELL = 0.03  # radians, of the panorama in which sight lines are compared
+_AROUND = int(2 * np.pi / _CELL) + 1  # cells around it
 
 
 def _panorama(points: Array) -> tuple[Indices, Array]:
@@ -216,13 +218,26 @@ def _visible(moved: Array, seen: Array) -> NDArray[np.bool_]:
 
 
 def _violation(moved: Array, seen: Array) -> float:
-    """Returns the share of points that hang in front of what the sensor at the origin saw in their direction."""
+    """Returns the share of points that hang before what the sensor at the origin saw in and around their direction.
+
+    Around, since beams pass beside what is thin and beside edges: something that hangs there stands before all of them.
+    """
     cell, distance = _panorama(moved)
-    sight = _sight(seen)[cell]
-    known = sight > 0
+    sight = _sight(seen)
+    known = sight[cell] > 0
     if known.sum() < 50:
         return 1.0
-    return float((known & (distance < 0.92 * sight - 0.1)).sum() / known.sum())
+    free = _free(sight)[cell]
+    return float((known & (distance < 0.92 * free - 0.1)).sum() / known.sum())
+
+
+def _free(sight: Array) -> Array:
+    """Returns the least of the sights in each cell of the panorama and in those around it that have one."""
+    grid = np.where(sight > 0, sight, np.inf).reshape(256, 256)[:_AROUND]
+    wrapped = np.concatenate([grid[-1:], grid, grid[:1]])
+    free = np.full((256, 256), np.inf)
+    free[:_AROUND] = minimum_filter(wrapped, size=3, mode="nearest")[1:-1]
+    return np.asarray(free.ravel())
 
 
 def _matches(source: Array, target: Array) -> Indices:
