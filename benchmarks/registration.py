@@ -37,8 +37,8 @@ from operators.sources import KittiRaw, SimulatedRobot  # noqa: E402
 Array = NDArray[np.float64]
 Posed = tuple[PointCloud, Array]  # a cloud, and the true pose (4, 4) of its sensor
 DATA = Path(os.environ.get("PERCEPTION_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
-TURN = 2.0  # degrees within which a registration is right; and as many voxels as
-NEAR = 1.0
+TURN = 3.0  # degrees within which a registration is right; and as many voxels as
+NEAR = 2.0
 SHARED = 2.0  # voxels within which a point has one of the other cloud
 
 DEPTH = {"voxel": 0.05}
@@ -78,7 +78,8 @@ def kitti(every: int) -> list[Posed]:
         assert isinstance(pose, Odometry)
         distance = np.linalg.norm(cloud.points, axis=1)
         if k % every == 0:
-            found.append((cloud.replace(points=cloud.points[(distance > 2) & (distance < 50)]), pose.matrix()))
+            kept = cloud.points[(distance > 2) & (distance < 50)]
+            found.append((PointCloud(stamp=cloud.stamp, frame=cloud.frame, points=kept), pose.matrix()))
     return found
 
 

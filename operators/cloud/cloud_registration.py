@@ -39,7 +39,7 @@ class CloudRegistration(Operator):
     trials: int = Param(60_000, ge=100, le=10_000_000, doc="triples of matches that are tried")
     min_overlap: float = Param(0.5, gt=0, le=1, doc="least share of each cloud that the other sensor could see")
     min_fitness: float = Param(0.85, gt=0, le=1, doc="least share of that which lies on the other cloud")
-    max_violation: float = Param(0.04, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
+    max_violation: float = Param(0.03, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
 
     def setup(self) -> None:
         self._settings = Settings(

@@ -22,6 +22,8 @@ Indices = NDArray[np.intp]
 
 
 FEWEST = 100  # voxels with a normal that a cloud must have
+_MODES = 60  # motions of RANSAC that are compared
+_SAME_TURN = 0.98  # cosine of the turn within which motions are like each other
 _TRIED = 12  # motions that are refined
 _RIVAL = 0.03  # a second motion whose score is that near to the best one's makes the result ambiguous
 _CORRELATED = 30.0  # voxels whose errors are alike, for the covariance
@@ -102,12 +104,11 @@ def register(source: Prepared, target: Prepared, settings: Settings, rng: np.ran
         return failure("no motion agrees with the features")
     tree = cKDTree(target.points)
     starts.sort(key=lambda T: -_agreement(source, target, tree, T, 3 * settings.voxel))
-    distinct: list[Array] = []
+    tried: list[Registered] = []
     for T in starts:
-        if all(apart(T, other, settings.voxel) for other in distinct):
-            distinct.append(T)
-    tried = [refine(source, target, T, settings) for T in distinct[:_TRIED]]
-    tried.sort(key=lambda found: -found.score)
+        if len(tried) < _TRIED and not any(_led_by(T, found.T, settings.voxel) for found in tried):
+            tried.append(refine(source, target, T, settings))
+    tried.sort(key=lambda found: (bool(found.reason), -found.score))
     best = tried[0]
     for other in tried[1:]:
         near = other.score > best.score - _RIVAL and other.overlap > 0.7 * best.overlap
@@ -188,6 +189,12 @@ def apart(A: Array, B: Array, voxel: float) -> bool:
     return bool(np.linalg.norm(off[:3]) > 4 * voxel or np.linalg.norm(off[3:]) > 0.1)
 
 
+def _led_by(start: Array, found: Array, voxel: float) -> bool:
+    """Tells whether a start is so near to a motion that it would lead to it again."""
+    off = se3.log(np.linalg.inv(start) @ found)
+    return bool(np.linalg.norm(off[:3]) < 10 * voxel and np.linalg.norm(off[3:]) < 0.35)
+
+
 _CELL = 0.03  # radians, of the panorama in which sight lines are compared
 _AROUND = int(2 * np.pi / _CELL) + 1  # cells around it
 
@@ -264,8 +271,23 @@ def _starts(source: Array, target: Array, settings: Settings, rng: np.random.Gen
     votes = np.zeros(len(motions), np.int64)
     for k, T in enumerate(motions):
         votes[k] = (np.linalg.norm(transform_points(T, source) - target, axis=1) <= 2.5 * settings.voxel).sum()
-    order = np.argsort(-votes, kind="stable")[:60]
-    return [motions[k] for k in order if votes[k] >= 4]
+    order = np.argsort(-votes, kind="stable")
+    return _modes(motions[order[votes[order] >= 4]], 5 * settings.voxel)
+
+
+def _modes(motions: Array, near: float) -> list[Array]:
+    """Returns motions (4, 4) that are apart, of (K, 4, 4) in their order: each stands for all that are like it.
+
+    A room that looks alike from both ends has many triples for one of two motions, and both are to be tried.
+    """
+    found: list[Array] = []
+    while len(motions) and len(found) < _MODES:
+        best = motions[0]
+        found.append(best)
+        cosine = (np.einsum("kij,ij->k", motions[:, :3, :3], best[:3, :3]) - 1) / 2
+        away = np.linalg.norm(motions[:, :3, 3] - best[:3, 3], axis=1)
+        motions = motions[(away > near) | (cosine < _SAME_TURN)]
+    return found
 
 
 def _rigid(source: Array, target: Array) -> Array:

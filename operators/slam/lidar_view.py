@@ -113,7 +113,8 @@ class LidarEyes:
                 break
         if not starts:
             return failure("nothing of the scan lies on surfaces that were seen there")
-        tried = sorted((refine(other.prepared, one.prepared, T, self.judge) for T in starts), key=lambda r: -r.score)
+        tried = [refine(other.prepared, one.prepared, T, self.judge) for T in starts]
+        tried.sort(key=lambda found: (bool(found.reason), -found.score))
         best = tried[0]
         for rival in tried[1:]:
             near = rival.score > best.score - _RIVAL and rival.overlap > 0.7 * best.overlap
