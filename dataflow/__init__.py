@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from dataflow.api.join import Joined
     from dataflow.api.recordings import RecordedStreams, open
     from dataflow.api.runs import RunResult, Verified, launch, replay, run, verify
+    from dataflow.api.session import Session
     from dataflow.api.stream import RecordedStream
     from dataflow.testing import Played, play
 
@@ -34,6 +35,7 @@ _HOMES = {
     "RecordedStream": "dataflow.api.stream",
     "RecordedStreams": "dataflow.api.recordings",
     "RunResult": "dataflow.api.runs",
+    "Session": "dataflow.api.session",
     "Verified": "dataflow.api.runs",
     "launch": "dataflow.api.runs",
     "open": "dataflow.api.recordings",
@@ -51,6 +53,7 @@ __all__ = [
     "RecordedStream",
     "RecordedStreams",
     "RunResult",
+    "Session",
     "Verified",
     "launch",
     "open",

@@ -32,7 +32,7 @@ SECTIONS: tuple[tuple[str, str, tuple[str, ...]], ...] = (
     (
         "Graphs and runs",
         "dataflow",
-        ("Graph", "run", "replay", "launch", "verify", "RunResult", "Verified"),
+        ("Graph", "run", "replay", "launch", "verify", "Session", "RunResult", "Verified"),
     ),
     ("One operator on streams", "dataflow", ("play", "Played")),
     (

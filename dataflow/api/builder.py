@@ -28,10 +28,20 @@ class Graph:
         graph.connect("alarm", image="camera/image").run(record="watch.mcap")
 
     It stands for a YAML text, which `yaml()` gives: the same rules, checks and errors apply. A stream is named
-    `operator/port`; wildcards work. `build()` checks it and is called by whatever runs it.
+    `operator/port`; wildcards work. `build()` checks it and is called by whatever runs it. Graph files that it nests
+    lie in `folder`, the current one unless it is given.
     """
 
-    def __init__(self, name: str = "graph", *, namespace: str | None = None, seed: int = 0, threads: int = 1) -> None:
+    def __init__(
+        self,
+        name: str = "graph",
+        *,
+        namespace: str | None = None,
+        seed: int = 0,
+        threads: int = 1,
+        folder: str | Path = ".",
+    ) -> None:
+        self._folder = Path(folder)
         self._head: dict[str, Any] = {"graph": name}
         if namespace is not None:
             self._head["namespace"] = namespace
@@ -39,7 +49,8 @@ class Graph:
         self._operators: dict[str, dict[str, Any]] = {}
 
     def add(self, name: str, operator: type[Operator] | str, /, **params: Any) -> Self:
-        """Adds an operator with its parameters: its class, or its import path (`"operators.cloud:CloudBuilder"`).
+        """Adds an operator with its parameters: its class, or its import path (`"operators.cloud:CloudBuilder"`), or
+        a nested graph by the path of its file (`"core/perception.yaml"`).
 
         A class may stand in a notebook's cell; then it exists in this process alone. Raises `ValueError` for a name
         that is taken, and for a class that stands inside a function or another class.
@@ -97,9 +108,11 @@ class Graph:
         file.write_text(self.yaml(), encoding="utf-8")
         return file
 
-    def build(self) -> ResolvedGraph:
-        """The graph, checked wholly. Raises `GraphError` with everything that is wrong."""
-        return load_text(self.yaml(), file=FILE)
+    def build(self, settings: Mapping[str, Any] | None = None) -> ResolvedGraph:
+        """The graph, checked wholly. `settings` change parameters of operators inside nested graphs, as `--set` does.
+        Raises `GraphError` with everything that is wrong."""
+        words = [f"{name}={v if isinstance(v, str) else _json(v)}" for name, v in (settings or {}).items()]
+        return load_text(self.yaml(), file=FILE, folder=self._folder, settings=words)
 
     def run(self, record: str | Path | None = None, **options: Any) -> RunResult:
         """Runs the graph in this process; see `dataflow.run`."""

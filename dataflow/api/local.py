@@ -5,6 +5,7 @@ Firings depend on timestamps and frontiers alone, so what comes out is what a ru
 
 from __future__ import annotations
 
+import functools
 import signal
 import threading
 import time
@@ -12,15 +13,16 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, TypeVar
 
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.feeds.window import Window
 from dataflow.firing.calls import summary_of
 from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.protocol import Runner
 from dataflow.firing.source import SourceRunner
 from dataflow.firing.threads import limited_threads
-from dataflow.graph.model import Graph
+from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
 from dataflow.process.pace import Pace
@@ -34,9 +36,10 @@ from dataflow.sync import FOREVER, NEVER, Entry
 BATCH_RECORDS = 64
 SHOW_EVERY = 0.2
 Watch = Callable[[Status], None]
+Made = TypeVar("Made")
 
 
-class _Recorder:
+class Recorder:
     """Writes what operators emit, as far as the graph records it, and all firing records."""
 
     def __init__(self, path: Path, graph: Graph, streams: set[str], options: Mapping[str, Any]) -> None:
@@ -70,12 +73,12 @@ class _Recorder:
         return self._sink.close(outcome)
 
 
-class _Emitter:
+class Emitting:
     """Hands what an operator emits to those who take it, and to the recorder."""
 
     def __init__(self, runners: Runners) -> None:
         self._runners = runners
-        self.recorder: _Recorder | None = None
+        self.recorder: Recorder | None = None
 
     def message(self, stream: str, entry: Entry) -> None:
         for runner in self._runners.taking(stream):
@@ -103,9 +106,9 @@ class LocalRun:
 
     def __init__(self, graph: Graph, *, log: LogPlan | None = None, paranoid: bool = False) -> None:
         self.graph, self._log = graph, log
-        self._config = _config(graph, log, paranoid)
+        self._config = config_of(graph, log, paranoid=paranoid)
         self._runners = Runners()
-        self._emitter = _Emitter(self._runners)
+        self._emitter = Emitting(self._runners)
         window = Window(1, 1)
         window.cover(FOREVER)  # one thread: a step is done before the next one is read
         self._feeding = Feeding(window, Pace(None))
@@ -131,7 +134,7 @@ class LocalRun:
         if record is not None:
             record.parent.mkdir(parents=True, exist_ok=True)
             options = {"metadata": metadata or {}, "overwrite": overwrite}
-            self._emitter.recorder = _Recorder(record, self.graph, made, options)
+            self._emitter.recorder = Recorder(record, self.graph, made, options)
         outcome = "failed: it did not end in order"
         facts: Mapping[str, Any] = {}
         began = time.monotonic()
@@ -163,27 +166,12 @@ class LocalRun:
         for node in self.graph.nodes.values():
             if node.name in replaced:
                 continue
-            try:
-                if node.source:
-                    source = make_source(node, self.graph, self._config, self._emitter)
-                    self._runners.sources.append(source)
-                    self._feeding.feeds.append(source)
-                else:
-                    self._runners.add(
-                        make_runner(
-                            node,
-                            self.graph,
-                            self._config,
-                            self._emitter,
-                            faults=OperatorFaults(),
-                            event_clock=time.time_ns,
-                            on_failure=_cannot_restart,
-                        )
-                    )
-            except OperatorFailure:
-                raise
-            except Exception as error:
-                raise OperatorFailure(node.name, "construction", error) from error
+            if node.source:
+                source = _made(node, functools.partial(make_source, node, self.graph, self._config, self._emitter))
+                self._runners.sources.append(source)
+                self._feeding.feeds.append(source)
+            else:
+                make_here(node, self.graph, self._config, self._emitter, self._runners)
         log = make_log(self.graph, self._config, self._emitter)
         if log is not None:
             self._feeding.feeds.append(log)
@@ -194,21 +182,14 @@ class LocalRun:
         while True:
             if self._stopped:
                 self._feeding.finish("interrupted")
-            if not (self._step() or self._feeding.admit()):
+            if not (step_each(self._runners) or self._feeding.admit()):
                 self._feeding.promise()
-                if not self._step():
+                if not step_each(self._runners):
                     break
             if watch is not None and time.monotonic() - shown >= SHOW_EVERY:
                 shown = time.monotonic()
                 watch(Status(phase="running", operators=self._counts(), first=self._first))
         self._check_ended()
-
-    def _step(self) -> bool:
-        """One step of every operator, last ones first, so that what is under way is done before more is begun."""
-        worked = False
-        for runner in reversed(self._runners.operators):
-            worked = runner.step() or worked
-        return worked
 
     def _check_ended(self) -> None:
         held = {r.node.name: r.waiting() for r in self._runners.operators if not r.ended}
@@ -279,7 +260,7 @@ def _losses(drops: Mapping[tuple[str, str], int]) -> tuple[tuple[str, str, int],
     return tuple((name, reason, number) for (name, reason), number in sorted(drops.items()))
 
 
-def _config(graph: Graph, log: LogPlan | None, paranoid: bool) -> ProcessConfig:
+def config_of(graph: Graph, log: LogPlan | None, *, paranoid: bool) -> ProcessConfig:
     """Returns what a process of its own would be told."""
     replay: dict[str, Any] | None = None
     if log is not None:
@@ -300,6 +281,35 @@ def _config(graph: Graph, log: LogPlan | None, paranoid: bool) -> ProcessConfig:
         if log is None or log.start is None or log.bag is not None
         else {"path": str(log.path), "stamp": log.start},
     )
+
+
+def step_each(runners: Runners) -> bool:
+    """One step of every operator, last ones first, so that what is under way is done before more is begun."""
+    worked = False
+    for runner in reversed(runners.operators):
+        worked = runner.step() or worked
+    return worked
+
+
+def make_here(node: Node, graph: Graph, config: ProcessConfig, emitter: Emitting, runners: Runners) -> None:
+    """Makes the runner of an operator that is not a source. Raises `OperatorFailure`."""
+    faults = OperatorFaults()
+
+    def make() -> Runner:
+        return make_runner(
+            node, graph, config, emitter, faults=faults, event_clock=time.time_ns, on_failure=_cannot_restart
+        )
+
+    runners.add(_made(node, make))
+
+
+def _made(node: Node, make: Callable[[], Made]) -> Made:
+    try:
+        return make()
+    except OperatorFailure:
+        raise
+    except Exception as error:
+        raise OperatorFailure(node.name, "construction", error) from error
 
 
 def _cannot_restart(failure: OperatorFailure, pause: float) -> None:

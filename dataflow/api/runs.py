@@ -113,7 +113,7 @@ def run(
     built = resolved(graph, settings)
     file = None if record is None else Path(record)
     report = LocalRun(built, paranoid=paranoid).execute(
-        record=file, metadata=_metadata(built, "run"), overwrite=overwrite, watch=watch
+        record=file, metadata=metadata_of(built, "run"), overwrite=overwrite, watch=watch
     )
     return RunResult(report, file)
 
@@ -155,7 +155,7 @@ def replay(
             log = plan_replay(opened, built, start=start, end=end)
     file = None if record is None else Path(record)
     report = LocalRun(built, log=log, paranoid=paranoid).execute(
-        record=file, metadata=facts | _metadata(built, "replay"), overwrite=overwrite, watch=watch
+        record=file, metadata=facts | metadata_of(built, "replay"), overwrite=overwrite, watch=watch
     )
     if file is not None and played is not None:
         keep_untouched(file, path, played, log.start, log.end)
@@ -231,7 +231,7 @@ def _defined_here(graph: ResolvedGraph) -> list[str]:
     return [node.name for node in graph.nodes.values() if node.use.startswith(NOTEBOOK)]
 
 
-def _metadata(graph: ResolvedGraph, mode: str) -> dict[str, dict[str, str]]:
+def metadata_of(graph: ResolvedGraph, mode: str) -> dict[str, dict[str, str]]:
     """Returns what a recording made here says of itself; the thread settings are those of this process."""
     facts = {
         "mode": mode,

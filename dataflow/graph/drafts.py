@@ -27,9 +27,33 @@ class Pattern:
     via: Place | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class Absence:
+    """Says why something is not there: `reason` for people, and the prefix of the operators that do without it.
+
+    Whoever stands inside (`"perception/"`) was written for that; a file that leaves an input out may not name what
+    would have been made of it.
+    """
+
+    reason: str
+    inside: str
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """One entry of an input. Of its ways, the first of which anything is there counts; `absence`: it has none.
+
+    `via` is the place inside a nested graph where an input of that graph is named.
+    """
+
+    ways: tuple[tuple[Pattern | Choice, ...], ...]
+    absence: Absence | None = None
+    via: Place | None = None
+
+
 @dataclass(slots=True)
 class Draft:
-    """One operator before its inputs are wired."""
+    """One operator before its inputs are wired. `inputs` follow from `choices` once it is settled what is there."""
 
     name: str
     place: Place
@@ -37,31 +61,42 @@ class Draft:
     use: str
     cls: type[Operator]
     params: dict[str, Any]
-    inputs: dict[str, list[Pattern]]
+    choices: dict[str, list[Choice]]
     input_places: dict[str, Place]
     inputs_place: Place
     process: Leaf | None
     machine: Leaf | None
     live: Tree | None
     sync: Tree | None
+    inputs: dict[str, list[Pattern]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Alias:
-    """An exported output of a nested graph: `key` stands for the stream that `target` matches."""
+    """An exported output of a nested graph: `key` stands for the stream that `target` comes to."""
 
     key: str
-    target: Pattern
+    target: Choice
+    place: Place
+
+    @property
+    def pattern(self) -> Pattern:
+        """The one expression that the target comes to, once that is settled."""
+        ((found,),) = self.target.ways
+        assert isinstance(found, Pattern)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
 class GraphInput:
     """A declared input of a nested graph, bound to expressions outside; `type` is what it promises to carry."""
 
-    patterns: tuple[Pattern, ...]
+    choices: tuple[Choice, ...]
     type: type[Message] | None
     place: Place
     """The place where the nested graph declares it."""
+    patterns: tuple[Pattern, ...] = ()
+    """The expressions that the choices come to."""
 
 
 @dataclass(slots=True)
@@ -74,6 +109,8 @@ class Expansion:
     drafts: list[Draft] = field(default_factory=list)
     aliases: list[Alias] = field(default_factory=list)
     graph_inputs: list[tuple[str, GraphInput]] = field(default_factory=list)
+    left_out: dict[str, tuple[Absence, ...]] = field(default_factory=dict)
+    """Operators and nested graphs that are not made, by full name: `when: false`, and those that lack an input."""
     broken: list[str] = field(default_factory=list)
     """Key prefixes of operators that could not be had: nothing is said about streams below them."""
     names: set[str] = field(default_factory=set)
@@ -89,7 +126,7 @@ class Scope:
     prefix: str
     key: str
     given: Mapping[str, Tree]
-    bindings: Mapping[str, tuple[Place, list[Pattern]]]
+    bindings: Mapping[str, tuple[Place, list[Choice]]]
     use: Place | None
     process: Leaf | None
     machine: Leaf | None

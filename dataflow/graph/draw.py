@@ -27,6 +27,10 @@ def tree(graph: Graph) -> Tree:
             entry = branch.add(label)
             for line in _ports(graph, node):
                 entry.add(line)
+    if graph.left_out:
+        branch = root.add(Text("left out", style="dim"))
+        for name, why in graph.left_out.items():
+            branch.add(Text.assemble((name, "bold"), "  ", (why, "dim")))
     return root
 
 

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 from dataflow.graph import document
-from dataflow.graph.drafts import Alias, Draft, Expansion, GraphInput, Pattern, Scope
+from dataflow.graph.conditions import failed
+from dataflow.graph.drafts import Absence, Alias, Choice, Draft, Expansion, GraphInput, Pattern, Scope
 from dataflow.graph.fields import Fields
 from dataflow.graph.graph_parameters import GraphParameters
-from dataflow.graph.keys import NAME_RULE, canonical, has_wildcard, key_fault, name_fault
+from dataflow.graph.keys import NAME_RULE, has_wildcard, key_fault, name_fault
 from dataflow.graph.limits import MAX_DEPTH, MAX_OPERATORS, Budget
 from dataflow.graph.lookup import NotFound, find_operator
 from dataflow.graph.operator_parameters import operator_parameters
@@ -20,14 +22,17 @@ from dataflow.graph.problems import Place, Problems, did_you_mean, nearest
 from dataflow.graph.references import substitute
 from dataflow.graph.settings import Setting, overridden, read_settings
 from dataflow.graph.tree import Entry, Items, Leaf, Table, Tree
+from dataflow.graph.wiring import Wiring
 from dataflow.messages.base import Message, message_types
 from dataflow.operator import Operator
 
 TOP_KEYS = (
     "graph", "namespace", "params", "inputs", "operators", "outputs", "record", "view", "seed", "threads", "network",
 )  # fmt: skip
-OPERATOR_KEYS = ("use", "inputs", "params", "process", "machine", "live", "sync")
-NESTED_KEYS = ("use", "inputs", "params", "process", "machine")
+OPERATOR_KEYS = ("use", "when", "inputs", "params", "process", "machine", "live", "sync")
+NESTED_KEYS = ("use", "when", "inputs", "params", "process", "machine")
+OPTIONAL = "?"
+"""Ends the type of an input of a nested graph that need not be given."""
 ReadFile = Callable[[str], str]
 """Text of a graph file by its path relative to the root file's folder; raises OSError or UnicodeDecodeError."""
 
@@ -46,6 +51,7 @@ class Expander:
     ) -> None:
         self.read, self.shown, self.problems = read, shown, problems
         self.fields = Fields(problems)
+        self.wiring = Wiring(self.fields, problems)
         self.budget = Budget(problems)
         self.graph_parameters = GraphParameters(variable, folder, self.fields, self.budget, problems)
         self.members = 0
@@ -132,21 +138,27 @@ class Expander:
             if fault := name_fault(name):
                 self.problems.add(entry.key.place, f"output name {fault}", NAME_RULE)
             elif self.fields.text(entry.value, f"output {name!r}") is not None and isinstance(entry.value, Leaf):
-                pattern = self.pattern(entry.value, scope)
-                if pattern is not None and has_wildcard(pattern.key):
-                    self.problems.add(pattern.place, f"output {name!r} must name one stream, not a wildcard")
-                elif pattern is not None:
-                    self.out.aliases.append(Alias(f"{scope.key}/{name}", pattern))
+                target = self.wiring.choice(entry.value, scope, inputs)
+                ways = [each for way in target.ways for each in way if isinstance(each, Pattern)]
+                if any(has_wildcard(pattern.key) for pattern in ways):
+                    self.problems.add(entry.value.place, f"output {name!r} must name one stream, not a wildcard")
+                elif target.ways:
+                    self.out.aliases.append(Alias(f"{scope.key}/{name}", target, entry.value.place))
 
     def graph_inputs(self, table: Table, scope: Scope) -> dict[str, GraphInput]:
         """The file's declared inputs with what the outer graph bound to them."""
         tree = table.get("inputs")
         declared: dict[str, tuple[Place, type[Message] | None]] = {}
+        optional: set[str] = set()
         if isinstance(tree, Items):
             declared = {leaf.value: (leaf.place, None) for leaf in self.fields.texts(tree, "an input's name")}
         elif tree is not None and (named := self.fields.table(tree, "inputs")) is not None:
             for name, entry in named.entries.items():
-                declared[name] = (entry.key.place, self.message_type(entry.value, name))
+                carried = entry.value
+                if isinstance(carried, Leaf) and isinstance(carried.value, str) and carried.value.endswith(OPTIONAL):
+                    optional.add(name)
+                    carried = replace(carried, value=carried.value.removesuffix(OPTIONAL).strip())
+                declared[name] = (entry.key.place, self.message_type(carried, name))
         if scope.use is None:
             for name, (place, _) in declared.items():
                 self.problems.add(
@@ -165,7 +177,11 @@ class Expander:
                 self.problems.add(place, f"input name {fault}", NAME_RULE)
                 continue
             bound = scope.bindings.get(name)
-            if bound is None:
+            choices = tuple(bound[1] if bound else ())
+            if bound is None and name in optional:
+                reason = f"{scope.prefix[:-1]} is not given its input {name!r}"
+                choices = (Choice((), Absence(reason, scope.prefix)),)
+            elif bound is None:
                 wanted = f" ({kind.SCHEMA})" if kind else ""
                 self.problems.add(
                     scope.use,
@@ -173,7 +189,7 @@ class Expander:
                     f"add 'inputs: {{{name}: ...}}'",
                     [(place, "declared here")],
                 )
-            inputs[name] = GraphInput(tuple(bound[1] if bound else ()), kind, place)
+            inputs[name] = GraphInput(choices, kind, place)
             self.out.graph_inputs.append((f"{scope.prefix}{name}", inputs[name]))
         return inputs
 
@@ -221,10 +237,11 @@ class Expander:
             for setting in self.settings:
                 setting.used |= setting.owner == full
             return
+        self.condition(full, table, scope, inputs)
         given, params = table.entries.get("inputs"), table.entries.get("params")
         tree = overridden(self.settings, full, params.value if params else None, entry.key.place)
         values = self.fields.table(tree, "params") or Table({}, entry.key.place)
-        wired = self.wiring(table.get("inputs"), scope, inputs)
+        wired = self.wiring.read(table.get("inputs"), scope, inputs)
         self.out.drafts.append(
             Draft(
                 name=full,
@@ -235,7 +252,7 @@ class Expander:
                 params=operator_parameters(
                     full, cls, values, params.key.place if params else entry.key.place, self.problems
                 ),
-                inputs={port: patterns for port, (_, patterns) in wired.items()},
+                choices={port: choices for port, (_, choices) in wired.items()},
                 input_places={port: place for port, (place, _) in wired.items()},
                 inputs_place=given.key.place if given else entry.key.place,
                 process=self.fields.label(table.get("process"), "process") or scope.process,
@@ -245,12 +262,21 @@ class Expander:
             )
         )
 
+    def condition(self, full: str, table: Table, scope: Scope, inputs: Mapping[str, GraphInput]) -> bool:
+        """Notes an operator or nested graph whose `when:` does not hold; False for one."""
+        fails = failed(table.get("when"), inputs, self.problems)
+        if fails is not None:
+            self.out.left_out[full] = (Absence(f"{full} has 'when: {fails}'", scope.prefix),)
+        return fails is None
+
     def nested(
         self, name: str, use: str, place: Place, table: Table, scope: Scope, inputs: Mapping[str, GraphInput]
     ) -> None:
         full = scope.prefix + name
         file = posixpath.normpath(posixpath.join(posixpath.dirname(scope.file), use))
         prefix = f"{scope.key}/{name}"
+        if not self.condition(full, table, scope, inputs):
+            return
         if file in scope.stack:
             way = " -> ".join(self.shown(f) for f in (*scope.stack[scope.stack.index(file) :], file))
             self.problems.add(place, f"graph nests in itself: {way}")
@@ -262,7 +288,7 @@ class Expander:
             return
         tree = self.parse(file, place)
         given = self.fields.table(overridden(self.settings, full, table.get("params"), place), "params")
-        wired = self.wiring(table.get("inputs"), scope, inputs)
+        wired = self.wiring.read(table.get("inputs"), scope, inputs)
         inner = Scope(
             file=file,
             shown=self.shown(file),
@@ -280,40 +306,6 @@ class Expander:
             self.out.broken.append(prefix)
         else:
             self.body(body, inner)
-
-    # -- inputs --------------------------------------------------------------------------------------------------
-
-    def wiring(
-        self, tree: Tree | None, scope: Scope, inputs: Mapping[str, GraphInput]
-    ) -> dict[str, tuple[Place, list[Pattern]]]:
-        """Input port → (place of its key, expressions)."""
-        table = self.fields.table(tree, "inputs")
-        wired = {}
-        for port, entry in (table.entries if table else {}).items():
-            patterns: list[Pattern] = []
-            if isinstance(entry.value, Items) and not entry.value.items:
-                self.fields.problems.add(entry.value.place, f"input {port!r} lists no stream", "leave the input out")
-            for leaf in self.fields.texts(entry.value, f"input {port!r}"):
-                if leaf.value in inputs:
-                    bound = inputs[leaf.value].patterns
-                    patterns += [Pattern(p.text, p.key, p.place, p.scope, p.via or leaf.place) for p in bound]
-                elif (pattern := self.pattern(leaf, scope, inputs)) is not None:
-                    patterns.append(pattern)
-            wired[port] = (entry.key.place, patterns)
-        return wired
-
-    def pattern(self, leaf: Leaf, scope: Scope, inputs: Mapping[str, GraphInput] | None = None) -> Pattern | None:
-        text = leaf.value
-        absolute = text.startswith("/")
-        if fault := key_fault(text[1:] if absolute else text):
-            self.problems.add(leaf.place, f"{text!r} is no key expression: {fault}")
-            return None
-        if not absolute and "/" not in text and not has_wildcard(text) and inputs:
-            hint = did_you_mean(text, inputs, "inputs of this graph")
-            self.problems.add(leaf.place, f"{text!r} is neither an input of this graph nor 'operator/port'", hint)
-            return None
-        key = canonical(text[1:] if absolute else f"{scope.key}/{text}")
-        return Pattern(text, key, leaf.place, scope.key)
 
     # -- settings ------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from dataflow.graph.expand import Expander
 from dataflow.graph.limits import MAX_BUNDLE, MAX_TEXT
 from dataflow.graph.model import Bundle, Graph
+from dataflow.graph.presence import Presence
 from dataflow.graph.problems import Place, Problems
 from dataflow.graph.resolve import Resolver
 from dataflow.graph.search import add_folder
@@ -39,11 +40,22 @@ def load_graph(path: str | Path, *, settings: Sequence[str] = (), live: bool = F
 
 
 def load_text(
-    text: str, *, file: str = "graph.yaml", files: Mapping[str, str] | None = None, settings: Sequence[str] = ()
+    text: str,
+    *,
+    file: str = "graph.yaml",
+    files: Mapping[str, str] | None = None,
+    folder: Path | None = None,
+    settings: Sequence[str] = (),
 ) -> Graph:
-    """The graph of a YAML text. `files` holds the texts of nested graphs by path; nothing is read from disk."""
+    """The graph of a YAML text. `files` holds the texts of nested graphs by path; others lie in `folder`, if given:
+    without it nothing is read from disk."""
     texts = {file: text, **(files or {})}
-    return _load(file, lambda key: _from(texts, key), os.environ.get, lambda: ".", settings, str)
+    read = None if folder is None else _reader(folder)
+
+    def text_of(key: str) -> str:
+        return read(key) if read is not None and key not in texts else _from(texts, key)
+
+    return _load(file, text_of, os.environ.get, lambda: "." if folder is None else folder.as_posix(), settings, str)
 
 
 def load_bundle(bundle: str) -> Graph:
@@ -106,6 +118,7 @@ def _load(
     if expansion is None:
         problems.check()
         raise AssertionError("a graph without a shape has a problem")
+    Presence(expansion, problems).settle()
     graph = Resolver(expansion, problems, live).resolve(
         Bundle(file, texts, tuple(settings), environment, "".join(folders))
     )

@@ -199,6 +199,8 @@ class Graph:
     """Exported outputs of nested graphs: alias key → stream name."""
     types: Mapping[str, Declaration] = field(default_factory=dict)
     """Message types that are not of `dataflow.messages`: schema name → declaration, with the module to import."""
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Operators that are in the files but not in this graph: name → why."""
 
     @property
     def text(self) -> str:
@@ -222,6 +224,7 @@ class Graph:
             "streams": [asdict(stream) for stream in self.streams.values()],
             "aliases": dict(self.aliases),
             "types": [declaration.to_json() for declaration in self.types.values()],
+            "left_out": dict(self.left_out),
             "record": record_to_json(self.record),
             "view": asdict(self.view),
             "network": asdict(self.network),
@@ -244,6 +247,7 @@ class Graph:
             streams={stream.name: stream for stream in streams},
             aliases=dict(data["aliases"]),
             types={declaration.schema: declaration for declaration in types},
+            left_out=dict(data.get("left_out", {})),
             record=record_from_json(data["record"]),
             view=view_from_json(data["view"]),
             network=Network(

@@ -13,6 +13,7 @@ from dataflow.graph.model import Bundle, Graph, Node
 from dataflow.graph.network import read_network
 from dataflow.graph.order import fed_by_devices, in_order, refuse_stuck_cycles
 from dataflow.graph.policies import live_policy, sync_every, sync_tolerance
+from dataflow.graph.presence import said
 from dataflow.graph.problems import Problems, did_you_mean
 from dataflow.graph.sections import PANELS, Record, View
 from dataflow.graph.streams import Streams
@@ -59,6 +60,7 @@ class Resolver:
             network=read_network(root.get("network"), self.fields),
             aliases=self.known.aliases,
             types=self.known.own_types,
+            left_out={name: said(reasons) for name, reasons in self.expansion.left_out.items()},
         )
 
     # -- streams -------------------------------------------------------------------------------------------------
@@ -244,7 +246,7 @@ class Resolver:
         return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots, flight=flight)
 
     def view(self, tree: Tree | None) -> View:
-        table = self.fields.table(tree, "view", ("hide", "panels", "layout"))
+        table = self.fields.table(tree, "view", ("hide", "panels", "layout", "keep"))
         if table is None:
             return View()
         panels = []
@@ -254,7 +256,8 @@ class Resolver:
         layout = self.fields.text(table.get("layout"), "layout") or ""
         if layout and not layout.endswith(".rbl"):
             self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")  # type: ignore[arg-type]
-        return View(self.topics(table.get("hide"), "hide"), tuple(panels), layout)
+        hidden, kept = (self.topics(table.get(what), what) for what in ("hide", "keep"))
+        return View(hidden, tuple(panels), layout, kept)
 
     def topics(self, tree: Tree | None, what: str) -> tuple[str, ...]:
         """The streams that a list of key expressions matches; each must match one at least."""

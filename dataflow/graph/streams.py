@@ -36,14 +36,15 @@ class Streams:
         while waiting:
             later = []
             for alias in waiting:
-                target = self.aliases.get(alias.target.key, alias.target.key)
+                pattern = alias.pattern
+                target = self.aliases.get(pattern.key, pattern.key)
                 if target in self.streams:
                     self.aliases[alias.key] = target
                 else:
                     later.append(alias)
             if len(later) == len(waiting):
                 for alias in later:
-                    self.no_match(alias.target, f"output {alias.key.rpartition('/')[2]!r}", None)
+                    self.no_match(alias.pattern, f"output {alias.key.rpartition('/')[2]!r}", None)
                 return
             waiting = later
 

@@ -409,7 +409,7 @@ CASES = {
     "live_of_a_nested_graph": (
         operator("n: {use: graph.yaml, live: {}}"),
         "4:24: unknown key 'live' in the nested graph 'n'",
-        "known here: use, inputs, params, process, machine",
+        "known here: use, when, inputs, params, process, machine",
     ),
 }
 

@@ -1,0 +1,192 @@
+"""A graph in this process that a program feeds message by message."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Self
+
+from dataflow.api.handed import HandedFeed
+from dataflow.api.local import Emitting, Recorder, config_of, make_here, step_each
+from dataflow.api.runs import GraphLike, metadata_of, resolved
+from dataflow.firing.calls import summary_of
+from dataflow.firing.failure import OperatorFailure
+from dataflow.firing.threads import limited_threads
+from dataflow.messages.base import Message
+from dataflow.process.runners import Runners
+from dataflow.supervision.report import RunFailed
+from dataflow.sync import Entry
+
+Made = dict[str, tuple[Message, ...]]
+"""Messages of a step by stream, without the namespace."""
+
+
+class Session:
+    """Executes a graph in this process, on this thread, with messages that the program hands in.
+
+        with dataflow.Session("graph.yaml", static={"camera/info": info}, outputs=["detector/*"]) as session:
+            made = session.put(image.stamp, {"camera/image": image})
+
+    What is handed in takes the place of all sources, which are not made. `put` returns when everything that follows
+    from the step has been computed; the messages are those of a run, digest by digest. Results that must wait for what
+    comes later (joins with a tolerance, ports with a lag) come with the step that decides them.
+    """
+
+    def __init__(
+        self,
+        graph: GraphLike,
+        *,
+        static: Mapping[str, Message] | None = None,
+        outputs: Iterable[str] | None = None,
+        settings: Mapping[str, Any] | None = None,
+        record: str | Path | None = None,
+        overwrite: bool = False,
+    ) -> None:
+        """`static`: the message of each static stream of the sources; `outputs`: streams that `put` returns, by name
+        without the namespace or exported name (all, unless given); `settings`: as for `dataflow.run`.
+
+        Raises `GraphError`, `ValueError` for streams that are not there, and `RunFailed` where an operator cannot be
+        set up.
+        """
+        self.graph = resolved(graph, settings)
+        self._names = self._chosen(outputs)
+        self._made: dict[str, list[Message]] = {}
+        self._runners = Runners()
+        self._emitter = _Collecting(self._runners, self._names, self._made)
+        self._feed = HandedFeed(self.graph, static or {}, self._emitter)
+        self._closed = False
+        self._outcome = "failed: it did not end in order"
+        self._open = ExitStack()
+        if record is not None:
+            file = Path(record)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            options = {"metadata": metadata_of(self.graph, "run"), "overwrite": overwrite}
+            self._emitter.recorder = Recorder(file, self.graph, set(self.graph.streams), options)
+            self._open.callback(lambda: self._emitter.recorder and self._emitter.recorder.close(self._outcome))
+        self._open.callback(self._close_operators)
+        self._open.enter_context(limited_threads(self.graph.threads))
+        try:
+            config = config_of(self.graph, None, paranoid=False)
+            for node in self.graph.nodes.values():
+                if not node.source:
+                    make_here(node, self.graph, config, self._emitter, self._runners)
+            for runner in self._runners.operators:
+                runner.setup()
+            self._feed.setup()
+        except BaseException as error:
+            self._fail(error)
+            raise
+
+    def _chosen(self, outputs: Iterable[str] | None) -> dict[str, str]:
+        """Stream → name under which it is returned."""
+        space = self.graph.namespace
+        aliases = {alias.removeprefix(f"{space}/"): stream for alias, stream in self.graph.aliases.items()}
+        own = {self.graph.relative(stream): stream for stream in self.graph.streams}
+        if outputs is None:
+            return {stream: name for name, stream in own.items()}
+        chosen = {}
+        for name in outputs:
+            stream = aliases.get(name) or own.get(name)
+            if stream is None:
+                raise ValueError(f"no stream {name!r} in graph {self.graph.name}")
+            chosen[stream] = name
+        return chosen
+
+    def put(self, stamp: int, messages: Mapping[str, Message]) -> Made:
+        """Hands in the messages of one stamp, by stream, and returns what the graph makes of them.
+
+        A step without messages says that time has passed. Raises `ValueError` for a stamp that does not come after
+        the last one and for streams that are not the sources', `TypeError` for messages of another type, and
+        `RunFailed` with the operator that failed, after which the session is closed.
+        """
+        if self._closed:
+            raise ValueError("the session is closed")
+        checked = self._feed.check(messages, stamp)
+        try:
+            self._feed.admit(checked, stamp)
+            self._work()
+        except BaseException as error:
+            self._fail(error)
+            raise
+        return self._taken()
+
+    def close(self) -> Made:
+        """Ends the streams and closes the operators; returns what they make at their end."""
+        if self._closed:
+            return {}
+        try:
+            self._feed.finish()
+            self._work()
+        except BaseException as error:
+            self._fail(error)
+            raise
+        self._outcome, self._closed = "complete", True
+        self._open.close()
+        return self._taken()
+
+    def summaries(self) -> dict[str, Mapping[str, Any]]:
+        """Returns what the operators sum up, by operator."""
+        return {r.node.name: s for r in self._runners.operators if (s := summary_of(r.operator, r.node.name))}
+
+    def _work(self) -> None:
+        """Runs what is decided, until nothing is left of it; a frontier alone may decide something further down."""
+        try:
+            while step_each(self._runners) or self._emitter.moved:
+                self._emitter.moved = False
+        except OperatorFailure as failure:
+            raise RunFailed(str(failure), failure.traceback, failure.operator) from failure
+
+    def _taken(self) -> Made:
+        made = {name: tuple(messages) for name, messages in self._made.items()}
+        self._made.clear()
+        return made
+
+    def _fail(self, error: BaseException) -> None:
+        self._closed = True
+        self._outcome = f"failed: {(str(error) or type(error).__name__).splitlines()[0]}"
+        try:
+            self._open.close()
+        except OperatorFailure as failure:  # of close(), after the first cause
+            error.add_note(str(failure))
+
+    def _close_operators(self) -> None:
+        failures = []
+        for runner in self._runners.operators:
+            try:
+                runner.operator.close()
+            except Exception as error:
+                failures.append(OperatorFailure(runner.node.name, "close()", error))
+        if failures:
+            raise failures[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if error is not None and not self._closed:
+            self._fail(error)
+        self.close()
+
+
+class _Collecting(Emitting):
+    """Also keeps the messages of chosen streams, and whether a frontier moved since it was asked last."""
+
+    def __init__(self, runners: Runners, names: Mapping[str, str], made: dict[str, list[Message]]) -> None:
+        super().__init__(runners)
+        self._names, self._kept = names, made
+        self.moved = False
+
+    def frontier(self, stream: str, frontier: int) -> None:
+        super().frontier(stream, frontier)
+        self.moved = True
+
+    def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
+        super().end(stream, final_stamp, reason)
+        self.moved = True
+
+    def message(self, stream: str, entry: Entry) -> None:
+        super().message(stream, entry)
+        name = self._names.get(stream)
+        if name is not None:
+            self._kept.setdefault(name, []).append(entry.value)
