@@ -43,11 +43,12 @@ VIEWS: dict[str, tuple[str, ...]] = {
         f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}",
     ),
     "slam": ("run", "graphs/slam.yaml", "--set", "duration=26s"),
+    "slam_lidar": ("run", "graphs/slam_lidar.yaml", "--set", "duration=26s"),
     "stereo": ("run", "graphs/simulated_stereo.yaml"),
 }
 """The arguments of `dataflow` by the picture's name."""
 
-LATER = {"fusion": 39, "slam": 22}
+LATER = {"fusion": 39, "slam": 22, "slam_lidar": 22}
 """Seconds after the start of which a picture is, where there is little to be seen at first."""
 
 GROWN = "demo"
