@@ -37,6 +37,7 @@ from operators.slam.keyframe_graph import Node  # noqa: E402
 from operators.slam.rgbd_slam import RgbdSlam, SlamResult  # noqa: E402
 from operators.slam.visual_graph import GraphSettings  # noqa: E402
 from operators.slam.visual_map_file import read_visual_map, write_visual_map  # noqa: E402
+from operators.slam.visual_view import View  # noqa: E402
 
 Array = NDArray[np.float64]
 
@@ -194,7 +195,7 @@ def show(name: str, row: dict[str, Any]) -> None:
     print(f"| {name} | {' | '.join(cells)} |  {row['frames']} {row['refused']}", flush=True)
 
 
-def saved_map(drive: Drive, file: Path) -> tuple[list[Node], Array]:
+def saved_map(drive: Drive, file: Path) -> tuple[list[Node[View]], Array]:
     """Returns a map of a drive, saved and loaded, and the true pose (4, 4) of its origin."""
     slam = RgbdSlam(drive.camera, RgbdOdometryConfig(), GraphSettings())
     for image, depth, stamp in zip(drive.image, drive.depth, drive.stamps.tolist(), strict=True):
@@ -203,7 +204,7 @@ def saved_map(drive: Drive, file: Path) -> tuple[list[Node], Array]:
     return read_visual_map(file), drive.truth[0]
 
 
-def tries(known: list[Node], origin: Array | None, drive: Drive, every: int) -> Counter[str]:
+def tries(known: list[Node[View]], origin: Array | None, drive: Drive, every: int) -> Counter[str]:
     """Begins anew at every `every`th frame; `origin` is None where the map is of another place."""
     tally: Counter[str] = Counter()
     for begin in range(0, len(drive.stamps) - TRY, every):

@@ -53,17 +53,19 @@ class Record:
     flight: Flight | None = None
 
 
-PANELS = ("world", "cameras", "scene", "map", "plots", "status", "log")
+PANELS = ("world", "cameras", "scene", "map", "text", "plots", "status", "log")
 """Parts of the viewer's window that a graph may choose."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Choices for the viewer: streams left out, panels (none: all), a layout saved from it (empty: derived)."""
+    """Choices for the viewer: streams left out, panels (none: all), a layout saved from it (empty: derived), and
+    clouds whose points stay where they were seen."""
 
     hide: tuple[str, ...] = ()
     panels: tuple[str, ...] = ()
     layout: str = ""
+    keep: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,5 +101,5 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
 
 
 def view_from_json(data: Mapping[str, Any]) -> View:
-    """Sections that older recordings lack are as they were: every panel, no saved layout."""
-    return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""))
+    """Sections that older recordings lack are as they were: every panel, no saved layout, no points that stay."""
+    return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""), tuple(data.get("keep", ())))

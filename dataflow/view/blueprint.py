@@ -15,9 +15,11 @@ from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCl
 from dataflow.view.canvas import Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
 from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, Outlook, entity_of
+from dataflow.view.visualizers.scene_tree import HEIGHT, WIDTH
 
 _BACKGROUND = (24, 27, 33)
 _PLOT_SECONDS = 10.0
+_WIDE, _HIGH = (-0.08 * WIDTH, 0.92 * WIDTH), (-0.03 * HEIGHT, 1.03 * HEIGHT)
 
 Part = rrb.View | rrb.Container
 
@@ -47,17 +49,16 @@ def blueprint_of(shown: Layout, *, outlook: Outlook | None = None, following: bo
     status = _status(shown) if "status" in chosen else None
     log = _log(shown) if "log" in chosen else None
 
-    main = [part for part in (world, _row(cameras, 3)) if part is not None]
-    parts = ((_tabs(side), 3), (_tabs(plots), 3), (status, 1), (log, 2))
-    column = [(part, share) for part, share in parts if part is not None]
-    beside = None
-    if column:
-        beside = rrb.Vertical(contents=[part for part, _ in column], row_shares=[share for _, share in column])
-    left = None
-    if main:
-        left = main[0] if len(main) == 1 else rrb.Vertical(contents=main, row_shares=[3, 2])
+    told = [name for name in _with_role(shown, "graph") if name not in shown.aside]
+    words = _texts(shown) if "text" in chosen else []
+    if told and world is not None:
+        left = _stack((world, 5), (_tabs(side), 2))
+        beside = _stack((_tabs(cameras), 4), (_tabs(words), 4), (_tabs(plots), 2), (status, 1), (log, 1))
+    else:
+        left = _stack((world, 3), (_row(cameras, 3), 2))
+        beside = _stack((_tabs([*side, *words]), 3), (_tabs(plots), 3), (status, 1), (log, 2))
     if left is not None and beside is not None:
-        root: Part = rrb.Horizontal(left, beside, column_shares=[7, 3])
+        root: Part = rrb.Horizontal(left, beside, column_shares=[2, 1] if told else [7, 3])
     else:
         root = left or beside or _log(shown)
     return rrb.Blueprint(
@@ -89,6 +90,7 @@ def _world(shown: Layout, outlook: Outlook | None) -> rrb.Spatial3DView | None:
     trails: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
         f"{entity_of(name)}/space/trail": rrb.VisibleTimeRanges([forever]) for name in shown.of_type(Pose, Odometry)
     }
+    trails |= {f"{entity_of(name)}/space/kept": rrb.VisibleTimeRanges([forever]) for name in shown.kept}
     hidden: dict[rr.encodings.EntityPath | str, VisualizerLike] = {
         f"{entity_of(name)}/space": rrb.EntityBehavior(visible=False) for name in shown.aside
     }
@@ -120,12 +122,24 @@ def _graphs(shown: Layout) -> list[Part]:
     return [
         rrb.GraphView(
             origin=f"{entity_of(name)}/graph",
-            name=_short(name, shown),
-            force_link=rrb.archetypes.ForceLink(enabled=True, distance=70.0),
-            force_many_body=rrb.archetypes.ForceManyBody(enabled=True, strength=-400.0),
-            force_collision_radius=rrb.archetypes.ForceCollisionRadius(enabled=True),
+            name=_titled("Scene graph", name, shown),
+            visual_bounds=rrb.VisualBounds2D(x_range=_WIDE, y_range=_HIGH),
+            force_link=rrb.archetypes.ForceLink(enabled=False),
+            force_many_body=rrb.archetypes.ForceManyBody(enabled=False),
+            force_position=rrb.archetypes.ForcePosition(enabled=False),
+            force_collision_radius=rrb.archetypes.ForceCollisionRadius(enabled=False),
+            force_center=rrb.archetypes.ForceCenter(enabled=False),
         )
         for name in sorted(_with_role(shown, "graph"), key=lambda name: name in shown.aside)
+    ]
+
+
+def _texts(shown: Layout) -> list[Part]:
+    """Documents, of which the newest is shown: the scene in words, scores."""
+    return [
+        rrb.TextDocumentView(origin=f"{entity_of(name)}/text", name=_titled("Scene", name, shown))
+        for name in _with_role(shown, "text")
+        if name not in shown.aside
     ]
 
 
@@ -202,6 +216,14 @@ def _with_role(shown: Layout, role: Role) -> list[str]:
     return [name for name, type_ in shown.streams.items() if role in roles_of(type_)]
 
 
+def _stack(*parts: tuple[Part | None, float]) -> Part | None:
+    """Those that there are, one above the other, with their shares of the height."""
+    there = [(part, share) for part, share in parts if part is not None]
+    if len(there) <= 1:
+        return there[0][0] if there else None
+    return rrb.Vertical(contents=[part for part, _ in there], row_shares=[share for _, share in there])
+
+
 def _row(parts: Sequence[Part], columns: int) -> Part | None:
     """Side by side; more than fit in a row go into the next."""
     if len(parts) <= 1:
@@ -218,6 +240,12 @@ def _tabs(parts: Sequence[Part]) -> Part | None:
     if len(parts) <= 2:
         return parts[0] if len(parts) == 1 else rrb.Vertical(contents=parts)
     return rrb.Tabs(contents=parts, active_tab=0)
+
+
+def _titled(title: str, stream: str, shown: Layout) -> str:
+    """A title for the only stream of its kind that is not put aside; with the stream's name where there are several."""
+    rivals = [name for name in shown.of_type(shown.streams[stream]) if name not in shown.aside]
+    return title if rivals == [stream] else f"{title} {_short(stream, shown)}"
 
 
 def _short(stream: str, shown: Layout) -> str:

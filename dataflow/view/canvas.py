@@ -20,7 +20,7 @@ from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
 NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
 
-Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor", "status"]
+Role = Literal["image", "overlay", "space", "plot", "log", "graph", "map", "tensor", "status", "text"]
 """The views in which a type appears. `image` is drawn at the stream's entity itself, all else at `<entity>/<role>`."""
 
 

@@ -137,6 +137,25 @@ class FrameTree:
             return None
         return self._to_top(frame)[1]
 
+    def pose_at(self, frame: str, stamp: int) -> Matrix | None:
+        """`T_root_frame` (4×4) at a stamp (ns).
+
+        None where a frame on the way moves and nobody said where it was then, or is only assumed to lie somewhere.
+        """
+        if frame not in self._frames:
+            return None
+        T = np.eye(4)
+        while (edge := self._edges.get(frame)) is not None:
+            if edge.assumed and not edge.owner:
+                return None
+            poses = self._sightings[frame, edge.owner].poses if not edge.assumed else ()
+            then = next((pose for at, pose in reversed(poses) if at == stamp), None)
+            if then is None and len(poses) > 1:
+                return None
+            T = (edge.T_parent_child if then is None else then) @ T
+            frame = edge.parent
+        return T
+
     def assumed(self) -> dict[str, str]:
         """Frame → parent, for the frames whose place nobody gave."""
         return {child: edge.parent for child, edge in self._edges.items() if edge.assumed}

@@ -51,6 +51,7 @@ class Layout:
     - `planes`: stream → name of the image plane that its pixels lie in, for images, calibrations and overlays.
     - `static`: streams whose one message holds for all time.
     - `aside`: truth that is drawn but switched off: scenes, surfaces, and boxes where others are estimated.
+    - `kept`: clouds whose points stay where they were seen.
     - `panels`: the parts of the window that the graph asks for; none: all.
     """
 
@@ -60,6 +61,7 @@ class Layout:
     static: frozenset[str] = frozenset()
     aside: frozenset[str] = frozenset()
     panels: tuple[str, ...] = ()
+    kept: frozenset[str] = frozenset()
 
     def of_type(self, *types: type[Message]) -> tuple[str, ...]:
         """The streams of some types, sorted."""
@@ -98,7 +100,8 @@ def layout(streams: Mapping[str, type[Message]], graph: Graph | None = None, sta
     )
     panels = graph.view.panels if graph is not None else ()
     aside = _aside(shown, graph)
-    return Layout(MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed), aside, panels)
+    kept = frozenset(graph.view.keep if graph is not None else ())
+    return Layout(MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed), aside, panels, kept)
 
 
 def plane_name(stream: str) -> str:

@@ -45,6 +45,8 @@ class ViewOptions:
       fit); None: as float32.
     - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log says so once.
     - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
+    - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
+      have had a point in a cell, so that what moves leaves none.
     - `trail`: trails get a vertex every so many metres at least.
     - `track_history`: event time (ns) for which the paths of tracks are drawn.
     """
@@ -53,6 +55,8 @@ class ViewOptions:
     depth_step: float | None = 0.001
     max_points: int = 200_000
     point_step: float = 0.0
+    kept_step: float = 0.05
+    kept_after: int = 5
     trail: float = 0.01
     track_history: int = 5_000_000_000
 
@@ -63,6 +67,8 @@ class ViewOptions:
             raise ValueError(f"depth_step must be more than 0 m or None, got {self.depth_step}")
         if not self.point_step >= 0:
             raise ValueError(f"point_step must be 0 m or more, got {self.point_step}")
+        if not self.kept_step > 0:
+            raise ValueError(f"kept_step must be more than 0 m, got {self.kept_step}")
         if self.max_points < 1:
             raise ValueError(f"max_points must be at least 1, got {self.max_points}")
 
@@ -98,6 +104,8 @@ class SceneState:
     _noted: set[tuple[str, str]] = field(default_factory=set)
     _ranges: list[float] = field(default_factory=list)
     _around: list[Vector] = field(default_factory=list)
+    _kept: list[Vector] = field(default_factory=list)
+    _ahead: Vector | None = None  # the direction in which one looks, decided once
     _posed: dict[str, None] = field(default_factory=dict)
     _waiting: dict[str, int] = field(default_factory=dict)
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
@@ -240,6 +248,16 @@ class SceneState:
         if T is not None and np.linalg.norm((p / distances[:, None]).mean(axis=0)) < _ONE_SIDED:
             self._around.append(p @ T[:3, :3].T + T[:3, 3])
 
+    @property
+    def keeps(self) -> bool:
+        """Tells whether there are points that stay."""
+        return bool(self._kept)
+
+    def kept_points(self, points: npt.ArrayLike) -> None:
+        """Points (N, 3) in the root frame that stay: the viewpoint is so far off that they are in view."""
+        p = np.asarray(points, np.float64).reshape(-1, 3)
+        self._kept.append(p[:: max(len(p) // 64, 1)])
+
     def outlook(self) -> Outlook:
         """Chooses the viewpoint from which everything seen is in view.
 
@@ -262,13 +280,17 @@ class SceneState:
         if np.linalg.norm(level) < 0.2:
             level = np.eye(3)[0] - up * up[0]
         level /= np.linalg.norm(level)
+        if self._ahead is None:
+            self._ahead = level
+        level = self._ahead
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
-        if self._around:
-            lower, upper = np.percentile(np.concatenate(self._around), [3, 97], axis=0)
+        if self._around or self._kept:
+            lower, upper = np.percentile(np.concatenate(self._around + self._kept), [3, 97], axis=0)
             middle = (lower + upper) / 2
             size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
-            return Outlook(up, middle - level * (0.97 * size) + up * (1.05 * size) + side * (0.4 * size), middle)
+            away = -0.97 * level + 1.05 * up + 0.4 * side
+            return Outlook(up, middle + size * away, middle - (0.1 * size * level if self._kept else 0.0))
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
 

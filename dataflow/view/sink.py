@@ -244,6 +244,8 @@ class ViewerSink:
                 waiting.changed.notify_all()
             self._draw(recording, stream, message)
         self._guarded("", lambda: self._settle(recording))
+        if isinstance(self.target, Save):
+            self._guarded("", lambda: self._look_again(recording))
         self._guarded("", lambda: recording.flush(timeout_sec=3600.0))  # close() bounds the wait
         recording.disconnect()
 
@@ -275,6 +277,13 @@ class ViewerSink:
             recording.log(SCENE, rr.ViewCoordinates.RDF, static=True)
         self._lay_out(recording)
 
+    def _look_again(self, recording: rr.RecordingStream) -> None:
+        """Chooses the viewpoint once more, from which all that there is in a file is in view."""
+        if not self._scene.keeps:
+            return
+        self._outlook = self._scene.outlook()
+        self._lay_out(recording)
+
     def _saved_layout(self, recording: rr.RecordingStream, graph: Graph | None) -> None:
         """Takes the layout that the graph names, as somebody saved it from the viewer, in place of a derived one."""
         if graph is None or not graph.view.layout:
@@ -292,7 +301,7 @@ class ViewerSink:
             return
         full = self._scene.layout
         shown = layout({name: type_ for name, type_ in full.streams.items() if name in self._seen}, self._graph)
-        following = not isinstance(self.target, Save)
+        following = not isinstance(self.target, Save) or self.target.at_end
         recording.send_blueprint(blueprint_of(shown, outlook=self._outlook, following=following))
 
     def _guarded(self, stream: str, action: Callable[[], object]) -> bool:

@@ -44,9 +44,10 @@ class Serve:
 
 @dataclass(frozen=True, slots=True)
 class Save:
-    """A file that Rerun opens; an existing one is replaced."""
+    """A file that Rerun opens; an existing one is replaced. `at_end`: it opens at its end instead of playing."""
 
     path: Path
+    at_end: bool = False
 
 
 Target = Spawn | Connect | Serve | Save

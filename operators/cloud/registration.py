@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import small_gicp
@@ -39,20 +40,24 @@ class Settings:
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A cloud as needed here: voxels (V, 3) with normals, and their features (V, 33)."""
+    """A cloud as needed here: voxels (V, 3) of a size with normals (V, 3), and their features (V, 33) if asked for."""
 
     points: Array
     normals: Array
-    features: Array
+    voxel: float
 
     @classmethod
     def of_cloud(cls, cloud: NDArray[np.float32], voxel: float) -> Prepared:
         points = Voxels.by_size(cloud, voxel).means(cloud) if len(cloud) else np.zeros((0, 3))
         normals = estimate_normals(points, neighbours=24, radius=4 * voxel, viewpoint=np.zeros(3))
         known = np.isfinite(normals).all(axis=1)
-        points, normals = points[known], normals[known]
-        features = histograms(points, normals, 8 * voxel, 80) if len(points) > 1 else np.zeros((len(points), 33))
-        return cls(points, normals, features)
+        return cls(points[known], normals[known], voxel)
+
+    @cached_property
+    def features(self) -> Array:
+        if len(self.points) < 2:
+            return np.zeros((len(self.points), 33))
+        return histograms(self.points, self.normals, 8 * self.voxel, 80)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +82,10 @@ class Registered:
         """The measures by which motions are compared."""
         return self.fitness - self.violation
 
+    def refused(self, reason: str) -> Registered:
+        """Returns the same, not to be believed."""
+        return replace(self, reason=reason)
+
 
 def register(source: Prepared, target: Prepared, settings: Settings, rng: np.random.Generator) -> Registered:
     """Returns the motion from source to target, without a guess: FPFH matches, RANSAC, then generalised ICP.
@@ -94,15 +103,15 @@ def register(source: Prepared, target: Prepared, settings: Settings, rng: np.ran
     starts.sort(key=lambda T: -_agreement(source, target, tree, T, 3 * settings.voxel))
     distinct: list[Array] = []
     for T in starts:
-        if all(_apart(T, other, settings.voxel) for other in distinct):
+        if all(apart(T, other, settings.voxel) for other in distinct):
             distinct.append(T)
     tried = [refine(source, target, T, settings) for T in distinct[:_TRIED]]
     tried.sort(key=lambda found: -found.score)
     best = tried[0]
     for other in tried[1:]:
         near = other.score > best.score - _RIVAL and other.overlap > 0.7 * best.overlap
-        if not best.reason and near and _apart(best.T, other.T, settings.voxel):
-            return replace(best, reason="ambiguous: another motion explains the clouds as well")
+        if not best.reason and near and apart(best.T, other.T, settings.voxel):
+            return best.refused("ambiguous: another motion explains the clouds as well")
     return best
 
 
@@ -116,9 +125,19 @@ def refine(source: Prepared, target: Prepared, guess: Array, settings: Settings)
             max_iterations=40,
         )  # fmt: skip
         T = np.asarray(found.T_target_source)
-    back = np.linalg.inv(T)
+    said = explained(source, target, T, settings)
+    reason = said.reason
+    if not reason and not _told(source, target, T, settings.voxel):
+        reason = "degenerate: the shared surfaces leave a direction free"
+    rotation_last = [3, 4, 5, 0, 1, 2]  # small_gicp has rotation first
+    information = found.H[np.ix_(rotation_last, rotation_last)] + 1e-9 * np.eye(6)
+    return replace(said, covariance=np.linalg.inv(information) * _CORRELATED, reason=reason)
+
+
+def explained(source: Prepared, target: Prepared, T: Array, settings: Settings) -> Registered:
+    """Returns what speaks for a motion; its covariance is not known."""
     one = _explained(transform_points(T, source.points), target.points, settings.voxel)
-    two = _explained(transform_points(back, target.points), source.points, settings.voxel)
+    two = _explained(transform_points(np.linalg.inv(T), target.points), source.points, settings.voxel)
     overlap, fitness = min(one[0], two[0]), min(one[1], two[1])
     violation, rmse = max(one[2], two[2]), max(one[3], two[3])
     reason = ""
@@ -128,12 +147,7 @@ def refine(source: Prepared, target: Prepared, guess: Array, settings: Settings)
         reason = f"{fitness:.0%} of what both saw agree"
     elif violation > settings.max_violation:
         reason = f"{violation:.0%} lie where the other sensor saw nothing"
-    elif not _told(source, target, T, settings.voxel):
-        reason = "degenerate: the shared surfaces leave a direction free"
-    rotation_last = [3, 4, 5, 0, 1, 2]  # small_gicp has rotation first
-    information = found.H[np.ix_(rotation_last, rotation_last)] + 1e-9 * np.eye(6)
-    covariance = np.linalg.inv(information) * _CORRELATED
-    return Registered(T, overlap, fitness, rmse, violation, covariance, reason)
+    return Registered(T, overlap, fitness, rmse, violation, np.full((6, 6), np.nan), reason)
 
 
 def failure(reason: str) -> Registered:
@@ -167,7 +181,8 @@ def _told(source: Prepared, target: Prepared, T: Array, voxel: float) -> bool:
     return True
 
 
-def _apart(A: Array, B: Array, voxel: float) -> bool:
+def apart(A: Array, B: Array, voxel: float) -> bool:
+    """Tells whether two motions are different ones."""
     off = se3.log(np.linalg.inv(A) @ B)
     return bool(np.linalg.norm(off[:3]) > 4 * voxel or np.linalg.norm(off[3:]) > 0.1)
 

@@ -252,10 +252,19 @@ def _velocity(
     frame = message.child_frame if isinstance(message, Odometry) else message.frame  # type: ignore[attr-defined]
     T_body_sensor = around.place(frame)
     axes = T_body_sensor[:3, :3].T
-    C = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
-    yield time - half, f"{name} linear", Velocity(linear, axes, T_body_sensor[:3, 3]), C
+    if _metric(message):
+        C = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
+        yield time - half, f"{name} linear", Velocity(linear, axes, T_body_sensor[:3, 3]), C
+    else:
+        around.ignored[f"{name}: scale unknown"] += 1
     C = _covariance(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
     yield time - half, f"{name} angular", AngularRate(angular, axes), C
+
+
+def _metric(message: Message) -> bool:
+    """Tells whether lengths are metres: a camera that does not know its scale gives positions an infinite variance."""
+    given = message.pose_covariance if isinstance(message, Odometry) else None
+    return given is None or bool(np.isfinite(np.diag(given)[:3]).any())
 
 
 def _wheels(time: int, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> Iterator[Found]:

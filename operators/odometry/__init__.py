@@ -7,6 +7,7 @@ from dataflow.lazy import lazily
 if TYPE_CHECKING:
     from operators.odometry.base_odometry import BaseOdometry
     from operators.odometry.lidar_odometry import LidarOdometry
+    from operators.odometry.mono_visual_odometry import MonoVisualOdometry
     from operators.odometry.stereo_visual_odometry import StereoVisualOdometry
     from operators.odometry.visual_odometry import VisualOdometry
     from operators.odometry.wheel_odometry import WheelOdometry
@@ -16,10 +17,18 @@ else:
         {
             "base_odometry": ("BaseOdometry",),
             "lidar_odometry": ("LidarOdometry",),
+            "mono_visual_odometry": ("MonoVisualOdometry",),
             "stereo_visual_odometry": ("StereoVisualOdometry",),
             "visual_odometry": ("VisualOdometry",),
             "wheel_odometry": ("WheelOdometry",),
         },
     )
 
-__all__ = ["BaseOdometry", "LidarOdometry", "StereoVisualOdometry", "VisualOdometry", "WheelOdometry"]
+__all__ = [
+    "BaseOdometry",
+    "LidarOdometry",
+    "MonoVisualOdometry",
+    "StereoVisualOdometry",
+    "VisualOdometry",
+    "WheelOdometry",
+]

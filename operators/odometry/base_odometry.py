@@ -27,8 +27,13 @@ class BaseOdometry(Operator):
     frame: str = Param("odom_base", min_length=1, doc="name of the frame in which the base began")
 
     def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry:
-        """Raises ValueError where the extrinsics do not hold the sensor on the base."""
+        """Raises ValueError where the extrinsics do not hold the sensor, or a pose without scale is beside the base."""
         T_base_sensor = transform_between(extrinsics, sensor.child_frame, self.base_frame)
+        if _without_scale(sensor) and T_base_sensor[:3, 3].any():
+            raise ValueError(
+                f"{sensor.child_frame!r} is posed without a scale (its positions have infinite variances), so where "
+                f"{self.base_frame!r} is beside it cannot be told"
+            )
         T = T_base_sensor @ sensor.matrix() @ invert(T_base_sensor)
         return Odometry.from_matrix(
             T,
@@ -37,6 +42,10 @@ class BaseOdometry(Operator):
             child_frame=self.base_frame,
             pose_covariance=_carried(sensor, T_base_sensor, T),
         )
+
+
+def _without_scale(sensor: Odometry) -> bool:
+    return sensor.pose_covariance is not None and bool(np.isinf(np.diag(sensor.pose_covariance)[:3]).any())
 
 
 def _carried(sensor: Odometry, T_base_sensor: np.ndarray, T: np.ndarray) -> np.ndarray | None:
@@ -49,5 +58,10 @@ def _carried(sensor: Odometry, T_base_sensor: np.ndarray, T: np.ndarray) -> np.n
     A = np.zeros((6, 6))
     A[:3, :3] = A[3:, 3:] = R
     A[:3, 3:] = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ R
+    if _without_scale(sensor):
+        turned = R @ sensor.pose_covariance[3:, 3:] @ R.T
+        C = np.diag([np.inf] * 3 + [0.0] * 3)
+        C[3:, 3:] = 0.5 * (turned + turned.T)
+        return C
     C = A @ sensor.pose_covariance @ A.T
     return np.asarray((C + C.T) / 2)

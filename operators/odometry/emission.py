@@ -9,6 +9,7 @@ from operators.odometry.tracking import Status, TrackResult
 from operators.status import counted_status
 
 LEVELS = {
+    Status.INITIALISING: Level.WARN,
     Status.TRACKING: Level.OK,
     Status.RELOCALISED: Level.OK,
     Status.PREDICTED: Level.WARN,

@@ -67,6 +67,10 @@ class LidarOdometry(Operator):
 
     def process(self, cloud: PointCloud, extrinsics: Transforms | None = None) -> Mapping[str, Message]:
         """Raises ValueError where no transform relates the cloud's frame to the body's."""
+        return self._tracked(cloud, extrinsics)[0]
+
+    def _tracked(self, cloud: PointCloud, extrinsics: Transforms | None) -> tuple[dict[str, Message], Tracked, Matrix]:
+        """Returns the messages of a scan, what they say, and the LiDAR's pose (4, 4) in the body."""
         body = self.body_frame or cloud.frame
         if body != cloud.frame and extrinsics is None:
             raise ValueError(f"the cloud is in {cloud.frame!r}; extrinsics that relate it to {body!r} are missing")
@@ -77,7 +81,7 @@ class LidarOdometry(Operator):
         messages: dict[str, Message] = {"status": _status(cloud.stamp, tracked)}
         if tracked.state is not State.LOST:
             messages["odometry"] = self._odometry(cloud.stamp, body, T_body_lidar, tracked)
-        return messages
+        return messages, tracked, T_body_lidar
 
     def on_reset(self, input: str) -> None:
         """Begins anew: the clock of a stream did, so nothing before it can be compared with."""

@@ -13,16 +13,15 @@ from numpy.typing import NDArray
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix, Vector
-from operators.odometry.lidar_fit import Fit, Prior, agreements, fit
+from operators.odometry.lidar_fit import Fit, Prior, fit
 from operators.odometry.lidar_map import PlaneMap
 from operators.odometry.lidar_motion import LidarMotion, as_left, as_right, corrected
 from operators.odometry.lidar_scan import Scan, deskewed, prepare
+from operators.odometry.lidar_search import TURNS, around
 
 FEWEST = 50  # points of a scan, and half as many in planes, that a pose may rest on
 _EPOCH = (1.0, 0.35)  # metres, radians: what the sensor moves until the map's new voxels count as younger
-_SEARCHED = 120  # points that a search for the pose looks at
-_REACH, _STEP = 3.0, 0.5  # metres to each side, and between starts, that a search covers
-_TURNS = 24  # headings, when lost
+_REACH = 3.0  # metres to each side that a search for the pose covers
 _STARTS, _LOST_STARTS = 3, 4  # of which a pose is fitted
 
 
@@ -60,7 +59,8 @@ class Tracked:
     """The pose `T` (4, 4) of the sensor, covariance (6, 6) of its right perturbation, velocity (6,) in its axes.
 
     `blind` (K, 6) are unit twists in the sensor's axes that the scan told nothing of. `velocity_covariance` is None
-    where the velocity was not measured.
+    where the velocity was not measured. `points` (N, 3) are the scan's, thinned and deskewed, in the sensor's frame at
+    the stamp; None where the pose or the velocity was not measured.
     """
 
     state: State
@@ -71,6 +71,7 @@ class Tracked:
     velocity_covariance: Matrix | None
     blind: NDArray[np.float64]
     counts: Mapping[str, int]
+    points: NDArray[np.float64] | None = None
 
 
 class LidarTracker:
@@ -151,19 +152,9 @@ class LidarTracker:
         reach = _REACH
         if not lost:
             reach = min(reach, self._config.start_speed * self._motion.seconds(stamp))
-        steps = np.arange(-int(reach / _STEP), int(reach / _STEP) + 1) * _STEP
-        turns = np.arange(_TURNS) * (2 * np.pi / _TURNS) if lost else np.zeros(1)
-        x, y, turn = (grid.ravel() for grid in np.meshgrid(steps, steps, turns, indexing="ij"))
-        starts = np.tile(np.eye(4), (len(x), 1, 1))
-        starts[:, 0, 0] = starts[:, 1, 1] = np.cos(turn)
-        starts[:, 1, 0] = np.sin(turn)
-        starts[:, 0, 1] = -starts[:, 1, 0]
-        starts[:, 0, 3], starts[:, 1, 3] = x, y
-        starts = T @ starts
-        points = scan.points[scan.sample[:: max(1, scan.count // _SEARCHED)]]
-        scores = agreements(points, self._map, starts, self._config.noise, 6.0) - 1e-3 * (np.abs(x) + np.abs(y))
-        best = np.argsort(-scores, kind="stable")[: _LOST_STARTS if lost else _STARTS]
-        return [T, *starts[best]]
+        turns = TURNS if lost else 1
+        best, _ = around(scan.points[scan.sample], self._map, T, reach, turns, self._config.noise)
+        return [T, *best[: _LOST_STARTS if lost else _STARTS]]
 
     def _fitted(self, scan: Scan, stamp: int, starts: list[Matrix]) -> Fit:
         """Returns the pose from the start that ends in the most agreement."""
@@ -225,26 +216,28 @@ class LidarTracker:
         dt = motion.seconds(stamp)
         if state is State.RELOCALISED:  # what was crossed unseen tells nothing of the velocity
             self._motion = LidarMotion(stamp, found.T, np.zeros(6), covariance)
+            points = None
         else:
             velocity, sweep = motion.velocity_to(found.T, stamp), motion.sweep_velocity(found.T, stamp)
             self._motion = LidarMotion(stamp, found.T, velocity, covariance, False, motion.stamp, motion.T)
-            self._grow(scan, sweep)
+            points = deskewed(scan.points, scan.offsets, sweep)
+            self._grow(points)
         reason = "; ".join(_told_nothing(twist) for twist in found.blind)
         counts = {"points on planes": found.paired, "agreeing, %": round(100 * found.inliers)}
         own_velocity = None if self._motion.fresh else 2 * own / dt**2
-        return self._result(
+        measured = self._result(
             state, reason, scan, self._motion, as_right(covariance, found.T), own_velocity, found.blind, counts
         )
+        return replace(measured, points=points)
 
-    def _grow(self, scan: Scan, velocity: Vector) -> None:
-        """Adds a scan at the pose just measured to the map."""
+    def _grow(self, points: NDArray[np.float64]) -> None:
+        """Adds a scan's points (N, 3), seen from the pose just measured, to the map."""
         motion = self._motion
         assert motion is not None
         moved = se3.log(invert(self._epoch_T) @ motion.T)
         if np.linalg.norm(moved[:3]) > _EPOCH[0] or np.linalg.norm(moved[3:]) > _EPOCH[1]:
             self._epochs.append(motion.covariance)
             self._epoch_T = motion.T
-        points = deskewed(scan.points, scan.offsets, velocity)
         self._map.add(points @ motion.T[:3, :3].T + motion.T[:3, 3], len(self._epochs) - 1)
         if np.linalg.norm(motion.T[:3, 3] - self._pruned_at) > 0.1 * self._config.far:
             self._pruned_at = motion.T[:3, 3].copy()

@@ -14,6 +14,7 @@ from operators.geometry.se3 import Matrix
 class Status(StrEnum):
     """Holds what a frame's pose rests on."""
 
+    INITIALISING = "initialising"  # nothing yet: one camera needs two views of a scene
     TRACKING = "tracking"  # measurements of this frame
     RELOCALISED = "relocalised"  # the same, in a map found again after a loss
     PREDICTED = "predicted"  # the motion so far, helped by whatever direction is still measured

@@ -18,6 +18,7 @@ from operators.segmentation.score import confusion, mean_iou
 from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
 from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
+from operators.training.network_weights import begin_with, fitting_facts, sample_images
 
 KIND = "segmenter"
 STEP = 16
@@ -61,6 +62,19 @@ class SegmenterTask:
     def samples(self) -> int:
         return len(self.data.training)
 
+    def begin_with(self, file: Path) -> None:
+        """Begins with the weights of a network file. Raises `TrainingFileError` where they do not fit."""
+        self.check(file)
+        begin_with(self.segmenter, file, sample_images(self))
+
+    def check(self, file: Path) -> None:
+        """Raises `TrainingFileError` for a network file of another kind, architecture, or of other classes."""
+        fitting_facts(file, kind=KIND, architecture=self._name, classes=list(self.data.classes))
+
+    @property
+    def _name(self) -> str:
+        return f"{self.architecture}-{self.width:g} decoder"
+
     def description(self) -> dict[str, Any]:
         return {
             "classes": list(self.data.classes),
@@ -103,7 +117,7 @@ class SegmenterTask:
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
         described = {
             "kind": KIND,
-            "architecture": f"{self.architecture}-{self.width:g} decoder",
+            "architecture": self._name,
             "classes": list(self.data.classes),
             "width": self.size[0],
             "height": self.size[1],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -11,12 +12,15 @@ from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
 from operators.slam.pose_graph import Edge, optimised
-from operators.slam.visual_view import View
+
+V = TypeVar("V")  # what a keyframe keeps of its place
+
+SAVED = -1  # the island of nodes that were loaded
 
 
 @dataclass(eq=False)
-class Node:
-    """A keyframe in the graph: `T_odom` and `T` (4, 4) pose the camera in the odometry frame, as it was said, and in
+class Node(Generic[V]):
+    """A keyframe in the graph: `T_odom` and `T` (4, 4) pose the sensor in the odometry frame, as it was said, and in
     the map; `covariance_odom` and `covariance` (6, 6) are theirs. A place that has a view already has no second one.
     """
 
@@ -25,25 +29,25 @@ class Node:
     covariance_odom: Matrix
     T: Matrix
     covariance: Matrix
-    travel: float  # radians of view change on the way here
+    travel: float  # change of view on the way here
     island: int  # one number for all that one unbroken chain of odometry joins
-    view: View | None
+    view: V | None
 
 
-class KeyframeGraph:
+class KeyframeGraph(Generic[V]):
     """Nodes by number, which ascends with time, and edges between them. Fixed nodes are never moved."""
 
     def __init__(self) -> None:
-        self.nodes: dict[int, Node] = {}
+        self.nodes: dict[int, Node[V]] = {}
         self.edges: list[Edge] = []
         self.fixed: set[int] = set()
 
-    def begin_with(self, nodes: Iterable[Node]) -> None:
+    def begin_with(self, nodes: Iterable[Node[V]]) -> None:
         """Begins with nodes that never move."""
         self.nodes = dict(enumerate(nodes))
         self.edges, self.fixed = [], set(self.nodes)
 
-    def add(self, node: Node) -> int:
+    def add(self, node: Node[V]) -> int:
         """Returns the number of the new node; the first one is fixed."""
         number = 1 + max(self.nodes, default=-1)
         self.nodes[number] = node

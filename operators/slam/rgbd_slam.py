@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -18,17 +17,11 @@ from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import scaled_intrinsics
 from operators.odometry.tracking import Status, TrackResult
-from operators.slam.visual_graph import Added, GraphSettings, VisualGraph
-from operators.slam.visual_memory import graph_from_plain, graph_to_plain
-
-
-class Place(StrEnum):
-    """Says what is known of the camera's place in the map."""
-
-    MAPPED = "mapped"  # by a chain of odometry from places that are in the map
-    CORRECTED = "corrected"  # by a loop at this very frame
-    SEARCHING = "searching"  # not since the start, or since the odometry began anew: no view was recognised yet
-    ADRIFT = "adrift"  # the odometry measures nothing
+from operators.slam.graph_memory import graph_from_plain, graph_to_plain
+from operators.slam.place import Place, place_of
+from operators.slam.sights import Added
+from operators.slam.visual_graph import GraphSettings, VisualGraph
+from operators.slam.visual_view import view_from_plain, view_to_plain
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +59,9 @@ class RgbdSlam:
             state = self._odometry.snapshot()
             added = self.graph.add(state.keyframes[-1], Fitter(working, self._config, state.noise), self._jumped)
             self._jumped &= not added.node
-        place, reason = self._place(result, added)
+        missing = result.status in (Status.PREDICTED, Status.LOST)
+        adrift = f"odometry {result.status}: {result.reason}" if missing else ""
+        place, reason = place_of(self.graph, added, adrift, result.reason)
         known = self.graph.located
         return SlamResult(
             odometry=result,
@@ -77,28 +72,16 @@ class RgbdSlam:
             added=added,
         )
 
-    def _place(self, result: TrackResult, added: Added) -> tuple[Place, str]:
-        refused = f"; refused: {', '.join(added.refused)}" if added.refused else ""
-        if added.found:
-            return Place.CORRECTED, "the map is found"
-        if added.loops:
-            return Place.CORRECTED, f"{added.loops} views of before seen again"
-        if not self.graph.located:
-            return Place.SEARCHING, f"no view of the map is recognised yet{refused}"
-        if result.status in (Status.PREDICTED, Status.LOST):
-            return Place.ADRIFT, f"odometry {result.status}: {result.reason}"
-        return Place.MAPPED, f"{result.reason}{refused}"
-
     def snapshot(self) -> Mapping[str, Any]:
         """Returns all that the next result depends on, as plain values."""
         return {
             "odometry": to_plain(self._odometry.snapshot()),
-            "graph": graph_to_plain(self.graph),
+            "graph": graph_to_plain(self.graph, view_to_plain),
             "jumped": self._jumped,
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Goes on from a snapshot of the same camera and settings."""
         self._odometry.restore(from_plain(state["odometry"]))
-        graph_from_plain(self.graph, state["graph"])
+        graph_from_plain(self.graph, state["graph"], view_from_plain)
         self._jumped = bool(state["jumped"])

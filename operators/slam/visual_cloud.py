@@ -10,10 +10,10 @@ from dataflow.messages import PointCloud
 from dataflow.messages.geometry import transform_points
 from operators.cloud.filtering import Voxels
 from operators.slam.keyframe_graph import Node
-from operators.slam.visual_view import STRIDE
+from operators.slam.visual_view import STRIDE, View
 
 
-def cloud_of(nodes: Iterable[Node], voxel: float, frame: str, stamp: int) -> PointCloud:
+def cloud_of(nodes: Iterable[Node[View]], voxel: float, frame: str, stamp: int) -> PointCloud:
     """Returns what the views of nodes saw, in the map, thinned to a mean point in each voxel; grey as it was seen."""
     points, shades = [np.zeros((0, 3))], [np.zeros(0, np.uint8)]
     for node in nodes:

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
-import numpy as np
-
 from dataflow.messages import (
     CameraInfo,
     DepthImage,
@@ -21,29 +19,22 @@ from dataflow.messages import (
     PointCloud,
     Transforms,
 )
-from dataflow.messages.diagnostics import Level
-from dataflow.messages.geometry import invert, matrix_to_quaternion
+from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.extrinsics import transform_between
-from operators.geometry.se3 import about_fixed_axes
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import DepthNoise
-from operators.slam.rgbd_slam import Place, RgbdSlam, SlamResult
+from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
+from operators.slam.rgbd_slam import RgbdSlam, SlamResult
 from operators.slam.visual_cloud import cloud_of
 from operators.slam.visual_graph import GraphSettings
 from operators.slam.visual_map_file import read_visual_map, write_visual_map
 from operators.slam.visual_view import Judge
-
-LEVELS = {
-    Place.MAPPED: Level.OK,
-    Place.CORRECTED: Level.OK,
-    Place.SEARCHING: Level.WARN,
-    Place.ADRIFT: Level.WARN,
-}
+from operators.status import counted_status
 
 
 @dataclass(frozen=True)
@@ -125,9 +116,11 @@ class VisualSlam(Operator):
         self._counts.update(f"refused: {reason}" for reason in result.added.refused)
         messages: dict[str, Message] = outputs(result.odometry, self.odometry_frame, depth.frame)
         messages["status"] = self._status(result, slam)
-        messages |= self._placed(result, depth)
+        odometry, T = messages["odometry"], result.odometry.T_world_camera
+        if result.T_map_odom is not None and isinstance(odometry, Odometry):
+            messages |= corrections(odometry, T, result.T_map_odom, result.covariance, self.map_frame)
         if result.added.loops:
-            messages["path"] = self._path(slam, depth.stamp)
+            messages["path"] = path_of(map_poses(slam.graph), self.map_frame, depth.stamp)
         if slam.graph.located and self._map_due(result, slam):
             messages["map"] = cloud_of(slam.graph.nodes.values(), self.voxel, self.map_frame, depth.stamp)
         return messages
@@ -153,51 +146,23 @@ class VisualSlam(Operator):
 
     def summary(self) -> Mapping[str, float | int]:
         """Returns the number of frames of each state, of loops, and of views that were refused, by reason."""
-        kept = {} if self._run is None else _sizes(self._run.slam) | {"loops": self._run.slam.graph.loops}
+        kept = {} if self._run is None else sizes(self._run.slam.graph) | {"loops": self._run.slam.graph.loops}
         return dict(self._counts) | kept
 
     # -- what is sent ------------------------------------------------------------------------------------
 
-    def _placed(self, result: SlamResult, depth: DepthImage) -> dict[str, Message]:
-        if result.T_map_odom is None:
-            return {}
-        T = result.T_map_odom @ result.odometry.T_world_camera
-        velocity = result.odometry.velocity
-        return {
-            "correction": Transforms.from_matrix(
-                result.T_map_odom, stamp=depth.stamp, frame=self.map_frame, child_frame=self.odometry_frame
-            ),
-            "pose": Odometry.from_matrix(
-                T,
-                stamp=depth.stamp,
-                frame=self.map_frame,
-                child_frame=depth.frame,
-                linear=velocity[:3],
-                angular=velocity[3:],
-                pose_covariance=about_fixed_axes(result.covariance, T),
-            ),
-        }
-
     def _status(self, result: SlamResult, slam: RgbdSlam) -> Diagnostics:
         """The map's state, then the odometry's."""
         odometry = result.odometry
-        counts = _sizes(slam) | {"loops": slam.graph.loops}
-        return Diagnostics(
-            stamp=odometry.stamp,
-            names=("visual_slam", "visual_odometry"),
-            messages=(f"{result.place}: {result.reason}", f"{odometry.status}: {odometry.reason}"),
-            levels=np.array([LEVELS[result.place], ODOMETRY_LEVELS[odometry.status]], np.uint8),
-            keys=(*counts, "inliers"),
-            values=(*map(str, counts.values()), str(odometry.inliers)),
-            owners=np.array([0] * len(counts) + [1], np.int32),
+        own = counted_status(
+            "visual_odometry",
+            odometry.stamp,
+            f"{odometry.status}: {odometry.reason}",
+            ODOMETRY_LEVELS[odometry.status],
+            {"inliers": odometry.inliers},
         )
-
-    def _path(self, slam: RgbdSlam, stamp: int) -> Path:
-        nodes = [node for node in slam.graph.nodes.values() if node.island in slam.graph.tied]
-        poses = np.array([node.T for node in nodes])
-        return Path(
-            stamp=stamp, frame=self.map_frame, positions=poses[:, :3, 3], orientations=matrix_to_quaternion(poses)
-        )
+        counts = sizes(slam.graph) | {"loops": slam.graph.loops}
+        return status_of("visual_slam", result.place, result.reason, counts, own)
 
     def _map_due(self, result: SlamResult, slam: RgbdSlam) -> bool:
         return result.added.loops > 0 or (result.added.node and len(slam.graph.nodes) % self.period == 0)
@@ -229,10 +194,6 @@ class VisualSlam(Operator):
             travel=self.travel,
             near=self.candidates,
             alike=self.candidates,
+            searched=2 * self.candidates,
             judge=Judge(self.min_inliers, self.min_overlap, self.min_agreement),
         )
-
-
-def _sizes(slam: RgbdSlam) -> dict[str, int]:
-    nodes = slam.graph.nodes.values()
-    return {"keyframes": len(nodes), "views": sum(node.view is not None for node in nodes)}

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,7 @@ from operators.odometry.recognition import Description, match
 from operators.odometry.relocalizer import rough_points
 from operators.odometry.surface import Surface
 from operators.odometry.watch import Watch
+from operators.slam.graph_memory import plain
 from operators.slam.place_index import Words, words_of
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
@@ -140,3 +143,12 @@ def _alone(view: View) -> LocalMap:
         )
     )  # fmt: skip
     return known
+
+
+def view_to_plain(view: View) -> dict[str, Any]:
+    """Returns a view as plain values; `view_from_plain` is the inverse."""
+    return plain(view) | {"surface": plain(view.surface)}
+
+
+def view_from_plain(values: Mapping[str, Any]) -> View:
+    return View(**(dict(values) | {"surface": Surface(**values["surface"])}))

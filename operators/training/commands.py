@@ -98,7 +98,7 @@ def train_detector(
             variation=Variation(flip=0.5 if flip else 0.0).times(variation),
             backbone=backbone_weights,
         )
-        prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
+        prepare(task, backbone_weights, frozen_stride, initial)
         tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
@@ -149,7 +149,7 @@ def train_segmenter(
             variation=Variation(flip=0.5 if flip else 0.0).times(variation),
             backbone=backbone_weights,
         )
-        prepare(task.network, task.backbone, backbone_weights, frozen_stride, initial)
+        prepare(task, backbone_weights, frozen_stride, initial)
         tell_data(read.notes, len(read.training), len(read.validation), read.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
@@ -258,7 +258,7 @@ def train_pair(
             width=width,
             variation=Variation(flip=0.5 if flip else 0.0).times(variation),
         )
-        prepare(task.network, task.backbone, None, 0, initial)
+        prepare(task, None, 0, initial)
         tell_data(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,

@@ -29,7 +29,12 @@ Frozen = Annotated[
     ),
 ]
 Initial = Annotated[
-    Path | None, typer.Option("--from", help="Start from all weights of this checkpoint (.pt) that fit: fine-tuning.")
+    Path | None,
+    typer.Option(
+        "--from",
+        help="Fine-tuning: start from all weights of this checkpoint (.pt) that fit, or from a network file (.onnx), "
+        "in 8 bits too. For a pair it is detector.onnx, with segmenter.onnx beside it.",
+    ),
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]

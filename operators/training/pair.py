@@ -22,6 +22,7 @@ from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
 from operators.segmentation.training import SegmenterTask
 from operators.training.augmentation import Variation, fitted, tensor_of, varied, warp
 from operators.training.backbone import Backbone
+from operators.training.network_weights import begin_with, sample_images
 
 DETECTOR, SEGMENTER = "detector.onnx", "segmenter.onnx"
 _CHANNELS = 64
@@ -88,6 +89,16 @@ class PairTask:
     @property
     def samples(self) -> int:
         return self.boxes.samples
+
+    def begin_with(self, file: Path) -> None:
+        """Begins with `detector.onnx` and the `segmenter.onnx` beside it, whose backbones were one; the detector's
+        counts. Raises `TrainingFileError` where they do not fit."""
+        other = file.with_name(SEGMENTER)
+        self.boxes.take_anchors(file)
+        self.masks.check(other)
+        images = sample_images(self)
+        begin_with(nn.Sequential(self.pair.backbone, self.pair.decoder), other, images)
+        begin_with(nn.Sequential(self.pair.backbone, self.pair.grid), file, images)
 
     def description(self) -> dict[str, Any]:
         return {"detector": self.boxes.description(), "segmenter": self.masks.description()}

@@ -6,7 +6,7 @@ import json as jsonlib
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import typer
 from rich.markup import escape
@@ -33,16 +33,26 @@ def run_task(task: Task, settings: Settings, out: Path, resume: bool, quiet: boo
         return train(task, settings, out, resume=resume, progress=bar)
 
 
-def prepare(
-    network: nn.Module, backbone: Extractor, weights: Path | None, frozen_stride: int | None, initial: Path | None
-) -> None:
+class FineTuned(Protocol):
+    """A task that can begin with the weights of another training."""
+
+    @property
+    def network(self) -> nn.Module: ...
+    @property
+    def backbone(self) -> Extractor: ...
+    def begin_with(self, file: Path) -> None: ...
+
+
+def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, initial: Path | None) -> None:
     """Gives a network its first weights and freezes the part of the backbone that came with them."""
     from operators.training.backbone import start_from
 
-    if initial is not None:
-        start_from(network, initial)
+    if initial is not None and initial.suffix == ".onnx":
+        task.begin_with(initial)
+    elif initial is not None:
+        start_from(task.network, initial)
     given = weights is not None or initial is not None
-    backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
+    task.backbone.freeze(frozen_stride if frozen_stride is not None else 4 if given else 0)
 
 
 def tell_data(

@@ -34,7 +34,10 @@ TRAINING, VALIDATION, HELD_OUT = 10_000, 20_000, 30_000
 """First seeds; every world has the next one. Networks are judged on worlds that nothing was chosen by."""
 KINDS = ("office", "table_top", "corridor", "office", "table_top")
 """Corridors show few objects, so fewer of them are rendered."""
+FOCALS, FOCAL = (0.45, 1.3), 0.85
+"""Focal lengths to train on, from and to, and that of a camera as it comes; shares of the image's width."""
 _SECONDS = 60
+_QUALITIES = (92, 92, 85, 85, 78, 78)  # of the stored JPEGs; two seeds, VGA and 320x240, share one
 
 
 @dataclass(frozen=True)
@@ -48,24 +51,24 @@ class WorldImage:
     masks: SegmentationMap
 
 
-def render(world: str, seed: int, frames: int, size: tuple[int, int], *, varied: bool) -> Iterator[WorldImage]:
-    """Images of a world, evenly spread over a minute. `varied` draws lens, light and noise by the seed."""
-    rng = np.random.default_rng((seed, 7))
-    camera: dict[str, Any] = {"rate": frames / _SECONDS, "width": size[0], "height": size[1]}
-    if varied:
-        camera |= {
-            "focal": float(rng.uniform(0.7, 1.0)),
-            "exposure": float(rng.uniform(0.7, 1.35)),
-            "read_noise": float(rng.uniform(0.5, 4)),
-            "phase": int(rng.uniform(0, 0.5) * 1e9 * _SECONDS / frames),
-        }
+def render(
+    world: str, seed: int, frames: int, size: tuple[int, int], *, varied: bool, focal: float = FOCAL
+) -> Iterator[WorldImage]:
+    """Images of a world, evenly spread over a minute.
+
+    `varied` draws by the seed: the lens, light, blur and noise of the camera, lamps that are dimmed, shaking, the way
+    that the robot takes, and how many people there are. Otherwise the camera has the focal length `focal`, a share of
+    the width, and all else is as `SimulatedRobot` has it.
+    """
+    settings: dict[str, Any] = _drawn(seed, frames) if varied else {"color_camera": {"focal": focal}}
+    settings["color_camera"] |= {"rate": frames / _SECONDS, "width": size[0], "height": size[1]}
     robot = SimulatedRobot(
         world=world,
         seed=seed,
         duration=f"{_SECONDS}s",
-        color_camera=camera,
         depth_camera={"rate": 0},
         truth={"poses": 0, "relations": 0, "activities": 0, "masks": True},
+        **settings,
     )
     robot.setup()
     try:
@@ -75,6 +78,30 @@ def render(world: str, seed: int, frames: int, size: tuple[int, int], *, varied:
                 yield WorldImage(world, seed, image, objects, masks)
     finally:
         robot.close()
+
+
+def _drawn(seed: int, frames: int) -> dict[str, Any]:
+    """Parameters of `SimulatedRobot` that differ from world to world."""
+    rng = np.random.default_rng((seed, 8))
+    shaken, dimmed = rng.random() < 0.3, rng.random() < 0.3
+    blurred = rng.random() < 0.4
+    begins = float(rng.uniform(0, 0.6)) * _SECONDS
+    return {
+        "color_camera": {
+            "focal": float(rng.uniform(*FOCALS)),
+            "exposure": float(rng.uniform(0.7, 1.35)),
+            "read_noise": float(rng.uniform(0.5, 4)),
+            "shot_noise": float(rng.uniform(0.05, 0.2)),
+            "shutter": int(rng.uniform(2e6, 2e7)) if blurred else 0,
+            "phase": int(rng.uniform(0, 0.5) * 1e9 * _SECONDS / frames),
+        },
+        "people": int(rng.choice([2, 3, 3, 4])),
+        "route": str(rng.choice(["round", "tour"])),
+        "motion": {"sway": float(rng.uniform(0, 0.03)), "turn": float(rng.uniform(0, 0.06))} if shaken else {},
+        "lighting": [{"span": (begins, begins + 0.4 * _SECONDS), "level": float(rng.uniform(0.15, 1.2))}]
+        if dimmed
+        else [],
+    }
 
 
 def worlds(first_seed: int, count: int, names: Sequence[str] = INDOOR) -> list[tuple[str, int]]:
@@ -129,7 +156,7 @@ def _store(folder: Path, stem: str, taken: WorldImage) -> dict[str, Any]:
     cv2.imwrite(
         str(folder / "images" / f"{stem}.jpg"),
         cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR),
-        [cv2.IMWRITE_JPEG_QUALITY, 92],
+        [cv2.IMWRITE_JPEG_QUALITY, _QUALITIES[taken.seed % len(_QUALITIES)]],
     )
     cv2.imwrite(str(folder / "masks" / f"{stem}.png"), classes)
     found = taken.objects

@@ -120,3 +120,23 @@ def test_everything_hangs_under_one_root_and_the_changes_rebuild_the_tree(events
             assert steps <= len(seen)
         assert at == root == tree.root
         np.testing.assert_allclose(pose, tree.pose(frame), atol=1e-9)
+
+
+def test_a_pose_of_a_stamp_is_that_of_then_and_of_no_other_time() -> None:
+    tree = FrameTree()
+    place(tree, "base", "camera", T(0.5, 0.0))
+    place(tree, "odom", "base", T(1.0, 0.0), owner="odometry", rank=Rank.ESTIMATE, t=10)
+    place(tree, "odom", "base", T(2.0, 0.0), owner="odometry", rank=Rank.ESTIMATE, t=20)
+    np.testing.assert_allclose(tree.pose_at("camera", 10), T(1.5, 0.0))
+    np.testing.assert_allclose(tree.pose_at("camera", 20), T(2.5, 0.0))
+    assert tree.pose_at("camera", 30) is None, "it has moved on, and nobody has said where to"
+    assert tree.pose_at("nowhere", 10) is None
+
+
+def test_a_frame_that_nobody_places_has_no_pose_of_a_stamp() -> None:
+    tree = FrameTree()
+    tree.see("map")
+    tree.see("camera")
+    assert tree.pose("camera") is not None
+    assert tree.pose_at("camera", 0) is None
+    assert tree.pose_at("map", 0) is not None

@@ -161,9 +161,10 @@ STREAMS = {
 def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
     assert views(blueprint(STREAMS)) == [
         ("3D", "World"),
+        ("Graph", "Scene graph"),
         ("2D", "camera/image"),
         ("2D", "camera/depth"),
-        ("Graph", "scene/graph"),
+        ("TextDocument", "Scene"),
         ("TimeSeries", "imu/data gyroscope"),
         ("TimeSeries", "imu/data accelerometer"),
         ("TimeSeries", "Latency"),

@@ -8,9 +8,22 @@ from dataflow.view.visualizers import (
     objects,
     poses,
     ranging,
+    scene_graphs,
     semantics,
     status,
     values,
 )
 
-__all__ = ["cameras", "clouds", "fallback", "maps", "objects", "poses", "ranging", "semantics", "status", "values"]
+__all__ = [
+    "cameras",
+    "clouds",
+    "fallback",
+    "maps",
+    "objects",
+    "poses",
+    "ranging",
+    "scene_graphs",
+    "semantics",
+    "status",
+    "values",
+]

@@ -11,25 +11,53 @@ import rerun as rr
 from dataflow.messages import Clusters, PointCloud
 from dataflow.view import colors
 from dataflow.view.canvas import Canvas, visualizer
+from dataflow.view.keeping import KeptPoints
+from dataflow.view.scene import TIMELINE
 
 _FARTHEST = 1e30  # metres
 
 
 @visualizer(PointCloud, "space")
 def point_cloud(canvas: Canvas, message: PointCloud) -> None:
-    """The points in their own colours, else by intensity, else by height (by distance in an optical frame)."""
+    """The points in their own colours, else by intensity, else by height (by distance in an optical frame).
+
+    Of a stream that the graph keeps, those that were not seen before, which the view then shows for ever.
+    """
+    if canvas.stream in canvas.scene.layout.kept:
+        _kept(canvas, message)
+        return
     kept = thin(canvas, np.flatnonzero(np.isfinite(message.points).all(axis=1)))
-    points = message.points[kept]
-    if message.colors is not None:
-        paint = message.colors[kept]
-    elif message.intensities is not None:
-        paint = colors.of_values(message.intensities[kept])
-    else:
-        paint = colors.of_values(points[:, 2])
+    points, paint = message.points[kept], _paint(message, kept)
     step = np.float32(canvas.scene.options.point_step)
     drawn = np.round(points / step) * step if step else points
     canvas.draw("space", message.frame, rr.Points3D(drawn, colors=paint, radii=rr.Radius.ui_points(1.5)))
     canvas.scene.saw_points(message.frame, points[::16])
+
+
+def _paint(message: PointCloud, chosen: npt.NDArray[np.int64]) -> colors.Colors:
+    if message.colors is not None:
+        return message.colors[chosen]
+    if message.intensities is not None:
+        return colors.of_values(message.intensities[chosen])
+    return colors.of_values(message.points[chosen, 2])
+
+
+def _kept(canvas: Canvas, message: PointCloud) -> None:
+    """Draws, in the root frame, what fills cells of space that had no point yet."""
+    scene, options = canvas.scene, canvas.scene.options
+    scene.see(canvas.recording, message.frame, canvas.stamp)
+    there = scene.remembered.setdefault((canvas.entity, "kept"), KeptPoints(options.kept_step, options.kept_after))
+    chosen = np.flatnonzero(np.isfinite(message.points).all(axis=1))
+    points = message.points[chosen].astype(np.float64)
+    scene.saw_points(message.frame, points[::16])
+    paint = _paint(message, chosen)
+    for stamp, placed, painted in there.add(canvas.stamp, message.frame, points, paint, scene.tree.pose_at):
+        drawn = np.round(placed * 128) / 128  # 8 mm: packs better
+        scene.kept_points(placed)
+        canvas.recording.set_time(TIMELINE, timestamp=np.datetime64(stamp, "ns"))
+        canvas.draw("space/kept", scene.tree.root or message.frame,
+                    rr.Points3D(drawn, colors=painted, radii=rr.Radius.ui_points(1.5)))  # fmt: skip
+    canvas.recording.set_time(TIMELINE, timestamp=np.datetime64(canvas.stamp, "ns"))
 
 
 @visualizer(Clusters, "space")

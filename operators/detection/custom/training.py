@@ -21,6 +21,7 @@ from operators.detection.custom.network import ANCHORS_PER_CELL, STRIDES, GridDe
 from operators.training.augmentation import Variation, fitted, tensor_of, warp
 from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
+from operators.training.network_weights import begin_with, fitting_facts, sample_images
 
 KIND = "detector"
 STEP = 16
@@ -72,6 +73,23 @@ class DetectorTask:
     def samples(self) -> int:
         return len(self.data.training)
 
+    def begin_with(self, file: Path) -> None:
+        """Begins with weights and anchors of a network file. Raises `TrainingFileError` where they do not fit."""
+        self.take_anchors(file)
+        begin_with(self.detector, file, sample_images(self))
+
+    def take_anchors(self, file: Path) -> None:
+        """Takes the anchors of a network file of this kind, scaled to this input."""
+        facts = fitting_facts(
+            file, kind=KIND, architecture=self._name, classes=list(self.data.classes), strides=list(self.strides)
+        )
+        scale = np.array(self.size, np.float32) / (facts["width"], facts["height"])
+        self.anchors = np.asarray(facts["anchors"], np.float32) * scale.astype(np.float32)
+
+    @property
+    def _name(self) -> str:
+        return f"{self.architecture}-{self.width:g} fpn grid"
+
     def description(self) -> dict[str, Any]:
         return {
             "classes": list(self.data.classes),
@@ -122,7 +140,7 @@ class DetectorTask:
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
         described = {
             "kind": KIND,
-            "architecture": f"{self.architecture}-{self.width:g} fpn grid",
+            "architecture": self._name,
             "classes": list(self.data.classes),
             "width": self.size[0],
             "height": self.size[1],

@@ -1,0 +1,187 @@
+"""Scene graphs for people: of hundreds of relations the few that are worth telling, as data and in words."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dataflow.messages.scene import Activity, SceneGraph
+
+AGENTS = frozenset(("person", "human", "pedestrian", "robot", "ball", "dog", "cat", "car", "bicycle"))
+"""Classes of nodes that act or move."""
+
+PEOPLE = frozenset(("person", "human", "pedestrian"))
+
+PLACES = frozenset(("room", "floor", "ground", "ceiling", "wall", "building", "place"))
+"""Classes of nodes that the others are in; they are drawn as outlines."""
+
+CARRYING = ("part_of", "sitting_on", "in", "on", "held_by")
+"""Predicates that say what carries a node; of equal scores, the first counts."""
+
+HEADS_FOR = "heads_for"
+"""The predicate of an intention: its score is the probability of the goal."""
+
+SURROUNDINGS = frozenset(("near", "left_of", "right_of", "in_front_of", "behind"))
+"""Predicates that hold between so many nodes that they say little."""
+
+LEAST = 0.5
+"""Score from which a relation is told; of an intention any."""
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """A relation between two nodes, by index. `score` is 1 where the graph has none."""
+
+    subject: int
+    predicate: str
+    object: int
+    score: float
+
+
+@dataclass(frozen=True, slots=True)
+class SceneSummary:
+    """The relations of a graph that are worth telling.
+
+    - `carriers`: by node, what it stands on, lies in or sits on: one relation at most, without loops.
+    - `telling`: the others, those of agents first, then by score.
+    - `intentions`: where agents may be going, likeliest first.
+    """
+
+    carriers: Mapping[int, Told]
+    telling: tuple[Told, ...]
+    intentions: tuple[Told, ...]
+
+    def carried(self, node: int) -> tuple[int, ...]:
+        """The nodes that `node` carries, by index."""
+        return tuple(child for child, relation in self.carriers.items() if relation.object == node)
+
+
+def class_names(graph: SceneGraph) -> tuple[str, ...]:
+    """The class name of each node; its number where classes have no names."""
+    return tuple(graph.class_names[c] if graph.class_names else str(c) for c in graph.class_ids.tolist())
+
+
+def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
+    """Chooses what to tell of a graph: who carries what, intentions, and at most `most` other relations.
+
+    Of the others the commonest predicates are left out first, `near` and its like always unless an agent is in it and
+    there is nothing else.
+    """
+    classes = class_names(graph)
+    scores = [1.0] * len(graph.subjects) if graph.relation_scores is None else graph.relation_scores.tolist()
+    every = [Told(s, p, o, score) for (s, p, o), score in zip(graph.relations(), scores, strict=True) if s != o]
+    carriers = _carriers([r for r in every if r.predicate in CARRYING and r.score >= LEAST])
+    intentions = sorted((r for r in every if r.predicate == HEADS_FOR), key=lambda r: (r.subject, -r.score))
+    rest = [
+        r
+        for r in every
+        if r.predicate not in CARRYING and r.predicate != HEADS_FOR and r.score >= LEAST
+        and r.predicate not in SURROUNDINGS
+    ]  # fmt: skip
+    counts = Counter(r.predicate for r in rest)
+    while len(rest) > most and len(counts) > 1:
+        commonest = counts.most_common(1)[0][0]
+        del counts[commonest]
+        rest = [r for r in rest if r.predicate != commonest]
+    rest.sort(key=lambda r: (classes[r.subject] not in AGENTS, -r.score, r.subject, r.object))
+    return SceneSummary(carriers, tuple(rest[:most]), tuple(intentions))
+
+
+def _carriers(relations: Sequence[Told]) -> dict[int, Told]:
+    """The strongest carrier of each node; a relation that would close a loop is left out."""
+    carriers: dict[int, Told] = {}
+    for relation in sorted(relations, key=lambda r: (-r.score, CARRYING.index(r.predicate), r.subject, r.object)):
+        if relation.subject in carriers:
+            continue
+        node: int | None = relation.object
+        while node is not None and node != relation.subject:
+            node = carriers[node].object if node in carriers else None
+        if node is None:
+            carriers[relation.subject] = relation
+    return dict(sorted(carriers.items()))
+
+
+def doing(activities: Activity | None) -> dict[int, tuple[str, float]]:
+    """The activity and its score by the id of who does it."""
+    if activities is None:
+        return {}
+    names = activities.class_names
+    rows = zip(activities.subjects.tolist(), activities.class_ids.tolist(), activities.scores.tolist(), strict=True)
+    return {subject: (names[c] if names else str(c), score) for subject, c, score in rows}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A line about a node: its name, and what there is to say of it."""
+
+    name: str
+    text: str
+
+
+def agents_in_words(graph: SceneGraph, summary: SceneSummary, activities: Activity | None = None) -> list[Row]:
+    """A row for each agent: its activity, what it is on, holds or heads for."""
+    names, classes, acts = graph.names(), class_names(graph), doing(activities)
+    rows = []
+    for node, (name, what) in enumerate(zip(names, classes, strict=True)):
+        identity = int(graph.ids[node])
+        if what not in AGENTS and identity not in acts:
+            continue
+        words = []
+        if identity in acts:
+            words.append(f"{spaced(acts[identity][0])} {percent(acts[identity][1])}")
+        related = [r for r in summary.telling if r.subject == node]
+        if node in summary.carriers:
+            related.insert(0, summary.carriers[node])
+        words += [f"{spaced(r.predicate)} {names[r.object]}" for r in related]
+        words += [f"heads for {names[r.object]} ({percent(r.score)})" for r in summary.intentions if r.subject == node]
+        rows.append(Row(name, ", ".join(words)))
+    return sorted(rows, key=lambda row: (row.name.split()[0] not in PEOPLE, not row.text))
+
+
+def carriers_in_words(graph: SceneGraph, summary: SceneSummary) -> list[Row]:
+    """A row for each thing that others are in or on: "12 books, mug 3"; places last, with what stands there alone."""
+    names, classes = graph.names(), class_names(graph)
+    rows, bare = [], []
+    for node in range(graph.count):
+        children = [child for child in summary.carried(node) if classes[child] not in AGENTS | PLACES]
+        if classes[node] in PLACES:
+            alone = [c for c in children if not summary.carried(c)]
+            bare += [Row(names[node], grouped([names[c] for c in alone], [classes[c] for c in alone]))] if alone else []
+            continue
+        if children:
+            ways = dict.fromkeys(summary.carriers[child].predicate for child in children)
+            words = []
+            for way in ways:
+                part = [c for c in children if summary.carriers[c].predicate == way]
+                words.append(f"{spaced(way)} it {grouped([names[c] for c in part], [classes[c] for c in part])}")
+            rows.append(Row(names[node], "; ".join(words)))
+    return rows + bare
+
+
+def grouped(names: Sequence[str], classes: Sequence[str]) -> str:
+    """Names of things, several of a class by their number: "12 books, mug 3"."""
+    kinds: dict[str, list[str]] = {}
+    for name, kind in zip(names, classes, strict=True):
+        kinds.setdefault(kind, []).append(name)
+    parts = [(len(several), several[0] if len(several) == 1 else f"{len(several)} {plural(kind)}")
+             for kind, several in kinds.items()]  # fmt: skip
+    return ", ".join(text for _, text in sorted(parts, key=lambda part: -part[0]))
+
+
+def plural(word: str) -> str:
+    """The plural of the name of a class, as English forms it most often."""
+    if word == "person":
+        return "people"
+    if word.endswith("shelf"):
+        return word[:-1] + "ves"
+    return word + ("es" if word.endswith(("s", "x", "ch", "sh")) else "s")
+
+
+def spaced(word: str) -> str:
+    """A predicate or an activity as words: "heads_for" is "heads for"."""
+    return word.replace("_", " ")
+
+
+def percent(score: float) -> str:
+    return f"{round(100 * score)} %"

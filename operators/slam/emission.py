@@ -1,0 +1,76 @@
+"""The messages that every SLAM makes of its map."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dataflow.messages import Diagnostics, Message, Odometry, Path, Transforms
+from dataflow.messages.diagnostics import Level
+from dataflow.messages.geometry import matrix_to_quaternion
+from operators.geometry.se3 import Matrix, about_fixed_axes
+from operators.slam.place import Place
+from operators.slam.place_graph import PlaceGraph
+
+LEVELS = {
+    Place.MAPPED: Level.OK,
+    Place.CORRECTED: Level.OK,
+    Place.SEARCHING: Level.WARN,
+    Place.ADRIFT: Level.WARN,
+}
+
+
+def corrections(
+    odometry: Odometry, T_odom: Matrix, T_map_odom: Matrix, covariance: Matrix, map_frame: str
+) -> dict[str, Message]:
+    """Returns the ports `correction` and `pose` where the odometry says `T_odom` (4, 4).
+
+    The covariance (6, 6) is of the pose's right perturbation.
+    """
+    T = T_map_odom @ T_odom
+    return {
+        "correction": Transforms.from_matrix(
+            T_map_odom, stamp=odometry.stamp, frame=map_frame, child_frame=odometry.frame
+        ),
+        "pose": Odometry.from_matrix(
+            T,
+            stamp=odometry.stamp,
+            frame=map_frame,
+            child_frame=odometry.child_frame,
+            linear=odometry.linear,
+            angular=odometry.angular,
+            pose_covariance=about_fixed_axes(covariance, T),
+        ),
+    }
+
+
+def path_of(poses: list[Matrix], map_frame: str, stamp: int) -> Path:
+    """Returns keyframes as the map has them."""
+    T = np.array(poses)
+    return Path(stamp=stamp, frame=map_frame, positions=T[:, :3, 3], orientations=matrix_to_quaternion(T))
+
+
+def map_poses(graph: PlaceGraph[Any]) -> list[Matrix]:
+    """Returns the poses of the nodes whose place in the map is known."""
+    return [node.T for node in graph.nodes.values() if node.island in graph.tied]
+
+
+def sizes(graph: PlaceGraph[Any]) -> dict[str, int]:
+    """Returns the number of keyframes, and of those that keep a view."""
+    nodes = graph.nodes.values()
+    return {"keyframes": len(nodes), "views": sum(node.view is not None for node in nodes)}
+
+
+def status_of(name: str, place: Place, reason: str, counts: Mapping[str, int], odometry: Diagnostics) -> Diagnostics:
+    """Returns the map's state, then the odometry's: one entry, with values."""
+    return Diagnostics(
+        stamp=odometry.stamp,
+        names=(name, *odometry.names),
+        messages=(f"{place}: {reason}", *odometry.messages),
+        levels=np.array([LEVELS[place], *odometry.levels], np.uint8),
+        keys=(*counts, *odometry.keys),
+        values=(*map(str, counts.values()), *odometry.values),
+        owners=np.array([0] * len(counts) + [1] * len(odometry.keys), np.int32),
+    )

@@ -1,0 +1,126 @@
+"""What is told of a scene graph: who carries what, who does what and where to; not what is near what."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataflow.messages import Activity, SceneGraph
+from dataflow.messages.scene_summary import (
+    CARRYING,
+    LEAST,
+    agents_in_words,
+    carriers_in_words,
+    grouped,
+    plural,
+    summarize,
+)
+
+Relation = tuple[int, str, int, float]
+
+
+def graph(classes: str, *relations: Relation) -> SceneGraph:
+    """Nodes of these classes with ids 1, 2, ...; relations by index."""
+    words = classes.split()
+    names = tuple(dict.fromkeys(words))
+    return SceneGraph(
+        stamp=0,
+        frame="map",
+        class_names=names,
+        predicates=tuple(p for _, p, _, _ in relations),
+        ids=np.arange(1, len(words) + 1),
+        class_ids=np.array([names.index(word) for word in words], np.int32),
+        positions=np.zeros((len(words), 3)),
+        sizes=np.ones((len(words), 3)),
+        subjects=np.array([s for s, _, _, _ in relations], np.int32),
+        objects=np.array([o for _, _, o, _ in relations], np.int32),
+        relation_scores=np.array([score for _, _, _, score in relations], np.float32),
+    )
+
+
+def test_a_thing_is_carried_by_the_likeliest_alone() -> None:
+    told = summarize(graph("mug table shelf", (0, "on", 1, 0.7), (0, "in", 2, 0.9), (1, "on", 2, 0.4)))
+    assert {child: (r.predicate, r.object) for child, r in told.carriers.items()} == {0: ("in", 2)}
+    assert told.carried(2) == (0,)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 5), st.sampled_from(CARRYING), st.integers(0, 5), st.floats(0, 1)), max_size=30)
+)
+def test_nothing_carries_itself_by_whatever_way(relations: list[Relation]) -> None:
+    told = summarize(graph("box box box box box box", *relations))
+    for start in told.carriers:
+        node, seen = start, set[int]()
+        while node in told.carriers:
+            assert node not in seen
+            seen.add(node)
+            node = told.carriers[node].object
+    for child, relation in told.carriers.items():
+        assert relation.subject == child
+        assert relation.score >= np.float32(LEAST)
+        assert (child, relation.predicate, relation.object) in {(s, p, o) for s, p, o, _ in relations}
+
+
+def test_what_holds_between_almost_all_is_not_told() -> None:
+    near = [(a, "near", b, 1.0) for a in range(4) for b in range(a)]
+    told = summarize(graph("mug mug mug person", *near, (3, "holding", 1, 0.8), (0, "under", 2, 0.4)))
+    assert [(r.subject, r.predicate, r.object) for r in told.telling] == [(3, "holding", 1)]
+
+
+def test_the_commonest_predicates_give_way_and_agents_come_first() -> None:
+    many = [(a, "touching", b, 1.0) for a in range(6) for b in range(6) if a != b]
+    told = summarize(
+        graph("mug mug mug mug mug mug person", *many, (0, "above", 1, 0.9), (6, "facing", 1, 0.6)), most=4
+    )
+    assert [r.predicate for r in told.telling] == ["facing", "above"]
+
+
+def test_intentions_are_told_however_unlikely_and_the_likeliest_first() -> None:
+    told = summarize(graph("person chair door", (0, "heads_for", 1, 0.2), (0, "heads_for", 2, 0.7)))
+    assert [(r.object, round(r.score, 1)) for r in told.intentions] == [(2, 0.7), (1, 0.2)]
+    assert not told.telling
+
+
+def test_people_come_with_what_they_do_and_where_they_go() -> None:
+    scene = graph("ball person chair", (1, "heads_for", 2, 0.76), (0, "on", 2, 0.9))
+    acts = Activity(
+        stamp=0,
+        class_names=("walking", "resting"),
+        subjects=np.array([2, 1]),
+        class_ids=np.array([0, 1], np.int32),
+        scores=np.array([0.9, 0.5], np.float32),
+    )
+    rows = agents_in_words(scene, summarize(scene), acts)
+    assert [(row.name, row.text) for row in rows] == [
+        ("person 2", "walking 90 %, heads for chair 3 (76 %)"),
+        ("ball 1", "resting 50 %, on chair 3"),
+    ]
+
+
+def test_what_is_carried_is_grouped_by_class_and_the_floor_has_what_stands_alone() -> None:
+    scene = graph(
+        "floor table book book mug lamp",
+        (1, "on", 0, 0.9), (2, "on", 1, 0.9), (3, "on", 1, 0.9), (4, "in", 1, 0.9), (5, "on", 0, 0.9),
+    )  # fmt: skip
+    rows = carriers_in_words(scene, summarize(scene))
+    assert [(row.name, row.text) for row in rows] == [
+        ("table 2", "on it 2 books; in it mug 5"),
+        ("floor 1", "lamp 6"),
+    ]
+
+
+def test_groups_are_in_english() -> None:
+    assert [plural(word) for word in ("person", "shelf", "box", "bench", "mug")] == [
+        "people", "shelves", "boxes", "benches", "mugs",
+    ]  # fmt: skip
+    assert grouped(["mug 1", "box 2", "box 3"], ["mug", "box", "box"]) == "2 boxes, mug 1"
+
+
+def test_a_graph_without_names_and_scores_is_told_too() -> None:
+    scene = SceneGraph(
+        stamp=0, frame="", predicates=("on",), ids=np.array([7, 8]), class_ids=np.array([0, 3], np.int32),
+        positions=np.zeros((2, 3)), sizes=np.ones((2, 3)), subjects=np.array([0], np.int32),
+        objects=np.array([1], np.int32),
+    )  # fmt: skip
+    assert [(row.name, row.text) for row in carriers_in_words(scene, summarize(scene))] == [("3 8", "on it 0 7")]

@@ -1,0 +1,57 @@
+"""Points that stay: placed by the pose of their own stamp, one a cell, none of what moves."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dataflow.view.keeping import KeptPoints, Points
+
+
+def still(frame: str, stamp: int) -> Points:
+    return np.eye(4)
+
+
+def drawn(kept: KeptPoints, stamp: int, points: list[list[float]]) -> list[list[float]]:
+    given = np.array(points, np.float64)
+    paint = np.zeros((len(given), 3), np.uint8)
+    return [row for _, placed, _ in kept.add(stamp, "sensor", given, paint, still) for row in placed.tolist()]
+
+
+def test_a_cell_counts_once_and_only_when_it_was_seen_often_enough() -> None:
+    kept = KeptPoints(step=0.1, after=3)
+    seen = [drawn(kept, t, [[1.01, 0.0, 0.0], [1.02, 0.0, 0.0]]) for t in range(6)]
+    assert seen == [[], [], [[1.01, 0.0, 0.0]], [], [], []]
+
+
+def test_what_moves_leaves_no_points() -> None:
+    kept = KeptPoints(step=0.05, after=3)
+    moving = [drawn(kept, t, [[0.1 * t, 0.0, 0.0], [0.0, 5.0, 0.0]]) for t in range(20)]
+    assert [point for found in moving for point in found] == [[0.0, 5.0, 0.0]]
+
+
+def test_a_cloud_waits_for_the_pose_of_its_own_stamp() -> None:
+    poses: dict[int, Points] = {}
+    kept = KeptPoints(step=0.1, after=1)
+    point, paint = np.array([[1.0, 0.0, 0.0]]), np.array([[9, 8, 7]], np.uint8)
+    assert list(kept.add(10, "sensor", point, paint, lambda frame, stamp: poses.get(stamp))) == []
+    poses[10] = np.eye(4)
+    poses[10][:3, 3] = (0.0, 2.0, 0.0)
+    ((stamp, placed, painted),) = kept.add(20, "sensor", point, paint, lambda frame, stamp: poses.get(stamp))
+    assert stamp == 10
+    assert placed.tolist() == [[1.0, 2.0, 0.0]]
+    assert painted.tolist() == [[9, 8, 7]]
+
+
+def test_clouds_whose_pose_never_comes_do_not_pile_up() -> None:
+    kept = KeptPoints(step=0.1, after=1)
+    point, paint = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
+    for stamp in range(100):
+        assert list(kept.add(stamp, "sensor", point, paint, lambda frame, stamp: None)) == []
+    found = list(kept.add(100, "sensor", point, paint, still))
+    assert len(found) == 1, "one cell, however many clouds had waited"
+    assert found[0][0] > 80
+
+
+def test_points_too_far_off_for_a_cell_are_left_out() -> None:
+    kept = KeptPoints(step=0.001, after=1)
+    assert drawn(kept, 0, [[1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]) == [[0.0, 0.0, 0.0]]
