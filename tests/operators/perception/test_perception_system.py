@@ -115,6 +115,7 @@ def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room)
             result = system.process(stamp, image=step["image"].data, depth=step["depth"].data)
     assert result.pose is not None
     assert result.masks is result.segmentation is not None
+    assert {"odometry", "lifter", "objects"} <= result.status.keys()
     assert {"cloud", "detections", "tracks", "boxes", "objects", "graph"} <= result.made().keys()
 
 
