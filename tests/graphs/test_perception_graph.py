@@ -65,4 +65,4 @@ def test_real_frames_become_a_scene_graph_that_verifies(
     assert dataflow.verify(file, jobs=1).identical
     last = dataflow.open(file)["robot1/perception/scene/graph"][-1]
     assert isinstance(last, SceneGraph)
-    assert must <= {label.partition(" ")[0] for label in last.labels()}
+    assert must <= {last.class_names[c] for c in last.class_ids.tolist()}
