@@ -1,6 +1,7 @@
 """Scores and times the shipped networks on simulated worlds that they have not seen, and on the bundled recording.
 
-python benchmarks/networks.py [--worlds 12] [--frames 16] [--size 640x480 320x240] [--write]
+python benchmarks/networks.py [--worlds 12] [--frames 16] [--size 640x480 320x240] [--focals 0.5 1.2] [--before FOLDER]
+                              [--write]
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +30,7 @@ from operators.detection.decode import Candidates
 from operators.segmentation import Segmenter
 from operators.segmentation.score import Confusion, confusion, mean_iou, named
 from operators.sources.simulator.classes import CLASSES, THINGS
-from operators.training.simulated_worlds import HELD_OUT, TRAINING, VALIDATION, WorldImage, render, worlds
+from operators.training.simulated_worlds import FOCAL, HELD_OUT, TRAINING, VALIDATION, WorldImage, render, worlds
 from operators.weights import read_facts, shipped
 
 VISIBLE, PIXELS = 0.6, 200
@@ -38,6 +39,7 @@ VGA = 640 * 480
 REPOSITORY = Path(__file__).resolve().parent.parent
 RECORDING, RECORDED = REPOSITORY / "recordings" / "demo.mcap", "recordings/demo.mcap"
 REPORT = Path(__file__).with_suffix(".md")
+Pair = tuple[CustomDetector, Segmenter]
 
 
 @dataclass
@@ -46,6 +48,7 @@ class WorldScore:
 
     name: str
     scored: list[ScoredImage] = field(default_factory=list)
+    all_counted: list[ScoredImage] = field(default_factory=list)
     table: Confusion = field(default_factory=lambda: np.zeros((len(CLASSES), len(CLASSES) + 1), np.int64))
     detector_ms: list[float] = field(default_factory=list)
     segmenter_ms: list[float] = field(default_factory=list)
@@ -77,6 +80,7 @@ def add(score: WorldScore, taken: WorldImage, detector: CustomDetector, segmente
     ignored = (truth.visible < VISIBLE) | (truth.pixel_counts < least)
     boxes = Candidates(found.boxes, found.scores, found.class_ids)
     score.scored.append(ScoredImage(truth.boxes, truth.class_ids, ignored, boxes))
+    score.all_counted.append(ScoredImage(truth.boxes, truth.class_ids, np.zeros_like(ignored), boxes))
     score.table += confusion(taken.masks.classes.astype(np.uint8), classes.classes.astype(np.uint8), len(CLASSES))
 
 
@@ -101,7 +105,7 @@ def recorded(file: Path) -> Iterator[WorldImage]:
                 yield WorldImage("recorded", 0, decoder.process(image), objects, masks)
 
 
-def opened(detector_file: Path, segmenter_file: Path) -> tuple[CustomDetector, Segmenter]:
+def opened(detector_file: Path, segmenter_file: Path) -> Pair:
     detector = CustomDetector(weights=str(detector_file), score_threshold=0.01)
     segmenter = Segmenter(weights=str(segmenter_file))
     detector.setup()
@@ -131,15 +135,28 @@ def time_together(detector: CustomDetector, segmenter: Segmenter, rounds: int) -
 
 
 def score_worlds(
-    count: int, frames: int, size: tuple[int, int], detector: CustomDetector, segmenter: Segmenter
-) -> list[WorldScore]:
-    scores, console = [], Console(stderr=True)
-    for world, seed in track(worlds(HELD_OUT, count), description=f"worlds at {size[0]}x{size[1]}", console=console):
-        score = WorldScore(f"{world} {seed}")
-        for taken in render(world, seed, frames, size, varied=False):
-            add(score, taken, detector, segmenter)
-        scores.append(score)
+    chosen: list[tuple[str, int]], frames: int, size: tuple[int, int], focal: float, pairs: Sequence[Pair]
+) -> list[list[WorldScore]]:
+    """Scores of each pair of operators, all on the same images: for each pair, a score of each world."""
+    scores: list[list[WorldScore]] = [[] for _ in pairs]
+    told = f"worlds at {size[0]}x{size[1]}, focal length {focal}"
+    for world, seed in track(chosen, description=told, console=Console(stderr=True)):
+        mine = [WorldScore(f"{world} {seed}") for _ in pairs]
+        for taken in render(world, seed, frames, size, varied=False, focal=focal):
+            for score, (detector, segmenter) in zip(mine, pairs, strict=True):
+                add(score, taken, detector, segmenter)
+        for kept, score in zip(scores, mine, strict=True):
+            kept.append(score)
     return scores
+
+
+def score_recording(file: Path, pairs: Sequence[Pair]) -> list[list[WorldScore]]:
+    """The same on the images of a recording, as one world."""
+    mine = [WorldScore(RECORDED) for _ in pairs]
+    for taken in recorded(file):
+        for score, (detector, segmenter) in zip(mine, pairs, strict=True):
+            add(score, taken, detector, segmenter)
+    return [[score] for score in mine]
 
 
 def summary(scores: list[WorldScore]) -> dict[str, Any]:
@@ -147,6 +164,7 @@ def summary(scores: list[WorldScore]) -> dict[str, Any]:
     every = [image for score in scores for image in score.scored]
     table: Confusion = np.sum([score.table for score in scores], axis=0)
     pooled = score_detections(every, THINGS)
+    whole = score_detections([image for score in scores for image in score.all_counted], THINGS)
     ap50, miou = {s.name: s.ap50 for s in scores}, {s.name: s.miou for s in scores}
     detector, segmenter = ([t for s in scores for t in times] for times in _times(scores))
     together = np.add(detector, segmenter)
@@ -158,6 +176,7 @@ def summary(scores: list[WorldScore]) -> dict[str, Any]:
         "ap50_worst": min(ap50.items(), key=lambda item: item[1]),
         "ap50_pooled": pooled.ap50,
         "ap_pooled": pooled.ap,
+        "nothing_ignored": {"objects": whole.objects, "ap50": whole.ap50, "ap": whole.ap},
         "ap50_of_worlds": ap50,
         "ap50_of_classes": pooled.per_class,
         "miou": float(np.mean(list(miou.values()))),
@@ -177,7 +196,7 @@ def _times(scores: list[WorldScore]) -> tuple[list[list[float]], list[list[float
 
 
 def markdown(
-    found: dict[str, dict[str, Any]], together: dict[str, list[float]], files: dict[str, Path], command: str
+    found: dict[str, list[dict[str, Any]]], together: dict[str, list[float]], files: dict[str, Path], command: str
 ) -> str:
     """The report."""
     lines = ["# The networks that come with the project", "", "    " + command, ""]
@@ -205,10 +224,27 @@ def markdown(
     lines += ["", "| both networks, a VGA image | ms, median | tenth percentile | least |", "|---|---|---|---|"]
     for name, times in together.items():
         lines.append(f"| {name} | {np.median(times):.1f} | {np.percentile(times, 10):.1f} | {min(times):.1f} |")
-    lines.append("")
-    for title, figures in found.items():
-        lines += _figures(title, figures)
+    lines += ["", *_overview(found)]
+    for title, (figures, *_) in found.items():
+        if f"focal length {FOCAL}" in title or RECORDED in title:
+            lines += _figures(title, figures)
     return "\n".join(lines)
+
+
+def _overview(found: dict[str, list[dict[str, Any]]]) -> list[str]:
+    """One row for each set of images; where files were given to compare with, theirs below."""
+    lines = ["## At a glance", "", "All images of a row pooled.", ""]
+    lines += [
+        "| images | AP50 | AP | AP50, nothing ignored | AP, nothing ignored | mIoU |",
+        "|---|---|---|---|---|---|",
+    ]
+    for title, several in found.items():
+        for k, figures in enumerate(several):
+            whole = figures["nothing_ignored"]
+            values = (figures["ap50_pooled"], figures["ap_pooled"], whole["ap50"], whole["ap"], figures["miou_pooled"])
+            name = title if k == 0 else "– the networks before"
+            lines.append(f"| {name} | " + " | ".join(f"{value:.3f}" for value in values) + " |")
+    return [*lines, ""]
 
 
 def _figures(title: str, figures: dict[str, Any]) -> list[str]:
@@ -219,7 +255,8 @@ def _figures(title: str, figures: dict[str, Any]) -> list[str]:
     lines = [
         f"## {title}",
         "",
-        f"{figures['images']} images with {figures['objects']} objects that count.",
+        f"{figures['images']} images with {figures['objects']} objects that count, of "
+        f"{figures['nothing_ignored']['objects']} of which any pixel shows.",
         "",
         "| | mean over worlds | worst world | all images pooled | ms an image, median | least |",
         "|---|---|---|---|---|---|",
@@ -256,29 +293,36 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=12)
     parser.add_argument("--frames", type=int, default=16, help="images of each world")
     parser.add_argument("--size", nargs="*", default=["640x480", "320x240"])
+    parser.add_argument(
+        "--focals", nargs="*", type=float, default=[0.5, 0.7, 1.0, 1.2], help="further focal lengths, at the first size"
+    )
+    parser.add_argument("--focal-frames", type=int, default=6, help="images of each world at each of them")
     parser.add_argument("--detector", type=Path, default=shipped("detector.onnx"))
     parser.add_argument("--segmenter", type=Path, default=shipped("segmenter.onnx"))
+    parser.add_argument("--before", type=Path, help="folder of a detector.onnx and segmenter.onnx to score beside them")
     parser.add_argument("--write", action="store_true", help=f"write {REPORT.name} beside this script")
     options = parser.parse_args()
-    detector, segmenter = opened(options.detector, options.segmenter)
-    one_by_one, at_once = time_together(detector, segmenter, 60)
+    pairs = [opened(options.detector, options.segmenter)]
+    one_by_one, at_once = time_together(*pairs[0], 60)
+    if options.before is not None:
+        pairs.append(opened(options.before / "detector.onnx", options.before / "segmenter.onnx"))
     together = {"one after the other, on one core": one_by_one, "at once, on two cores": at_once}
-    found = {}
-    for size in options.size:
-        width, height = map(int, size.split("x"))
-        scores = score_worlds(options.worlds, options.frames, (width, height), detector, segmenter)
-        found[f"{options.worlds} held-out worlds, images of {size}"] = summary(scores)
+    sizes = [(int(width), int(height)) for width, _, height in (size.partition("x") for size in options.size)]
+    sets = [(size, options.frames, FOCAL) for size in sizes]
+    sets += [(sizes[0], options.focal_frames, focal) for focal in options.focals]
+    chosen, found = worlds(HELD_OUT, options.worlds), {}
+    for size, frames, focal in sets:
+        title = f"{options.worlds} held-out worlds, {size[0]}x{size[1]}, focal length {focal}"
+        found[title] = [summary(scores) for scores in score_worlds(chosen, frames, size, focal, pairs)]
     if RECORDING.is_file():
-        score = WorldScore(RECORDED)
-        for taken in recorded(RECORDING):
-            add(score, taken, detector, segmenter)
-        found[f"The bundled recording ({RECORDED}: JPEG, 320x240)"] = summary([score])
+        title = f"The bundled recording ({RECORDED}: JPEG, 320x240)"
+        found[title] = [summary(scores) for scores in score_recording(RECORDING, pairs)]
     least = {name: {"median": float(np.median(times)), "least": min(times)} for name, times in together.items()}
     print(json.dumps({"ms": least, **found}, indent=1))
     if options.write:
         command = (
             f"python benchmarks/networks.py --worlds {options.worlds} --frames {options.frames} "
-            f"--size {' '.join(options.size)} --write"
+            f"--size {' '.join(options.size)} --focals {' '.join(map(str, options.focals))} --write"
         )
         files = {"detector.onnx": options.detector, "segmenter.onnx": options.segmenter}
         REPORT.write_text(markdown(found, together, files, command), encoding="utf-8")

@@ -15,8 +15,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from dataflow.feeds.window import Window
-from dataflow.firing.failure import OperatorFailure
-from dataflow.firing.source import SourceRunner
 from dataflow.firing.threads import limit_threads
 from dataflow.graph.model import Graph
 from dataflow.process.channel import Channel
@@ -223,17 +221,7 @@ class OperatorProcess:
         if self._watch is not None:
             self._watch.stop()
         reading, failures = self.live.await_readers()
-        for maker in self.runners.all:
-            if maker.node.name in reading:
-                continue
-            try:
-                if isinstance(maker, SourceRunner) and not self.config.live:
-                    maker.close_stream()
-                maker.operator.close()
-            except OperatorFailure as failure:
-                failures.append(failure)
-            except Exception as error:
-                failures.append(OperatorFailure(maker.node.name, "close()", error))
+        failures += self.runners.close(but=reading, live=self.config.live)
         for log in self.feeding.logs:
             log.close()
         self.taps.close()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +53,23 @@ class Runners:
         self.ready.add(runner)
         for stream in {s for streams in runner.node.inputs.values() for s in streams}:
             self.consumers.setdefault(stream, []).append(runner)
+
+    def close(self, *, but: Container[str], live: bool) -> list[OperatorFailure]:
+        """Closes every operator but those named; returns what went wrong. A stream that was not read to its end is
+        closed first, in a run that is not live."""
+        failures = []
+        for maker in self.all:
+            if maker.node.name in but:
+                continue
+            try:
+                if isinstance(maker, SourceRunner) and not live:
+                    maker.close_stream()
+                maker.operator.close()
+            except OperatorFailure as failure:
+                failures.append(failure)
+            except Exception as error:
+                failures.append(OperatorFailure(maker.node.name, "close()", error))
+        return failures
 
     def taking(self, stream: str) -> Iterable[Runner]:
         return self.consumers.get(stream, ())

@@ -94,8 +94,9 @@ class Core:
                     part.not_reading(self.run.processes[label], seconds, overflowed=overflowed)
             case HungUp(label):
                 self.run.processes[label].hung_up = self.run.steady
-            case LeftBehind(label, processes):
-                self.run.note(f"process {label!r} left processes behind, which were killed: {', '.join(processes)}")
+            case LeftBehind(labels, processes):
+                who = " or ".join(map(repr, labels))
+                self.run.note(f"process {who} left processes behind, which were killed: {', '.join(processes)}")
             case Remained(label, remains):
                 for part in self._parts:
                     part.remained(self.run.processes[label], remains)

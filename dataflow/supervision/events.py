@@ -88,9 +88,10 @@ class HungUp:
 
 @dataclass(frozen=True, slots=True)
 class LeftBehind:
-    """A process that ended has left others, which were killed: each as "name (process N)"."""
+    """A process that ended, or one of several that ended at once, has left others, which were killed: each as "name
+    (process N)"."""
 
-    label: str
+    labels: tuple[str, ...]
     processes: tuple[str, ...]
 
 

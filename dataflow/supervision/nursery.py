@@ -107,9 +107,9 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Leftovers:
-    """A child has left these processes behind; they were killed."""
+    """A child has left these processes behind, or one of several that ended at once; they were killed."""
 
-    child: Child
+    children: tuple[Child, ...]
     processes: tuple[str, ...]
 
 
@@ -201,7 +201,8 @@ class Nursery:
                 self._children[pid] = child
                 return None
             case "left":
-                return Leftovers(self._children[pid], tuple(fact))
+                processes, others = fact
+                return Leftovers(tuple(self._children[each] for each in (pid, *others)), tuple(processes))
             case _:
                 return End(self._children.pop(pid), int(fact))
 

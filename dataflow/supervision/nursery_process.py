@@ -121,7 +121,8 @@ def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: in
     _, status = os.waitpid(pid, 0)
     if connection is not None:
         if left:
-            _tell(connection, "left", pid, left)
+            others = [children[each] for each in readable(list(children), 0.0)]  # have ended, too: it may be theirs
+            _tell(connection, "left", pid, [left, others])
         _tell(connection, "ended", pid, os.waitstatus_to_exitcode(status))
 
 

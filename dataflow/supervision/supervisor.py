@@ -19,8 +19,8 @@ from dataflow.feeds.playback import Action
 from dataflow.firing.threads import environment
 from dataflow.process.channel import ChannelClosed
 from dataflow.process.speech import heard, shown
-from dataflow.records.black_box import make_black_box, read_black_box
 from dataflow.supervision import commands, events
+from dataflow.supervision.boxes import Boxes
 from dataflow.supervision.compose import core_of
 from dataflow.supervision.configs import configurations
 from dataflow.supervision.early import EarlyNursery
@@ -63,8 +63,7 @@ class Supervisor:
         self.core = core_of(plan, self._processes, configurations(plan, self._processes, self._endpoints))
         self._on_output = on_output or _print
         self._children: dict[str, Child] = {}
-        self._boxes: dict[str, int] = {}
-        """The black boxes of operator processes in a live run: descriptors, by label."""
+        self._boxes = Boxes(plan.graph, self._processes, live=plan.live)
         self._taken_at: dict[str, float] = {}  # label → when the process last took what was queued for it
         self._announced = contextlib.ExitStack()
         self._over: commands.Over | None = None
@@ -186,11 +185,13 @@ class Supervisor:
             self._feed(events.Aborted(str(failure)))
             return
         for each in news:
-            label = next(label for label, child in self._children.items() if child is each.child)
             if isinstance(each, End):
-                self._ended(label, each.code)
+                self._ended(self._label(each.child), each.code)
             else:
-                self._feed(events.LeftBehind(label, each.processes))
+                self._feed(events.LeftBehind(tuple(map(self._label, each.children)), each.processes))
+
+    def _label(self, process: Child) -> str:
+        return next(label for label, child in self._children.items() if child is process)
 
     def _ended(self, label: str, code: int | None) -> None:
         """A process has ended: what it has said and printed until then comes first."""
@@ -204,20 +205,9 @@ class Supervisor:
             self._heard(label, line)
         del self._children[label]
         self._taken_at.pop(label, None)
-        self._read_box(label)
+        if (remains := self._boxes.read(label)) is not None:
+            self._feed(events.Remained(label, remains))
         self._feed(events.Died(label, code))
-
-    def _read_box(self, label: str) -> None:
-        """A process that can be taken the place of has ended: reads the firing records that it left."""
-        box = self._boxes.pop(label, None)
-        if box is None:
-            return
-        try:
-            nodes = self.plan.graph.nodes
-            remains = read_black_box(box, {name: tuple(nodes[name].outputs) for name in self._processes[label].nodes})
-        finally:
-            os.close(box)
-        self._feed(events.Remained(label, remains))
 
     def _read_channel(self, label: str) -> None:
         child = self._children.get(label)
@@ -298,7 +288,7 @@ class Supervisor:
 
     def _spawn(self, label: str) -> None:
         try:
-            box = self._make_box(label)
+            box = self._boxes.make(label)
             child = self._nursery.spawn((*self._rings.handed(label), *box))
         except (NurseryFailed, OSError) as failure:
             self._feed(events.Aborted(str(failure)))
@@ -307,13 +297,6 @@ class Supervisor:
         self._selector.register(child.channel, selectors.EVENT_READ, (label, "channel"))
         assert child.words is not None
         self._selector.register(child.words, selectors.EVENT_READ, (label, "words"))
-
-    def _make_box(self, label: str) -> tuple[int, ...]:
-        """Makes what a process writes its firing records to, where another one may take its place."""
-        if not self.plan.live or self._processes[label].sink is not None:
-            return ()
-        self._boxes[label] = make_black_box()
-        return (self._boxes[label],)
 
     def _flush(self) -> None:
         """Sends what processes take; who takes nothing is looked at again when it does."""
@@ -353,9 +336,7 @@ class Supervisor:
             self._unregister(child)
             child.close()
         self._children.clear()
-        for box in self._boxes.values():
-            os.close(box)
-        self._boxes.clear()
+        self._boxes.close()
 
     def _close_pipe(self) -> None:
         os.close(self._woken)

@@ -29,16 +29,16 @@ from collections.abc import Mapping
 from itertools import count
 from typing import NamedTuple
 
-from dataflow.sync.batch import Batch
+from dataflow.sync.context import Absent, Context
 from dataflow.sync.drops import DropLog
-from dataflow.sync.entries import Drop, DropReason, Entry, Firing, InputValue, Waiting
+from dataflow.sync.entries import Drop, Entry, Firing, FiringKind, Waiting
 from dataflow.sync.join import Join
-from dataflow.sync.lanes import PRUNE_AT, Lane, Role, StreamState
+from dataflow.sync.lanes import Lane, Role, StreamState
 from dataflow.sync.merge import Merge
-from dataflow.sync.sampled import Sampled
 from dataflow.sync.spec import AlignSpec
 from dataflow.sync.stamps import FOREVER, NEVER
 from dataflow.sync.ticks import Ticks
+from dataflow.sync.undecided import Undecided
 
 _NO_NAMES: frozenset[str] = frozenset()
 
@@ -76,22 +76,15 @@ class Aligner:
             self._triggers = Join(triggers, spec.tolerance, self._drop_log.entry)
         else:
             self._triggers = Merge(spec.triggers, triggers, self._drop_log.entry)
-        self._sampled = {s.name: Sampled(s, self._lanes[s.name]) for s in spec.sampled}
-        self._batches = {b.name: Batch(b, self._lanes[b.name], self._drop_log.entry) for b in spec.batches}
-        self._ticks: Ticks | None = None
+        self._context = Context(spec, self._lanes, self._drop_log)
+        ticks: Ticks | None = None
         bounding: list[Lane] = []
         if spec.every is not None:
             bounds = spec.bounds_of_ticks()
             bounding = [lane for name, stream in bounds for lane in self._lanes[name] if lane.state.name == stream]
-            self._ticks = Ticks(spec.every, bounding)
+            ticks = Ticks(spec.every, bounding)
         self._finals = {lane.state.name: lane.state for lane in (*triggers, *bounding)}
-
-        self._stamp: int | None = None  # the first undecided stamp, of a trigger or a tick
-        self._triggered = False  # whether a trigger candidate lies there
-        self._ticked = False  # whether a tick lies there
-        self._ready = False  # whether that is all known
-        self._settled = False  # whether these say what is so: nothing has changed since
-        self._decided = NEVER  # everything at or below is decided, or has been promised downstream
+        self._undecided = Undecided(self._triggers, ticks, triggers)
         self._last_firing = NEVER
         self._finished = False
         self.paused = False
@@ -100,10 +93,7 @@ class Aligner:
     def begin_at(self, stamp: int) -> None:
         """Everything before `stamp` was decided elsewhere, ticks included. To be called before the first `push`;
         messages from before may still be pushed, as partners, samples and parts of batches of what is to come."""
-        self._decided = stamp - 1
-        self._settled = False
-        if self._ticks is not None:
-            self._ticks.begin_at(stamp)
+        self._undecided.begin_at(stamp)
 
     # What streams say
 
@@ -121,7 +111,7 @@ class Aligner:
             for lane in state.lanes:
                 self._drop_log.entry(lane, entry, "late")
             return
-        self._settled = False
+        self._undecided.settled = False
         frontier = entry.stamp
         if state.static:
             self.ends[stream] = StreamEnd(None, "static")
@@ -143,7 +133,7 @@ class Aligner:
         """
         state = self._stream(stream)
         if state.advance(frontier):
-            self._settled = False
+            self._undecided.settled = False
             for lane in state.lanes:
                 lane.raise_frontier(frontier)
 
@@ -158,7 +148,7 @@ class Aligner:
         if state.ended:
             return
         state.end(final_stamp)
-        self._settled = False
+        self._undecided.settled = False
         self.ends[stream] = StreamEnd(state.final, reason)
         for lane in state.lanes:
             lane.raise_frontier(FOREVER)
@@ -172,10 +162,10 @@ class Aligner:
         """
         state = self._stream(stream)
         state.reset(incarnation)
-        self._settled = False
+        self._undecided.settled = False
         self.ends.pop(stream, None)
         for lane in state.lanes:
-            lane.reopen(self._decided)
+            lane.reopen(self._undecided.decided)
 
     # What the process decides when it will not wait
 
@@ -188,32 +178,17 @@ class Aligner:
         moved = [lane for lane in self._lanes[input] if not lane.state.static and frontier > lane.frontier]
         for lane in moved:
             lane.frontier = frontier
-            self._settled = False
+            self._undecided.settled = False
         return bool(moved)
 
     def owed_ticks(self) -> tuple[int, int, int]:
         """The ticks that are due now, with nothing between them: how many, the first and the last."""
-        ticks = self._ticks
-        if ticks is None or self._finished:
-            return 0, NEVER, NEVER
-        self._settle()
-        if not ticks.confirmed:
-            return 0, NEVER, NEVER
-        last = min(ticks.reach, self._triggers.bound)
-        if self._triggers.stamp is not None:
-            last = min(last, self._triggers.stamp)
-        for name in (*self._sampled, *self._batches):
-            last = min(last, *(lane.frontier + lane.delay for lane in self._lanes[name]))
-        return ticks.owed(last)
+        return (0, NEVER, NEVER) if self._finished else self._undecided.owed_ticks(self._context.lanes())
 
     def skip_ticks(self, stamp: int) -> None:
         """Drops the ticks before `stamp` that are not decided yet, as overflow. Live only."""
-        ticks = self._ticks
-        if ticks is None or self._finished:
-            return
-        self._settle()
-        if ticks.confirmed and ticks.stamp < stamp:
-            self._drop_log.ticks(ticks.skip(stamp), "overflow")
+        if not self._finished:
+            self._drop_log.ticks(self._undecided.skip_ticks(stamp), "overflow")
 
     def waiting(self) -> Waiting | None:
         """The first undecided stamp and what it waits for; None if the next message decides.
@@ -223,26 +198,16 @@ class Aligner:
         """
         if self._finished:
             return None
-        self._settle()
-        if self._exhausted():
+        self._undecided.settle()
+        if self._undecided.exhausted():
             return None
-        stamp = self._undecided()
-        needs: dict[str, int] = {}
+        stamp = self._undecided.first_possible()
         if stamp is None:
             held = self._triggers.oldest_wait()
             return Waiting(*held) if held is not None else None
-        if self._triggers.stamp == stamp:
-            needs.update(self._triggers.needs())
-        elif self._triggers.bound < stamp:
-            lagging = [lane for trigger in self.spec.triggers for lane in self._lanes[trigger.name]]
-            needs.update({lane.input: stamp for lane in lagging if lane.frontier < stamp})
-        for name, frontier in self._ticks_need(stamp).items():
+        needs = self._undecided.needs(stamp)
+        for name, frontier in self._context.needs(stamp).items():
             needs[name] = max(frontier, needs.get(name, NEVER))
-        contexts: tuple[Sampled | Batch, ...] = (*self._sampled.values(), *self._batches.values())
-        for context in contexts:
-            need = context.needs(stamp)
-            if need is not None:
-                needs[context.name] = max(need, needs.get(context.name, NEVER))
         for name, frontier in needs.items():
             if any(lane.state.static and lane.frontier < frontier for lane in self._lanes[name]):
                 needs[name] = FOREVER
@@ -259,20 +224,17 @@ class Aligner:
         self.paused = False
         if self._finished:
             return None
+        undecided = self._undecided
         for _ in count() if most is None else range(most):
-            self._settle()
-            stamp = self._stamp
-            if not self._ready or stamp is None:
-                return self._finish() if self._exhausted() else None
-            for context in self._sampled.values():
-                if not context.knows(stamp):
-                    return None
-            for batch in self._batches.values():
-                if not batch.knows(stamp):
-                    return None
+            undecided.settle()
+            stamp = undecided.stamp
+            if not undecided.ready or stamp is None:
+                return self._finish() if undecided.exhausted() else None
+            if not self._context.knows(stamp):
+                return None
             firing = self._fire(stamp)
-            self._settled = False
-            self._decided = stamp
+            undecided.settled = False
+            undecided.decided = stamp
             if firing is not None:
                 self._last_firing = stamp
                 return firing
@@ -286,25 +248,19 @@ class Aligner:
         """
         if self._finished:
             return FOREVER
-        self._settle()
-        if self._exhausted():
-            frontier = self._finish_stamp() - 1
-        else:
-            frontier = self._triggers.bound
-            if self._stamp is not None and self._stamp <= frontier:
-                frontier = self._stamp - 1
-            if self._ticks is not None:
-                frontier = min(frontier, self._ticks.stamp - 1, self._ticks.reach)
-        if frontier > self._decided:
-            self._decided = frontier
-        return self._decided
+        undecided = self._undecided
+        undecided.settle()
+        frontier = self._finish_stamp() - 1 if undecided.exhausted() else undecided.frontier()
+        if frontier > undecided.decided:
+            undecided.decided = frontier
+        return undecided.decided
 
     def idle_frontier(self) -> int:
         """The output frontier, where no firing is held back and none is left: nothing will come before somebody says
         more. NEVER where `poll` is to be asked."""
-        if not self._settled:
-            self._settle()
-        if self._stamp is not None or not self._settled or self._triggers.bound == FOREVER:
+        undecided = self._undecided
+        undecided.settle()
+        if undecided.stamp is not None or not undecided.settled or self._triggers.bound == FOREVER:
             return NEVER
         return self.output_frontier()
 
@@ -345,103 +301,37 @@ class Aligner:
 
     # Deciding
 
-    def _settle(self) -> None:
-        """Finds the first undecided stamp, and whether triggers and ticks there are known."""
-        if self._settled:
-            return
-        triggers = self._triggers
-        triggers.settle()
-        candidate = triggers.stamp
-        ticks = self._ticks
-        if ticks is None:  # else what is known of ticks depends on what is decided, too
-            self._settled = True
-            self._stamp, self._triggered, self._ready = candidate, candidate is not None, triggers.ready
-            return
-        ticks.settle(self._decided)
-        tick = ticks.stamp
-        if candidate is not None and candidate <= tick:
-            self._stamp, self._triggered, self._ticked = candidate, True, candidate == tick
-            self._ready = triggers.ready and (candidate < tick or ticks.confirmed)
-        else:
-            self._stamp, self._triggered, self._ticked = (tick if tick != FOREVER else None), False, True
-            self._ready = ticks.confirmed and triggers.bound >= tick
-
-    def _undecided(self) -> int | None:
-        """The first undecided stamp, or, while ticks have no known start, the first that may be one."""
-        ticks = self._ticks
-        if ticks is None or ticks.started:
-            return self._stamp
-        return min((s for s in (self._triggers.stamp, ticks.latest_start) if s is not None), default=None)
-
-    def _ticks_need(self, stamp: int) -> dict[str, int]:
-        if self._ticks is None:
-            return {}
-        if not self._ticks.started:
-            return self._ticks.needs_to_start(stamp)
-        return self._ticks.needs() if self._ticks.stamp == stamp else {}
-
     def _fire(self, stamp: int) -> Firing | None:
         """The firing at a decided stamp, or None if a required Sampled input is absent: a drop instead."""
-        if not self._sampled and not self._batches:
-            inputs = self._triggers.take() if self._triggered else self._triggers.absent()
-            return Firing(stamp, "fire" if self._triggered else "tick", self._ticked, inputs, _NO_NAMES, _NO_NAMES)
-        context: dict[str, InputValue] = {}
-        stale: list[str] = []
-        late: list[str] = []
-        for name, sampled in self._sampled.items():
-            value = sampled.choose(stamp)
-            if sampled.required and not value:
-                self._reject(stamp, sampled.why_absent(), name)
-                return None
-            context[name] = value
-            if sampled.stale:
-                stale.append(name)
-            if sampled.late:
-                late.append(name)
-        for name, batch in self._batches.items():
-            context[name] = batch.take(stamp, self._last_firing)
-            if batch.late:
-                late.append(name)
-        inputs = self._triggers.take() if self._triggered else self._triggers.absent()
-        if context:
-            inputs.update(context)
-        return Firing(
-            stamp,
-            "fire" if self._triggered else "tick",
-            self._ticked,
-            inputs,
-            frozenset(stale) if stale else _NO_NAMES,
-            frozenset(late) if late else _NO_NAMES,
-        )
-
-    def _reject(self, stamp: int, reason: DropReason, because: str) -> None:
-        if self._triggered:
-            self._triggers.reject(reason, because)
-        if self._ticked:
-            self._drop_log.tick(stamp, reason, because)
-
-    def _exhausted(self) -> bool:
-        """Tells whether nothing is left but the finish."""
-        over = self._stamp is None and self._triggers.bound == FOREVER
-        return over and (self._ticks is None or self._ticks.stamp == FOREVER)
+        undecided, context = self._undecided, self._context
+        kind: FiringKind = "fire" if undecided.triggered else "tick"
+        if context.empty:
+            inputs = self._triggers.take() if undecided.triggered else self._triggers.absent()
+            return Firing(stamp, kind, undecided.ticked, inputs, _NO_NAMES, _NO_NAMES)
+        try:
+            values = context.take(stamp, self._last_firing)
+        except Absent as absent:
+            if undecided.triggered:
+                self._triggers.reject(absent.reason, absent.input)
+            if undecided.ticked:
+                self._drop_log.tick(stamp, absent.reason, absent.input)
+            return None
+        inputs = self._triggers.take() if undecided.triggered else self._triggers.absent()
+        inputs.update(values)
+        return Firing(stamp, kind, undecided.ticked, inputs, context.stale, context.late)
 
     def _finish_stamp(self) -> int:
         if self._finished:
             return self._last_firing
         finals = [state.final for state in self._finals.values() if state.final is not None]
-        reached = max(finals, default=NEVER)
-        reached = max(reached, self._decided)
+        reached = max(*finals, self._undecided.decided) if finals else self._undecided.decided
         return reached + 1 if reached != NEVER else 0
 
     def _finish(self) -> Firing:
         stamp = self._finish_stamp()
-        for batch in self._batches.values():
-            batch.drop_rest()
-        for name in self._sampled:
-            for lane in self._lanes[name]:
-                lane.entries.clear()
+        self._context.finish()
         self._finished = True
-        self._decided = FOREVER
+        self._undecided.decided = FOREVER
         self._last_firing = stamp
         return Firing(stamp, "finish")
 
@@ -460,30 +350,15 @@ class Aligner:
 
     def _push_forced(self, lane: Lane, entry: Entry) -> None:
         """Takes a trigger message that lies below a forced frontier."""
-        if entry.stamp <= max(self._decided, self._triggers.decided):
+        if entry.stamp <= max(self._undecided.decided, self._triggers.decided):
             self._drop_log.entry(lane, entry, "late")
         else:
             lane.entries.append(entry)
 
     def _push_context(self, lane: Lane, entry: Entry) -> None:
+        """Takes a message of a Sampled or Batch input."""
         if self._finished:
             if lane.role == "batch":
                 self._drop_log.entry(lane, entry, "unused")
-            return
-        if lane.state.static and lane.role == "sampled":
-            lane.entries.clear()
-        lane.entries.append(entry)
-        if entry.stamp + lane.delay <= self._last_firing:
-            lane.late = entry.stamp
-            self._drop_log.came_late(lane)
-        if len(lane.entries) > lane.limit:
-            self._prune(lane)
-
-    def _prune(self, lane: Lane) -> None:
-        """Forgets what no firing to come can need. The limit doubles, so the cost per message stays small."""
-        bound = self.output_frontier()
-        if lane.role == "sampled":
-            self._sampled[lane.input].prune(lane, bound)
-        else:
-            self._batches[lane.input].prune(bound)
-        lane.limit = max(PRUNE_AT, 2 * len(lane.entries))
+        elif self._context.push(lane, entry, self._last_firing):
+            self._context.prune(lane, self.output_frontier())

@@ -34,9 +34,10 @@ class SingleAligner(Aligner):
         entries = lane.entries
         if self._finished or not entries or entries[0].stamp > lane.frontier:
             return super().poll(most)
-        self.paused = self._settled = False
+        undecided = self._undecided
+        self.paused = undecided.settled = False
         entry = entries.popleft()
-        stamp = self._decided = self._last_firing = self._triggers.decided = entry.stamp
+        stamp = undecided.decided = self._last_firing = self._triggers.decided = entry.stamp
         value: InputValue = {lane.state.name: entry} if self._many else entry
         return Firing(stamp, "fire", False, {lane.input: value}, _NO_NAMES, _NO_NAMES)
 
@@ -44,6 +45,6 @@ class SingleAligner(Aligner):
         frontier = self._lane.frontier
         if self._lane.entries or frontier == FOREVER or self._finished:
             return NEVER
-        if frontier > self._decided:
-            self._decided = frontier
-        return self._decided
+        if frontier > self._undecided.decided:
+            self._undecided.decided = frontier
+        return self._undecided.decided

@@ -25,6 +25,7 @@ VIEWS: dict[str, tuple[str, ...]] = {
     "depth": ("run", "graphs/depth.yaml"),
     "fusion": ("run", "graphs/fusion.yaml"),
     "lidar": ("run", "graphs/simulated_lidar.yaml"),
+    "mono": ("run", "graphs/mono.yaml"),
     "mono_depth": (
         "run",
         "graphs/mono_depth.yaml",
@@ -37,7 +38,7 @@ VIEWS: dict[str, tuple[str, ...]] = {
 }
 """The arguments of `dataflow` by the picture's name."""
 
-LATER = {"slam": 22}
+LATER = {"fusion": 39, "slam": 22}
 """Seconds after the start of which a picture is, where there is little to be seen at first."""
 
 

@@ -27,13 +27,14 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.beginning import Prior, coasting_node
 from operators.fusion.control import Command
+from operators.fusion.covariances import Unusable
 from operators.fusion.error_state import POSITION, Noise
 from operators.fusion.gate import GateConfig
 from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.nodes import Measurement
 from operators.fusion.output import diagnostics, odometry_of
-from operators.fusion.sensors import SensorSettings, Surroundings, Unusable, measurements, unheard, use_of
+from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, unheard, use_of
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
@@ -55,7 +56,8 @@ class EkfFusion(Operator):
     for them. Detections of a radar and ranges may be of something else, so the filter never yields to those.
 
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
-    as the motion tells of it.
+    as the motion tells of it. So are a position's error that changes slowly, as satellites have (`drift`), and the
+    scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small.
 
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
     rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
@@ -257,7 +259,7 @@ class EkfFusion(Operator):
             if inertial
             else Noise(0.0, self.free_acceleration, self.free_turning, 0.0),
             gates=self._gates,
-            clocks=tuple((name, s.offset_sigma) for name, s in sorted(self.sensors.items()) if s.offset_sigma),
+            errors=errors_of(self.sensors),
         )
 
     def _prior(self) -> Prior:

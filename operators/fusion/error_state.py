@@ -1,7 +1,7 @@
 """The error-state Kalman filter of an inertial body: its state, its motion, and the update by an innovation.
 
 The error is (15 + K,): position and velocity in the world's axes, rotation as a right perturbation R <- R exp(θ),
-gyroscope bias, accelerometer bias, and the errors of K sensors' time offsets. Solà, "Quaternion kinematics for the
+gyroscope bias, accelerometer bias, and K lasting errors of sensors. Solà, "Quaternion kinematics for the
 error-state Kalman filter", 2017; Li and Mourikis, "Online temporal calibration for camera-IMU systems", 2014.
 """
 
@@ -20,17 +20,14 @@ Array = NDArray[np.float64]
 POSITION, VELOCITY, ROTATION, GYRO_BIAS, ACCEL_BIAS = (slice(3 * k, 3 * k + 3) for k in range(5))
 SIZE = 15
 _I3, _I15 = np.eye(3), np.eye(SIZE)
-_CLOCK_WALK = 1e-4
-"""Random walk of a sensor's time offset, s/√s."""
 
 
 @dataclass(frozen=True, eq=False)
 class State:
     """An estimate: position (3,) and velocity (3,) in the world, R_world_body (3, 3), biases (3,), covariance.
 
-    `offsets` (K,): seconds by which measurements of sensors are older than they are taken for; `covariance` is
-    (15 + K, 15 + K). A body without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose
-    sensor reads 0.
+    `errors` (K,): lasting errors of sensors, such as time offsets; `covariance` is (15 + K, 15 + K). A body
+    without inertial sensor has the angular velocity -gyro_bias: it is an inertial body whose sensor reads 0.
     """
 
     position: Array
@@ -39,7 +36,7 @@ class State:
     gyro_bias: Array
     accel_bias: Array
     covariance: Array
-    offsets: Array = field(default_factory=lambda: np.zeros(0))
+    errors: Array = field(default_factory=lambda: np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,20 @@ def log_rotation(R: Array) -> Array:
     return np.asarray(math.pi * axis / np.linalg.norm(axis))
 
 
-def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: Noise, gravity: Array) -> State:
+@dataclass(frozen=True, eq=False)
+class Wander:
+    """How lasting errors of sensors change: rates of decay (K,) in 1/s, densities of noise (K,) in their unit/√s."""
+
+    decay: Array = field(default_factory=lambda: np.zeros(0))
+    noise: Array = field(default_factory=lambda: np.zeros(0))
+
+
+STEADY = Wander()
+
+
+def propagated(
+    state: State, gyro: Array, accel: Array, seconds: float, noise: Noise, gravity: Array, wander: Wander = STEADY
+) -> State:
     """Moves the state by the mean readings (rad/s, m/s²) of a short time; `gravity` (3,) in m/s²."""
     dt = seconds
     R = state.rotation
@@ -98,7 +108,8 @@ def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: N
     F[VELOCITY, GYRO_BIAS] = lever * (0.5 * dt * dt)
     F[ROTATION, ROTATION] = step.T
     F[ROTATION, GYRO_BIAS] = middle.T * -dt
-    P = _carried(F, state.covariance)
+    left = 1.0 - wander.decay * dt
+    P = _carried(F, left, state.covariance)
     a, g = noise.accel**2, noise.gyro**2
     d = P.reshape(-1)[:: len(P) + 1]  # the diagonal, as a view
     d[POSITION] += a * dt**3 / 3
@@ -106,7 +117,7 @@ def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: N
     d[ROTATION] += g * dt
     d[GYRO_BIAS] += noise.gyro_walk**2 * dt
     d[ACCEL_BIAS] += noise.accel_walk**2 * dt
-    d[SIZE:] += _CLOCK_WALK**2 * dt
+    d[SIZE:] += wander.noise**2 * dt
     index = np.arange(3)
     P[index, index + 3] += a * dt * dt / 2
     P[index + 3, index] += a * dt * dt / 2
@@ -117,15 +128,15 @@ def propagated(state: State, gyro: Array, accel: Array, seconds: float, noise: N
         gyro_bias=state.gyro_bias,
         accel_bias=state.accel_bias,
         covariance=P,
-        offsets=state.offsets,
+        errors=left * state.errors,
     )
 
 
-def _carried(F: Array, covariance: Array) -> Array:
-    """The covariance after a motion F (15, 15) that leaves time offsets as they are."""
+def _carried(F: Array, left: Array, covariance: Array) -> Array:
+    """The covariance after a motion F (15, 15) that leaves a share (K,) of the sensors' errors."""
     if len(covariance) == SIZE:
         return np.asarray(F @ covariance @ F.T)
-    G = np.eye(len(covariance))
+    G = np.diag(np.concatenate([np.ones(SIZE), left]))
     G[:SIZE, :SIZE] = F
     return np.asarray(G @ covariance @ G.T)
 
@@ -149,7 +160,7 @@ def moved(state: State, error: Array) -> State:
         gyro_bias=state.gyro_bias + error[GYRO_BIAS],
         accel_bias=state.accel_bias + error[ACCEL_BIAS],
         covariance=state.covariance,
-        offsets=state.offsets + error[SIZE:],
+        errors=state.errors + error[SIZE:],
     )
 
 
@@ -162,7 +173,7 @@ def difference(state: State, other: State) -> Array:
             log_rotation(state.rotation.T @ other.rotation),
             other.gyro_bias - state.gyro_bias,
             other.accel_bias - state.accel_bias,
-            other.offsets - state.offsets,
+            other.errors - state.errors,
         ]
     )
 

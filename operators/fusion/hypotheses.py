@@ -1,4 +1,4 @@
-"""Several estimates side by side: how they are united, reduced to those that are likely, and given clocks."""
+"""Several estimates side by side: how they are united, reduced to those that are likely, and given sensors' errors."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from operators.fusion.error_state import ROTATION, SIZE, State, difference
 from operators.fusion.nodes import Hypothesis, Node
 
 
-def with_clocks(node: Node, sigmas: Sequence[float]) -> Node:
-    """Returns the node with a time offset of 0 for each standard deviation (s), unless it has them."""
+def with_errors(node: Node, sigmas: Sequence[float]) -> Node:
+    """Returns the node with an error of a sensor, 0, for each standard deviation, unless it has them."""
     made = []
     for h in node.hypotheses:
         known = len(h.state.covariance)
@@ -20,8 +20,8 @@ def with_clocks(node: Node, sigmas: Sequence[float]) -> Node:
         covariance[:known, :known] = h.state.covariance
         fresh = range(known, len(covariance))
         covariance[fresh, fresh] = np.square(sigmas[known - SIZE :])
-        offsets = np.concatenate([h.state.offsets, np.zeros(len(fresh))])
-        made.append(replace(h, state=replace(h.state, covariance=covariance, offsets=offsets)))
+        errors = np.concatenate([h.state.errors, np.zeros(len(fresh))])
+        made.append(replace(h, state=replace(h.state, covariance=covariance, errors=errors)))
     return replace(node, hypotheses=tuple(made))
 
 

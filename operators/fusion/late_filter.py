@@ -27,7 +27,7 @@ from operators.fusion.error_state import (
     updated,
 )
 from operators.fusion.gate import Doubt, GateConfig, Health, judge
-from operators.fusion.hypotheses import combined, reduced, with_clocks
+from operators.fusion.hypotheses import combined, reduced, with_errors
 from operators.fusion.measurements import from_plain, to_plain
 from operators.fusion.nodes import (
     Entry,
@@ -40,6 +40,7 @@ from operators.fusion.nodes import (
     plain_sample,
     sample_of,
 )
+from operators.fusion.sensor_errors import SensorErrors
 
 Array = NDArray[np.float64]
 _MOMENT = 1e-3
@@ -53,8 +54,7 @@ class FilterConfig:
     `window`: seconds for which late measurements are taken; `gravity` in m/s²; `max_gap`: seconds without an inertial
     sample after which the motion in between is unknown, with the noise `unknown`; `inertial`: there are samples at all.
     Without them velocity and angular velocity stay but for the noise `unknown`. `gates`: those of single sensors, by
-    the first word of their name. `clocks`: sensors whose time offset is estimated, and its standard deviation at first,
-    seconds.
+    the first word of their name. `errors`: those of sensors that are estimated.
     """
 
     window: float = 1.0
@@ -64,7 +64,7 @@ class FilterConfig:
     unknown: Noise = field(default_factory=lambda: Noise(0.0, 1.0, 1.0, 0.0))
     gate: GateConfig = field(default_factory=GateConfig)
     gates: Mapping[str, GateConfig] = field(default_factory=dict)
-    clocks: tuple[tuple[str, float], ...] = ()
+    errors: SensorErrors = field(default_factory=SensorErrors)
 
 
 class LateFilter:
@@ -73,7 +73,8 @@ class LateFilter:
     def __init__(self, config: FilterConfig, start: Node) -> None:
         self._config = config
         self._down = np.array([0.0, 0.0, -config.gravity])
-        self._nodes = [with_clocks(start, [sigma for _, sigma in config.clocks])]
+        self._wander = config.errors.wander
+        self._nodes = [with_errors(start, config.errors.sigmas)]
         self._entries: list[Entry] = []
         self._keys: list[tuple[int, int, str, int]] = []
         self._sample_times: list[int] = []
@@ -123,12 +124,12 @@ class LateFilter:
 
     def offsets(self) -> dict[str, tuple[float, float]]:
         """Returns the estimated time offset of each sensor that has a clock, and its standard deviation, seconds."""
-        if not self._config.clocks:
+        names = [name for name, _ in self._config.errors.clocks]
+        if not names:
             return {}
         state = combined(self._nodes[-1].hypotheses)
         sigmas = np.sqrt(np.diag(state.covariance)[SIZE:]).tolist()
-        names = [name for name, _ in self._config.clocks]
-        return {name: (float(at), sigma) for name, at, sigma in zip(names, state.offsets, sigmas, strict=True)}
+        return {name: (float(state.errors[k]), sigmas[k]) for k, name in enumerate(names)}
 
     def estimate(self, time: int) -> tuple[State, Array]:
         """Returns the state at a time, not before the newest entry, and the gyroscope's reading."""
@@ -233,7 +234,7 @@ class LateFilter:
         if inertial and seconds <= self._config.max_gap:
             mean_gyro, mean_accel = 0.5 * (node.gyro + gyro), 0.5 * (node.accel + accel)
             hypotheses = tuple(
-                replace(h, state=propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down))
+                replace(h, state=propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down, self._wander))
                 for h in node.hypotheses
             )
         else:
@@ -247,7 +248,7 @@ class LateFilter:
         for k in range(steps):
             force = state.accel_bias - state.rotation.T @ self._down
             before = state.rotation
-            state = propagated(state, turning, force, seconds / steps, self._config.unknown, self._down)
+            state = propagated(state, turning, force, seconds / steps, self._config.unknown, self._down, self._wander)
             if node.command is not None and not self._config.inertial:
                 now = node.time + round((k + 1) / steps * seconds * 1e9)
                 state = node.command.drive(state, before, now, seconds / steps)
@@ -281,17 +282,17 @@ class LateFilter:
         return Node(node.time, hypotheses, node.gyro, node.accel, {**node.health, entry.sensor: after}, node.command)
 
     def _innovation(self, entry: Measurement, state: State, node: Node) -> tuple[Array, Array]:
-        """Residual and Jacobian (M, 15 + K), with the time offset of the sensor as far as it was not taken off."""
+        """Residual and Jacobian (M, 15 + K), without the errors that the sensor is believed to have."""
         residual, H = entry.model.innovation(state, node.gyro)
-        if not len(state.offsets):
+        if not len(state.errors):
             return residual, H
         J = np.zeros((len(residual), len(state.covariance)))
         J[:, :SIZE] = H
         if entry.clock >= 0:
             change = self._change(entry, state, node)
-            residual = residual + change * (state.offsets[entry.clock] - entry.assumed)
+            residual = residual + change * (state.errors[entry.clock] - entry.assumed)
             J[:, SIZE + entry.clock] = -change
-        return residual, J
+        return self._config.errors.taken_off(entry.sensor, entry.model, state, residual, J), J
 
     def _change(self, entry: Measurement, state: State, node: Node) -> Array:
         """How fast the prediction of a measurement changes (M,), its unit a second."""

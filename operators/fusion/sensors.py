@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
 from typing import Literal
@@ -25,6 +25,7 @@ from dataflow.messages import (
     Twist,
 )
 from dataflow.messages.geometry import invert, quaternion_to_matrix, transform_matrix
+from operators.fusion.covariances import Unusable, check_finite, covariance_of, positive, white_part
 from operators.fusion.measurements import (
     AngularRate,
     FullPose,
@@ -35,6 +36,7 @@ from operators.fusion.measurements import (
     Range,
     Velocity,
 )
+from operators.fusion.sensor_errors import SensorErrors
 from operators.geometry import se3
 from operators.geometry.geodesy import east_north_up
 
@@ -65,6 +67,15 @@ class SensorSettings(BaseModel):
     offset: float = Field(0.0, ge=-10, le=10, description="seconds by which a measurement is older than its stamp")
     offset_sigma: float = Field(
         0.0, ge=0, le=2, description="seconds by which the offset may be wrong: if above 0, it is estimated"
+    )
+    drift: tuple[float, float, float] = Field(
+        (0.0, 0.0, 0.0),
+        description="standard deviations (east, north, up, m) of an error of positions that changes slowly, a part of "
+        "what the covariance says: if above 0, it is estimated",
+    )
+    drift_time: float = Field(30.0, gt=0, description="seconds in which that error changes")
+    scale_sigma: float = Field(
+        0.0, ge=0, lt=0.5, description="share by which all speeds of wheels may be wrong: if above 0, it is estimated"
     )
     sigma: float | None = Field(
         None, gt=0, description="standard deviation of what has a length (m, m/s); the message's covariance if none"
@@ -105,10 +116,6 @@ _FITTING: dict[str, tuple[type[Message], ...]] = {
 }
 
 
-class Unusable(Exception):
-    """A message that is ignored: says why."""
-
-
 @dataclass
 class Surroundings:
     """Holds what measurements are related to: places of sensors on the body, the world's frame, origin and landmarks.
@@ -130,6 +137,16 @@ def use_of(name: str, message: Message, settings: SensorSettings) -> str:
         fitting = " or ".join(t.__name__ for t in _FITTING[use])
         raise ValueError(f"{name}: {type(message).__name__} cannot be used as {use!r}, which takes {fitting}")
     return use
+
+
+def errors_of(sensors: Mapping[str, SensorSettings]) -> SensorErrors:
+    """Returns the lasting errors of sensors that settings ask to be estimated."""
+    ordered = sorted(sensors.items())
+    return SensorErrors(
+        tuple((name, s.offset_sigma) for name, s in ordered if s.offset_sigma),
+        tuple((name, s.drift, s.drift_time) for name, s in ordered if any(s.drift)),
+        tuple((name, s.scale_sigma) for name, s in ordered if s.scale_sigma),
+    )
 
 
 def unheard(names: Sequence[str], streams: Sequence[str]) -> dict[str, str]:
@@ -163,7 +180,7 @@ def measurements(
         yield from _velocity(time, name, message, before, settings, around)
     elif isinstance(message, MagneticField):
         measured = around.place(message.frame)[:3, :3] @ message.field
-        _check(measured)
+        check_finite(measured)
         if not measured.any():
             raise Unusable("no field")
         sigma = settings.angular_sigma or 0.1
@@ -177,7 +194,7 @@ def measurements(
 def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundings) -> tuple[Model, Array]:
     if fix.status == "no_fix":
         raise Unusable("no fix")
-    _check(np.array([fix.latitude, fix.longitude]))
+    check_finite(np.array([fix.latitude, fix.longitude]))
     if around.origin is None:
         around.origin = (fix.latitude, fix.longitude, fix.altitude if math.isfinite(fix.altitude) else 0.0)
     high = math.isfinite(fix.altitude)
@@ -185,7 +202,7 @@ def _fix(name: str, fix: NavSatFix, settings: SensorSettings, around: Surroundin
     if not high:
         place[2] = np.nan
     known = np.isfinite(place)
-    noise = _covariance(name, fix.covariance, settings.sigma, "sigma")
+    noise = white_part(covariance_of(name, fix.covariance, settings.sigma, "sigma"), settings.drift)
     return Position(place, around.place(fix.frame)[:3, 3]), noise[np.ix_(known, known)]
 
 
@@ -195,9 +212,9 @@ def _absolute(
     if isinstance(message, Imu):
         if message.orientation is None:
             raise Unusable("no orientation")
-        _check(message.orientation)
+        check_finite(message.orientation)
         R = quaternion_to_matrix(message.orientation) @ around.place(message.frame)[:3, :3].T
-        C = _covariance(name, message.orientation_covariance, settings.angular_sigma, "angular_sigma")
+        C = covariance_of(name, message.orientation_covariance, settings.angular_sigma, "angular_sigma")
         return Orientation(R), R.T @ C @ R
     assert isinstance(message, Pose | Odometry)
     if message.frame != around.world_frame:
@@ -205,21 +222,22 @@ def _absolute(
             f"{name}: poses are in the frame {message.frame!r}, the filter's is {around.world_frame!r}: odometry of a "
             "frame of its own is used as 'velocity'"
         )
-    _check(message.position, message.orientation)
+    check_finite(message.position, message.orientation)
     given = message.covariance if isinstance(message, Pose) else message.pose_covariance
     T_body_child = around.place(message.child_frame)
     T = transform_matrix(message.position, message.orientation) @ invert(T_body_child)
     R = T[:3, :3]
     C = np.zeros((6, 6))
     if use != "orientation":
-        C[:3, :3] = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
+        told = None if given is None else given[:3, :3]
+        C[:3, :3] = white_part(covariance_of(name, told, settings.sigma, "sigma"), settings.drift)
     if use == "position":
         return Position(message.position, T_body_child[:3, 3]), C[:3, :3]
-    angular = _covariance(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
+    angular = covariance_of(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
     C[3:, 3:] = angular
     if given is not None and settings.sigma is None and settings.angular_sigma is None:
         C[:3, 3:], C[3:, :3] = given[:3, 3:], given[3:, :3]
-        _positive(C)
+        positive(C)
     J = np.eye(6)
     J[3:, 3:] = R.T
     if use == "orientation":
@@ -248,16 +266,16 @@ def _velocity(
     time: int, name: str, message: Message, before: Message | None, settings: SensorSettings, around: Surroundings
 ) -> Iterator[Found]:
     half, linear, angular, given = _twist(message, before)
-    _check(linear, angular)
+    check_finite(linear, angular)
     frame = message.child_frame if isinstance(message, Odometry) else message.frame  # type: ignore[attr-defined]
     T_body_sensor = around.place(frame)
     axes = T_body_sensor[:3, :3].T
     if _metric(message):
-        C = _covariance(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
+        C = covariance_of(name, None if given is None else given[:3, :3], settings.sigma, "sigma")
         yield time - half, f"{name} linear", Velocity(linear, axes, T_body_sensor[:3, 3]), C
     else:
         around.ignored[f"{name}: scale unknown"] += 1
-    C = _covariance(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
+    C = covariance_of(name, None if given is None else given[3:, 3:], settings.angular_sigma, "angular_sigma")
     yield time - half, f"{name} angular", AngularRate(angular, axes), C
 
 
@@ -270,7 +288,7 @@ def _metric(message: Message) -> bool:
 def _wheels(time: int, name: str, message: Message, settings: SensorSettings, around: Surroundings) -> Iterator[Found]:
     """Forward speed, no slip aside or upwards, and rest when the wheels stand."""
     half, linear, angular, given = _twist(message, None)
-    _check(linear, angular)
+    check_finite(linear, angular)
     frame = message.child_frame if isinstance(message, Odometry) else message.frame  # type: ignore[attr-defined]
     T_body_base = around.place(frame)
     axes, lever = T_body_base[:3, :3].T, T_body_base[:3, 3]
@@ -279,7 +297,7 @@ def _wheels(time: int, name: str, message: Message, settings: SensorSettings, ar
         yield time, f"{name} no turn", AngularRate(np.zeros(3), axes), _I3 * 0.002**2
         return
     C = np.diag([0.0, 0.02**2, 0.02**2])
-    C[0, 0] = _covariance(name, None if given is None else given[:1, :1], settings.sigma, "sigma")[0, 0]
+    C[0, 0] = covariance_of(name, None if given is None else given[:1, :1], settings.sigma, "sigma")[0, 0]
     yield time - half, name, Velocity(np.array([linear[0], 0.0, 0.0]), axes, lever), C
 
 
@@ -313,35 +331,11 @@ def _ranges(
     for k, (identity, distance) in enumerate(zip(sightings.ids.tolist(), sightings.ranges.tolist(), strict=True)):
         C = None if sightings.covariances is None else sightings.covariances[k, :1, :1]
         try:
-            noise = _covariance(name, C, settings.sigma, "sigma")[:1, :1]
+            noise = covariance_of(name, C, settings.sigma, "sigma")[:1, :1]
             if identity not in places:
                 raise Unusable("landmark not in the map")
-            _check(np.array([distance]), places[identity])
+            check_finite(np.array([distance]), places[identity])
         except Unusable as reason:
             around.ignored[f"{name}: {reason}"] += 1
         else:
             yield time, name, Range(np.array([distance]), places[identity], lever), noise
-
-
-def _covariance(name: str, given: Array | None, sigma: float | None, setting: str) -> Array:
-    """The covariance that counts: of the setting, else of the message."""
-    if sigma is not None:
-        return np.eye(3) * sigma**2
-    if given is None:
-        raise ValueError(f"{name}: its messages have no covariance, so its {setting} must say how good it is")
-    return _positive(given)
-
-
-def _positive(covariance: Array) -> Array:
-    """The covariance, symmetric. Raises Unusable for what is none."""
-    if not np.isfinite(covariance).all():
-        raise Unusable("covariance not finite")
-    symmetric = np.asarray(0.5 * (covariance + covariance.T))
-    if float(np.linalg.eigvalsh(symmetric)[0]) <= 0:
-        raise Unusable("covariance not positive")
-    return symmetric
-
-
-def _check(*values: Array) -> None:
-    if not all(np.isfinite(v).all() for v in values):
-        raise Unusable("not finite")

@@ -20,7 +20,7 @@ LARGEST = 1.3  # factor by which one correction may change a known scale
 
 @dataclass(frozen=True)
 class Scale:
-    """How well the map's unit is known to be a metre: standard deviation of its logarithm, infinite if not at all."""
+    """Uncertainty of the map's unit as a metre: standard deviation of its logarithm, infinite if not known at all."""
 
     sigma: float = float("inf")
 

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 class Usual:
     """Usual size: shorter and longer side on the ground and height, metres, and spreads of their logs.
 
-    What is `round` has the outline of an ellipse, as seen from above.
+    What is `round` has the outline of an ellipse, as seen from above. What is leafy shows points that are inside its
+    box, by the share `inset` of half its side.
     """
 
     size: tuple[float, float, float]
     spread: tuple[float, float, float]
     round: bool = False
+    inset: float = 0.0
 
 
 CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
@@ -24,7 +26,10 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25)),),
     "door": (Usual((0.18, 1.06, 2.13), (0.50, 0.10, 0.05)),),
     "monitor": (Usual((0.20, 0.56, 0.48), (0.10, 0.12, 0.10)),),
-    "plant": (Usual((0.11, 0.13, 0.23), (0.30, 0.30, 0.20), True), Usual((0.40, 0.45, 0.86), (0.35, 0.35, 0.25), True)),
+    "plant": (
+        Usual((0.11, 0.13, 0.23), (0.30, 0.30, 0.20), True, 0.4),
+        Usual((0.40, 0.45, 0.86), (0.35, 0.35, 0.25), True, 0.4),
+    ),
     "box": (Usual((0.17, 0.20, 0.16), (0.45, 0.40, 0.42)),),
     "ball": (Usual((0.12, 0.12, 0.12), (0.45, 0.45, 0.45), True),),
     "mug": (Usual((0.08, 0.11, 0.10), (0.10, 0.10, 0.10), True),),

@@ -22,10 +22,11 @@ _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
-_TAIL = 2.0  # standard deviations of noise by which the outermost points are beyond a side
+_TAIL = 0.8  # standard deviations of noise by which the outermost points are beyond a side
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN = 0.1  # radians by which the heading that points show strays
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
+_SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
 _ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
 
 
@@ -78,6 +79,7 @@ def fit_cuboid(
         towards = heading if heading is not None and form >= len(_priors(usual)[0]) else start[2]
         headings = np.array([_nearest_turn(box[2], towards)])
     outline = _ELLIPSE if usual and usual[0].round else _SIGNS
+    inset = usual[0].inset if usual else 0.0
     P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
@@ -90,7 +92,7 @@ def fit_cuboid(
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
-        parts = [image, _surface(flat, points, eyes, noise), turn, size]
+        parts = [image, _surface(flat, points, eyes, noise, inset), turn, size]
         return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
     forms = np.arange(len(x)) if before is None else np.array([before[0]])
@@ -102,7 +104,7 @@ def fit_cuboid(
             kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
             x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
             forms, askew = forms[kept], askew[kept]
-        weighted = J * np.minimum(1.0, _BOUND / np.maximum(np.abs(r), 1e-9))[:, None]  # Huber
+        weighted = J * _influence(r)[:, None]
         A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
         step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
         x = x + step
@@ -113,9 +115,17 @@ def fit_cuboid(
 
 
 def _cost(r: Array) -> Array:
-    """Returns the cost (A,) of residuals (A, R), after Huber."""
-    size = np.abs(r)
-    return np.asarray(np.where(size < _BOUND, 0.5 * size * size, _BOUND * (size - 0.5 * _BOUND)).sum(axis=1))
+    """Returns the cost (A,) of residuals (A, R), after Huber; that of sizes is not bounded."""
+    size, strays = np.abs(r), np.arange(r.shape[1]) < r.shape[1] - _SIZES
+    bounded = (size >= _BOUND) & strays
+    return np.asarray(np.where(bounded, _BOUND * (size - 0.5 * _BOUND), 0.5 * size * size).sum(axis=1))
+
+
+def _influence(r: Array) -> Array:
+    """Returns the weights (A, R) of residuals, after Huber: sizes, the last, do not stray as images and points do."""
+    weights = np.minimum(1.0, _BOUND / np.maximum(np.abs(r), 1e-9))
+    weights[:, -_SIZES:] = 1.0
+    return np.asarray(weights)
 
 
 def _nearest_turn(yaw: float, towards: float) -> float:
@@ -195,7 +205,7 @@ def _images(rows: Array, P: Array, outline: Array) -> Array:
     return np.asarray(image)
 
 
-def _surface(rows: Array, points: Array, eyes: Array, noise: float) -> Array:
+def _surface(rows: Array, points: Array, eyes: Array, noise: float, inset: float) -> Array:
     """Returns by how much the points' extents differ from the sides of boxes (K, 7): (K, 6), in standard deviations.
 
     Sides that no view sees may be farther out than the points.
@@ -212,7 +222,7 @@ def _surface(rows: Array, points: Array, eyes: Array, noise: float) -> Array:
     way = np.abs(eye).mean(axis=2)
     distance = np.sqrt((way * way).sum(axis=1, keepdims=True))
     stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
-    residual = residual + np.concatenate([stray, stray], axis=1)
+    residual = residual + np.concatenate([stray, stray], axis=1) - inset * np.concatenate([half, half], axis=1)
     shown = np.concatenate([(eye < -half[..., None]).mean(axis=2), (eye > half[..., None]).mean(axis=2)], axis=1) > 0.3
     # positive: the side is beyond the points
     return np.asarray(np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE)

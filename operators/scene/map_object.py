@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -32,7 +33,8 @@ class MapObject:
 
     `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
     of voxels that it had; `images` are the views that its box is fitted to, `form` which of
-    the ways in which its class stands, -1 while that is open.
+    the ways in which its class stands, -1 while that is open. `beside` counts by id in how many views another one was
+    seen too, in a place of its own in the image.
     """
 
     id: int
@@ -51,6 +53,7 @@ class MapObject:
     most: int = 0
     images: list[ImageView] = field(default_factory=list)
     form: int = -1
+    beside: Counter[int] = field(default_factory=Counter)
 
     @property
     def class_id(self) -> int:
@@ -105,7 +108,8 @@ class MapObject:
         rows = self.images
         images = [np.stack([getattr(v, name) for v in rows]) for name in ("P", "box", "edges", "eye")] if rows else []
         plain = {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)}
-        return plain | {"cells": self.cells.snapshot(), "images": images}
+        beside = sorted(self.beside.items())
+        return plain | {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
@@ -113,6 +117,7 @@ class MapObject:
         cells.restore(state["cells"])
         fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
         made = cls(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
+        made.beside = Counter({int(other): int(count) for other, count in state["beside"]})
         for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():
             view = ImageView(np.array(P), np.array(box), np.array(edges, np.bool_), np.array(eye))
             made.images.append(view)

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 LARGE = 0.8  # metres on the ground from which a thing is seldom seen whole, so that its voxels tell
 _COARSE = 0.3  # metres from which a thing is often hidden in part
 _WITHIN = 0.8  # share of an image box that is in that of an object, where the rest is hidden
+_COVERING = 0.6  # share of the smaller of two image boxes, from which one covers the other
 _SLACK = 0.02  # of the distance, by which points stray
 
 
@@ -83,7 +84,7 @@ def alike(
 
     `image` compares them where there is an image. `large` things are seldom seen whole: their voxels tell.
     """
-    away = _outside(cells.middle, object.box)
+    away = outside(cells.middle, object.box)
     reach = s.reach if each.image is None else s.reach + _SLACK * float(np.linalg.norm(cells.middle - each.image.eye))
     if away > reach:
         return 0.0
@@ -126,7 +127,16 @@ def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_
     ]
 
 
-def _outside(place: Array, box: tuple[Array, Array, float]) -> float:
+def in_places_of_their_own(images: Sequence[ImageView]) -> NDArray[np.bool_]:
+    """Tells of each two of images of one view (N, N) whether neither covers the other's place."""
+    boxes = np.stack([image.box for image in images])
+    low, high = (side(boxes[:, None], boxes[None]) for side in (np.maximum, np.minimum))
+    shared = np.maximum(high[..., 2:] - low[..., :2], 0).prod(axis=2)
+    areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)
+    return np.asarray(shared < _COVERING * np.minimum(areas[:, None], areas[None]))
+
+
+def outside(place: Array, box: tuple[Array, Array, float]) -> float:
     """Returns how far a place (3,) is from a box, 0 inside."""
     center, size, yaw = box
     c, s = math.cos(yaw), math.sin(yaw)

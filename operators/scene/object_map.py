@@ -9,27 +9,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
+from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.matching import (
-    LARGE,
     MapSettings,
     Observation,
     alike,
     alike_mover,
-    closeness,
     color_likeness,
     in_image,
-    tolerance,
+    in_places_of_their_own,
+    outside,
 )
+from operators.scene.merging import are_one, merge
 from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
-_COVERED = 0.3  # share of the smaller of two boxes that both have, from which they are one
+_GONE = 1.0  # times its size away from its place, and a thing is moved
 _SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
 _AGAIN = 8  # views after which the heading of the room is looked for once more
 _LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
@@ -40,10 +40,12 @@ class ObjectMap:
 
     An observation is of the object of its class whose box, seen from where it was seen, covers its own in the image,
     and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
-    other. Colour decides near ties. Two objects that come to share their place are one. Places that a view looks
-    through lose voxels; an object whose place is empty, or that is in plain view and not detected, loses evidence and
-    at last goes. If one of its class and size appears elsewhere, that is the same object, moved.
-    `movers` are classes whose place is that of their last view; they are joined by predicted place.
+    other. Colour decides near ties. Two objects that come to share their place, of one class or not, are one, unless
+    they are seen beside each other. Places that a view looks through lose voxels; an object whose place is empty, or
+    that is in plain view and not detected, loses evidence and at last goes. If one of its class and size appears
+    elsewhere, that is the same object, moved.
+    `movers` are classes whose place is that of their last view; they are joined by predicted place. Small ones (a ball)
+    are as other things are until a view looks through their place and one of their class is near.
 
     After Hughes et al., "Hydra", 2022, and Gu et al., "ConceptGraphs", 2024; existence as in occupancy grids.
     """
@@ -56,8 +58,7 @@ class ObjectMap:
         usual: Mapping[int, Sequence[Usual]] | None = None,
     ) -> None:
         """`usual` are the sizes of classes whose size is known."""
-        self._settings, self._classes, self._movers = settings, classes, frozenset(movers)
-        self._usual = dict(usual or {})
+        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {})
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -75,14 +76,18 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
-        cells = [Cells.of(self._near_side(each, view.origin), s.voxel) for each in seen]
-        joined = self._joined(seen, cells, stamp)
+        cells = [
+            Cells.of(self._kinds.near_side(each.points, each.class_id, view.origin, s.range_noise), s.voxel)
+            for each in seen
+        ]
+        joined = self._joined(seen, cells, stamp, view)
         for k, each in enumerate(seen):
             if k in joined:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 self._begin(each, cells[k], stamp, view.origin)
         shown = {i: cells[k] for k, i in joined.items()}
+        self._note_beside(seen, [joined.get(k) for k in range(len(seen))])
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
@@ -92,28 +97,9 @@ class ObjectMap:
         s = self._settings
         return [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
 
-    def is_mover(self, object: MapObject) -> bool:
-        return object.class_id in self._movers
-
-    def _is_large(self, object: MapObject) -> bool:
-        usual = self._usual.get(object.class_id)
-        return (max(u.size[1] for u in usual) if usual else float(object.size[:2].max())) >= LARGE
-
-    def _near_side(self, each: Observation, eye: Array) -> Array:
-        """Returns an observation's points without those that are farther behind most than such a thing is deep."""
-        usual = self._usual.get(each.class_id)
-        if not usual:
-            return each.points
-        way = each.points[:, :2] - eye[:2]
-        ranges = np.sqrt((way * way).sum(axis=1))
-        deep = max(u.size[1] * math.exp(2 * u.spread[1]) for u in usual)
-        deep += 4 * self._settings.range_noise * float(ranges.min()) ** 2
-        ranked = np.sort(ranges)
-        counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
-        first = ranked[int(np.argmax(counts))]
-        return np.asarray(each.points[(ranges >= first) & (ranges <= first + deep)])
-
-    def _joined(self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int) -> dict[int, int]:
+    def _joined(
+        self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
+    ) -> dict[int, int]:
         """Returns the object's id of each observation that is of a known one."""
         s, ids = self._settings, sorted(self.objects)
         value = np.zeros((len(seen), len(ids)))
@@ -121,24 +107,33 @@ class ObjectMap:
             return {}
         known = [self.objects[i] for i in ids]
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
-        moves = np.array([self.is_mover(o) for o in known])
-        usual = [self._usual.get(o.class_id, ()) for o in known]
-        images = in_image(seen, rows, np.array([bool(u) and u[0].round for u in usual]))
+        moves = np.array([self._kinds.is_mover(o) for o in known])
+        still = np.array([self._kinds.is_still(o) for o in known])
+        classes = np.array([o.class_id for o in known])
+        images = in_image(seen, rows, np.array([self._kinds.is_round(o) for o in known]))
+        left: dict[int, bool] = {}
         for k, each in enumerate(seen):
-            mover = each.class_id in self._movers
-            more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
+            mover = each.class_id in self._kinds.movers
             near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
             near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
-            for j in np.flatnonzero((near <= more) & (moves == mover)).tolist():
-                if mover:
+            here = ~moves & (near <= s.reach) & (still if mover else True)
+            for j in np.flatnonzero(here).tolist():
+                image = None if images is None else images[k][j]
+                value[k, j] = alike(each, cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
+            if not mover:
+                continue
+            around = (near <= s.mover_reach + 2 * s.mover_speed) & (classes == each.class_id) & (value[k] == 0)
+            for j in np.flatnonzero(around).tolist():
+                if not moves[j] and j not in left:
+                    left[j] = self._has_left(known[j], view)
+                if moves[j] or left[j]:
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
-                else:
-                    image = None if images is None else images[k][j]
-                    value[k, j] = alike(each, cells[k], known[j], image, s, large=self._is_large(known[j]))
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
     def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
-        mover = self.is_mover(object)
+        mover = self._kinds.is_mover(object)
+        if each.class_id in self._kinds.movers and outside(cells.middle, object.box) > _GONE * float(object.size.max()):
+            mover, object.images, object.form = True, [], -1  # what lay still is moved
         direction = _direction(eye, cells)
         object.views += 1
         object.view = direction * object.views if mover else object.view + direction
@@ -151,18 +146,25 @@ class ObjectMap:
             known = np.isfinite(object.color).all()
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
-            object.cells = cells
-            object.fit(self._usual, self._heading, self._settings.range_noise)
+            object.cells, object.most = cells, len(cells)
+            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
             return
         object.cells.add(cells)
+        object.velocity = np.zeros(3)
         new = each.image is not None and object.look(each.image) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
-            object.fit(self._usual, self._heading, self._settings.range_noise)
+            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+
+    def _has_left(self, object: MapObject, view: RangeView) -> bool:
+        """Tells whether a view looks through the place of an object."""
+        sight = view.of(object.cells.points, self._settings.margin)
+        looked = int(np.count_nonzero(sight.looked))
+        return int(np.count_nonzero(sight.free)) >= 0.6 * max(looked, 1)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
@@ -172,9 +174,9 @@ class ObjectMap:
             made.color = each.color
         made.view = _direction(eye, cells)
         made.center = cells.middle
-        if each.image is not None and not self.is_mover(made):  # one view alone tells less than the points
+        if each.image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
             made.look(each.image)
-        made.fit(self._usual, self._heading, self._settings.range_noise)
+        made.fit(self._kinds.usual, self._heading, self._settings.range_noise)
         self.objects[made.id] = made
         self._next += 1
 
@@ -193,7 +195,7 @@ class ObjectMap:
 
     def _look(self, object: MapObject, sight: Sight | None, eye: Array, own: Cells | None, seconds: float) -> None:
         """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any."""
-        s, mover = self._settings, self.is_mover(object)
+        s, mover = self._settings, self._kinds.is_mover(object)
         if not len(object.cells):
             object.evidence = -1.0
             return
@@ -222,6 +224,19 @@ class ObjectMap:
         ):
             object.evidence -= s.missed
 
+    def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
+        """Counts for neighbours in how many views both were seen, each in a place of its own in the image."""
+        rows = [(k, i, each.image) for k, (i, each) in enumerate(zip(ids, seen, strict=True)) if i is not None]
+        images = [image for _, _, image in rows if image is not None]
+        if len(rows) < 2 or len(images) < len(rows):
+            return
+        apart = in_places_of_their_own(images)
+        centers = np.array([self.objects[i].center for _, i, _ in rows])
+        radii = np.array([float(self.objects[i].size.max()) for _, i, _ in rows]) / 2
+        near = np.linalg.norm(centers[:, None] - centers[None], axis=2) <= radii[:, None] + radii[None]
+        for a, b in np.argwhere(apart & near).tolist():
+            self.objects[rows[a][1]].beside[rows[b][1]] += 1
+
     def _join_doubles(self, changed: list[int]) -> None:
         """Makes one of two objects that share their voxels."""
         if not changed:
@@ -235,44 +250,14 @@ class ObjectMap:
             k = ids.index(i)
             close = np.linalg.norm(centers - centers[k], axis=1) <= (radii + radii[k]) / 2 + 0.1
             for j in (ids[n] for n in np.flatnonzero(close).tolist()):
-                if i in self.objects and j in self.objects and i != j:
-                    self._join_two(self.objects[i], self.objects[j])
-
-    def _join_two(self, a: MapObject, b: MapObject) -> None:
-        if not self._one(a, b):
-            return
-        kept, other = (a, b) if (a.born, a.id) < (b.born, b.id) else (b, a)
-        if not self.is_mover(kept):
-            kept.cells.add(other.cells)
-            for image in other.images:
-                kept.look(image)
-        kept.votes = kept.votes + other.votes
-        kept.evidence = min(max(kept.evidence, other.evidence), MOST_EVIDENCE)
-        kept.seen, kept.views = max(kept.seen, other.seen), kept.views + other.views
-        kept.view = kept.view + other.view
-        kept.fit(self._usual, self._heading, self._settings.range_noise)
-        del self.objects[other.id]
-
-    def _one(self, a: MapObject, b: MapObject) -> bool:
-        s = self._settings
-        movers = self.is_mover(a), self.is_mover(b)
-        if any(movers) and a.class_id != b.class_id:
-            return False
-        if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
-            return False
-        if all(movers):
-            return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
-        if a.class_id != b.class_id:
-            return upright_iou(a.box, b.box) >= 0.5
-        least = 0.5 if a.seen == b.seen else _COVERED  # two that one view shows are seldom one
-        if shared_volume(a.box, b.box) >= least * min(float(np.prod(a.size)), float(np.prod(b.size))):
-            return True
-        small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
-        if a.images and b.images and not self._is_large(small):
-            return False
-        if closeness(small.cells, large.cells) <= 0.3:
-            return False
-        return large.cells.near(small.cells.points, 0.5 * tolerance(small.size) + 0.5 * s.voxel) >= 0.5
+                if i not in self.objects or j not in self.objects or i == j:
+                    continue
+                a, b = self.objects[i], self.objects[j]
+                if are_one(a, b, self._kinds, self._settings.voxel):
+                    del self.objects[i], self.objects[j]
+                    one = merge(a, b, self._kinds)
+                    one.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+                    self.objects[one.id] = one
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""

@@ -40,10 +40,11 @@ _BORDER = 3.0  # pixels; boxes that end nearer to the image's edge may go on bey
 class SemanticMap(Operator):
     """Accumulates objects in the world over time, each with class, oriented box, existence and when it was last seen.
 
-    What a view shows is joined to the map by place, class and colour; two entries that come to share their place are
-    one. Each view also says where nothing is: an object whose place is empty goes, and one of its class, size and
-    colour that appears elsewhere takes its id, moved and not doubled. Classes that move by themselves are followed
-    instead, and forgotten after a while out of sight. Everything else is kept while it is out of sight.
+    What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
+    are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
+    and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
+    by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
+    out of sight.
 
     Method: after Hughes et al., "Hydra: a real-time spatial perception system", 2022, and Gu et al., "ConceptGraphs",
     2024, with free space from the views themselves.

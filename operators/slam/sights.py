@@ -1,4 +1,4 @@
-"""Declares what a map of places asks of a sensor: how its views differ, which look alike, and how one lies to another."""
+"""Declares what a map of places asks of a sensor: how its views differ, which look alike, how one lies to another."""
 
 from __future__ import annotations
 

@@ -247,11 +247,14 @@ def test_patience_shortens_the_time_for_closing(patience: float, closes_within: 
 
 def test_what_a_process_has_left_behind_is_named() -> None:
     play = Play().starts()
-    play.tell(LeftBehind("sum", ("sleep (process 12)",)))
+    play.tell(LeftBehind(("sum",), ("sleep (process 12)",)), LeftBehind(("left", "sum"), ("cat (process 13)",)))
     over = play.ends()
 
     assert over.report is not None
-    assert over.report.notes == ("process 'sum' left processes behind, which were killed: sleep (process 12)",)
+    assert over.report.notes == (
+        "process 'sum' left processes behind, which were killed: sleep (process 12)",
+        "process 'left' or 'sum' left processes behind, which were killed: cat (process 13)",
+    )
 
 
 def test_a_program_that_cannot_go_on_ends_the_run_in_order() -> None:

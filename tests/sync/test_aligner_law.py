@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.sync import FOREVER, Aligner, aligner, lanes
+from dataflow.sync import FOREVER, Aligner, context, lanes
 
 from . import reference
 from .scenarios import Scenario, interleave, poll_all, run, scenarios, tell
@@ -22,7 +22,7 @@ def prune_at_once() -> Iterator[None]:
     """Streams here are short: lanes are pruned from the first message on, or never would be."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lanes, "PRUNE_AT", 0)
-        patch.setattr(aligner, "PRUNE_AT", 0)
+        patch.setattr(context, "PRUNE_AT", 0)
         yield
 
 

@@ -8,12 +8,13 @@ s · (2σ(tx) − 0.5 + column), s · (2σ(ty) − 0.5 + row), its size w · (2�
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.decode import Candidates
-from operators.detection.nms import class_wise_nms
+from operators.detection.nms import merging_nms
 
 Map = NDArray[np.float32]
 """(1, A · (5 + C), H, W): per anchor tx, ty, tw, th, objectness and C class scores, all before the sigmoid."""
@@ -30,11 +31,15 @@ def find_boxes(
     nms_iou: float,
     most: int,
 ) -> Candidates:
-    """The boxes in the output, in input pixels, after class-wise suppression: the best `most`, by falling score."""
+    """The boxes in the output, in input pixels, after class-wise suppression: the best `most`, by falling score.
+
+    Each lies at the mean of the boxes that were one with it.
+    """
     found = decode_grid(maps, anchors, strides, classes, threshold)
     if len(found.scores) > _CROWD * most:  # a network that is still untrained answers everywhere
         found = found.select(np.argsort(-found.scores, kind="stable")[: _CROWD * most])
-    return found.select(class_wise_nms(found.boxes, found.scores, found.classes, nms_iou)[:most])
+    kept, boxes = merging_nms(found.boxes, found.scores, found.classes, nms_iou, most)
+    return replace(found.select(kept), boxes=boxes)
 
 
 def decode_grid(

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from operators.detection.nms import class_wise_nms, intersection_over_union
+from operators.detection.nms import class_wise_nms, intersection_over_union, merging_nms
 
 
 def random_boxes(seed: int, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -72,3 +72,45 @@ def test_boxes_without_area_overlap_nothing() -> None:
     boxes = np.array([[5, 5, 5, 5], [0, 0, 10, 10]], np.float32)
     assert intersection_over_union(boxes[0], boxes).tolist() == [0, 0]
     assert len(class_wise_nms(boxes, np.ones(2, np.float32), np.zeros(2, np.int32), 0.0)) == 2
+
+
+@settings(max_examples=60, deadline=None)
+@given(SEEDS, COUNTS, THRESHOLDS, st.integers(1, 30))
+def test_merging_keeps_the_same_boxes_in_any_order(seed: int, count: int, threshold: float, most: int) -> None:
+    boxes, scores, classes = random_boxes(seed, count)
+    shuffle = np.random.default_rng(seed + 1).permutation(count)
+    kept, merged = merging_nms(boxes, scores, classes, threshold, most)
+    assert kept.tolist() == class_wise_nms(boxes, scores, classes, threshold)[:most].tolist()
+    _, again = merging_nms(boxes[shuffle], scores[shuffle], classes[shuffle], threshold, most)
+    np.testing.assert_array_equal(merged, again)
+
+
+def test_a_merged_box_lies_among_those_that_were_one_and_nearer_to_the_likelier() -> None:
+    boxes = np.array([[10, 10, 30, 30], [12, 10, 32, 30], [60, 10, 80, 30], [11, 10, 31, 30]], np.float32)
+    scores, classes = np.array([0.9, 0.3, 0.5, 0.8], np.float32), np.array([0, 0, 0, 1], np.int32)
+    kept, merged = merging_nms(boxes, scores, classes, 0.5, 10)
+    assert kept.tolist() == [0, 3, 2]
+    assert 10 < merged[0, 0] < 11
+    np.testing.assert_allclose(merged[0], [merged[0, 0], 10, merged[0, 0] + 20, 30], atol=1e-4)
+    np.testing.assert_allclose(merged[1:], boxes[[3, 2]], atol=1e-4)  # another class, and one that stands alone
+
+
+def test_merging_takes_away_errors_that_are_independent() -> None:
+    rng = np.random.default_rng(0)
+    true = np.array([100, 100, 160, 180], np.float32)
+    boxes = (true + rng.normal(0, 3, (200, 8, 4))).astype(np.float32)
+    scores, classes = rng.uniform(0.3, 1, (200, 8)).astype(np.float32), np.zeros(8, np.int32)
+    errors = np.array([
+        [np.abs(b[0] - true).mean(), np.abs(a[0] - true).mean()]
+        for one, s in zip(boxes, scores, strict=True)
+        for b, a in [(one[class_wise_nms(one, s, classes, 0.5)], merging_nms(one, s, classes, 0.5, 1)[1])]
+    ])  # fmt: skip
+    assert errors[:, 1].mean() < 0.6 * errors[:, 0].mean()
+
+
+def test_boxes_of_no_score_are_left_where_they_are() -> None:
+    boxes = np.array([[0, 0, 10, 10], [1, 0, 11, 10]], np.float32)
+    kept, merged = merging_nms(boxes, np.zeros(2, np.float32), np.zeros(2, np.int32), 0.5, 5)
+    assert kept.tolist() == [0]
+    np.testing.assert_array_equal(merged, boxes[:1])
+    assert merging_nms(boxes[:0], np.zeros(0, np.float32), np.zeros(0, np.int32), 0.5, 5)[1].shape == (0, 4)

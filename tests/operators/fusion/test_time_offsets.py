@@ -17,6 +17,7 @@ from operators.fusion.error_state import Noise
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import AngularRate, Model, Orientation, Position, Velocity
 from operators.fusion.nodes import Measurement, Sample
+from operators.fusion.sensor_errors import SensorErrors
 
 MOTION = Motion()
 NOISE = Noise(1e-4, 1e-3, 1e-6, 1e-5)
@@ -42,7 +43,7 @@ def estimated(kind: str, offset: float, seconds: float = 6.0) -> tuple[float, fl
     prior = Prior(heading=MOTION.phase, heading_sigma=0.02, position=tuple(MOTION.position(0.0).tolist()))
     begin = RATE // 2
     node = first_node(samples[:begin], prior, -GRAVITY[2], at_rest=True)
-    filter = LateFilter(FilterConfig(clocks=(("wrong", 0.1),)), node)
+    filter = LateFilter(FilterConfig(errors=SensorErrors(clocks=(("wrong", 0.1),))), node)
     rng = np.random.default_rng(1)
     for k in range(begin, len(t)):
         filter.feel(samples[k])
@@ -67,7 +68,7 @@ def test_an_unknown_offset_is_found(kind: str, offset: float) -> None:
 def test_an_offset_that_nothing_tells_of_keeps_its_sigma() -> None:
     samples = [Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE) for k in range(3)]
     node = first_node(samples, Prior(heading=0.0), -GRAVITY[2], at_rest=True)
-    filter = LateFilter(FilterConfig(clocks=(("still", 0.1),)), node)
+    filter = LateFilter(FilterConfig(errors=SensorErrors(clocks=(("still", 0.1),))), node)
     for k in range(3, 100):
         filter.feel(Sample(k * 10_000_000, np.zeros(3), -GRAVITY, NOISE))
         rate = AngularRate(np.zeros(3), np.eye(3))
@@ -77,9 +78,10 @@ def test_an_offset_that_nothing_tells_of_keeps_its_sigma() -> None:
 
 def test_offsets_come_back_from_a_snapshot_and_older_snapshots_get_them() -> None:
     _, _, filter = estimated("position", 0.05, seconds=3.0)
-    again = LateFilter.restored(FilterConfig(clocks=(("wrong", 0.1),)), filter.snapshot())
+    again = LateFilter.restored(FilterConfig(errors=SensorErrors(clocks=(("wrong", 0.1),))), filter.snapshot())
     assert again.offsets() == filter.offsets()
-    more = LateFilter.restored(FilterConfig(clocks=(("wrong", 0.1), ("z", 0.3))), filter.snapshot())
+    two = SensorErrors(clocks=(("wrong", 0.1), ("z", 0.3)))
+    more = LateFilter.restored(FilterConfig(errors=two), filter.snapshot())
     assert more.offsets()["z"][1] == pytest.approx(0.3, rel=0.01)
 
 

@@ -70,3 +70,12 @@ def test_edges_that_the_image_cuts_off_do_not_count() -> None:
 def test_a_box_that_is_partly_behind_the_camera_has_no_image() -> None:
     P = view_of(BOOK, 0.0).P
     assert np.isnan(image_boxes(np.array([[0.2, 0, 1, 0.5, 0.5, 0.5, 0]]), P, np.array([False]))).all()
+
+
+def test_leaves_inside_their_box_do_not_push_it_away_from_the_viewer() -> None:
+    plant: Box = (np.array([2.5, 0.0, 0.9]), np.array([0.12, 0.12, 0.23]), 0.0)
+    leaves = spine(plant) + np.array([0.03, 0.0, 0.0])
+    center, _, _ = fit_cuboid(
+        standing_box(leaves), [view_of(plant, y) for y in SIDEWAYS], leaves, CLASS_SIZES["plant"], noise=0.0012
+    )[1]
+    assert abs(center[0] - 2.5) < 0.02

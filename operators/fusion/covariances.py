@@ -1,0 +1,48 @@
+"""Covariances of measurements: what a message or a setting says, checked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class Unusable(Exception):
+    """A message that is ignored: says why."""
+
+
+def covariance_of(name: str, given: Array | None, sigma: float | None, setting: str) -> Array:
+    """Returns the covariance that counts: of the setting, else of the message."""
+    if sigma is not None:
+        return np.eye(3) * sigma**2
+    if given is None:
+        raise ValueError(f"{name}: its messages have no covariance, so its {setting} must say how good it is")
+    return positive(given)
+
+
+def white_part(covariance: Array, drift: Sequence[float]) -> Array:
+    """Returns the part (3, 3) of a position's covariance that is not its drift, a tenth at least."""
+    if not any(drift):
+        return covariance
+    least = 0.1 * np.diag(covariance)
+    change = np.maximum(np.diag(covariance) - np.square(drift), least) - np.diag(covariance)
+    return covariance + np.diag(change)
+
+
+def positive(covariance: Array) -> Array:
+    """Returns the covariance, symmetric. Raises Unusable for what is none."""
+    if not np.isfinite(covariance).all():
+        raise Unusable("covariance not finite")
+    symmetric = np.asarray(0.5 * (covariance + covariance.T))
+    if float(np.linalg.eigvalsh(symmetric)[0]) <= 0:
+        raise Unusable("covariance not positive")
+    return symmetric
+
+
+def check_finite(*values: Array) -> None:
+    """Raises Unusable for values that are not finite."""
+    if not all(np.isfinite(v).all() for v in values):
+        raise Unusable("not finite")

@@ -1,0 +1,60 @@
+"""Knowledge about the classes of a map: which move by themselves, and how large their things are."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.scene.class_sizes import Usual
+from operators.scene.map_object import MapObject
+from operators.scene.matching import LARGE
+
+Array = NDArray[np.float64]
+_SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
+
+
+class Kinds:
+    """Tells of objects and classes what follows from which classes move and which sizes are usual."""
+
+    def __init__(self, movers: Iterable[int], usual: Mapping[int, Sequence[Usual]]) -> None:
+        self.movers, self.usual = frozenset(movers), dict(usual)
+
+    def is_mover(self, object: MapObject) -> bool:
+        """Tells whether an object is of a class that moves by itself; small ones do only while they are moved."""
+        return object.class_id in self.movers and not self.is_still(object)
+
+    def is_still(self, object: MapObject) -> bool:
+        """Tells whether an object is small and lies still, so that it may be of a class that moves or not."""
+        size = float(object.size.max())
+        if object.class_id in self.movers:
+            size = max([size, *(max(u.size) for u in self.usual.get(object.class_id, ()))])
+        return size <= _SMALL and float(np.abs(object.velocity).max()) <= _STILL
+
+    def is_large(self, object: MapObject) -> bool:
+        """Tells whether things of an object's class are seldom seen whole."""
+        usual = self.usual.get(object.class_id)
+        return (max(u.size[1] for u in usual) if usual else float(object.size[:2].max())) >= LARGE
+
+    def is_round(self, object: MapObject) -> bool:
+        return any(u.round for u in self.usual.get(object.class_id, ()))
+
+    def near_side(self, points: Array, class_id: int, eye: Array, noise: float) -> Array:
+        """Returns one view's points (N, 3) without those that are farther behind most than such a thing is deep.
+
+        Of the ways in which the class stands, that counts which is as high as the points. `noise` is that of ranges.
+        """
+        usual = self.usual.get(class_id)
+        if not usual:
+            return points
+        way = points[:, :2] - eye[:2]
+        ranges = np.sqrt((way * way).sum(axis=1))
+        height = max(float(np.ptp(points[:, 2])), 0.01)
+        form = min(usual, key=lambda u: abs(math.log(u.size[2] / height)))
+        deep = form.size[1] * math.exp(form.spread[1]) + 4 * noise * float(ranges.min()) ** 2
+        ranked = np.sort(ranges)
+        counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
+        first = ranked[int(np.argmax(counts))]
+        return np.asarray(points[(ranges >= first) & (ranges <= first + deep)])

@@ -1,0 +1,62 @@
+"""Entries of the map that are of one thing, and what is made of them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.kinds import Kinds
+from operators.scene.map_object import MOST_EVIDENCE, MapObject
+from operators.scene.matching import closeness, tolerance
+
+_COVERED = 0.25  # share of the smaller of two boxes that both have, from which they are one
+_APART_COVERED = 0.5  # that share where both are seen beside each other
+_PART = 0.4  # that share where the classes differ
+_LIKE = 6.0  # times smaller, and what is in the other is no part of it
+_SELDOM = 0.15  # share of the views in which both are seen beside each other, from which they are two
+
+
+def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
+    """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
+    movers = kinds.is_mover(a), kinds.is_mover(b)
+    if any(movers) and a.class_id != b.class_id and not (kinds.is_still(a) and kinds.is_still(b)):
+        return False
+    if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
+        return False
+    if all(movers):
+        return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
+    volumes = float(np.prod(a.size)), float(np.prod(b.size))
+    beside = max(a.beside[b.id], b.beside[a.id]) > _SELDOM * min(a.views, b.views)
+    shared = shared_volume(a.box, b.box) / max(min(volumes), 1e-9)
+    if a.class_id != b.class_id:
+        if upright_iou(a.box, b.box) >= 0.5:
+            return True
+        like = max(volumes) <= _LIKE * min(volumes) and not (kinds.is_large(a) or kinds.is_large(b))
+        return like and not beside and shared >= _PART
+    if shared >= (_APART_COVERED if beside else _COVERED):
+        return True
+    small, large = (a, b) if len(a.cells) <= len(b.cells) else (b, a)
+    if a.images and b.images and not kinds.is_large(small):
+        return False
+    if closeness(small.cells, large.cells) <= 0.3:
+        return False
+    return large.cells.near(small.cells.points, 0.5 * tolerance(small.size) + 0.5 * voxel) >= 0.5
+
+
+def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
+    """Returns one entry for two: the older one's id, and the place of the one that was seen more often.
+
+    Voxels and images of both count only where they are of one class; else those of a part would shrink the whole.
+    """
+    best, other = (a, b) if (a.views, -a.id) > (b.views, -b.id) else (b, a)
+    if best.class_id == other.class_id and not kinds.is_mover(best):
+        best.cells.add(other.cells)
+        for image in other.images:
+            best.look(image)
+    best.votes = best.votes + other.votes
+    best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
+    best.seen, best.views = max(best.seen, other.seen), best.views + other.views
+    best.view = best.view + other.view
+    best.beside += other.beside
+    best.born, best.id = min((a.born, a.id), (b.born, b.id))
+    return best

@@ -1,0 +1,123 @@
+"""ObjectMap on observations made by hand: what is one thing, and what are two."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import invert
+from operators.scene.class_sizes import Usual
+from operators.scene.cuboid import ImageView, image_boxes
+from operators.scene.map_object import MapObject
+from operators.scene.matching import MapSettings, Observation
+from operators.scene.object_map import ObjectMap
+from operators.scene.range_view import RangeView
+
+BOX, MUG, BALL = 0, 1, 2
+SECOND = 1_000_000_000
+BALL_SIZE = {BALL: (Usual((0.12, 0.12, 0.12), (0.4, 0.4, 0.4), True),)}
+K = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+Solid = tuple[Sequence[float], Sequence[float]]
+"""Centre and full size of a box along the axes."""
+
+
+def looking(y: float) -> NDArray[np.float64]:
+    """The pose of a camera at the origin, moved sideways, that looks along x."""
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T[:3, 3] = [0, y, 0.2]
+    return T
+
+
+def surface(solid: Solid) -> NDArray[np.float64]:
+    """Points on the side that faces the camera."""
+    center, size = np.array(solid[0]), np.array(solid[1])
+    grid = np.stack(np.meshgrid(np.linspace(-0.45, 0.45, 7), np.linspace(-0.45, 0.45, 7)), axis=-1).reshape(-1, 2)
+    return np.asarray(center + np.column_stack([np.full(len(grid), -0.5), grid]) * size)
+
+
+def observation(solid: Solid, class_id: int, T: NDArray[np.float64]) -> Observation:
+    P = K @ invert(T)[:3]
+    box = image_boxes(np.array([[*solid[0], *solid[1], 0.0]]), P, np.array([False]))[0]
+    return Observation(surface(solid), class_id, 0.8, None, ImageView(P, box, np.ones(4, np.bool_), T[:3, 3]))
+
+
+def after(scenes: Sequence[Sequence[tuple[Solid, int]]]) -> ObjectMap:
+    """The map after views of things, each said to be of a class, a quarter of a second apart."""
+    known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE)
+    for k, scene in enumerate(scenes):
+        T = looking(0.4 * np.sin(k))
+        wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
+        hidden = np.zeros(len(wall), np.bool_)
+        way = wall - T[:3, 3]
+        for solid, _ in scene:
+            center, size = np.array(solid[0]), np.array(solid[1])
+            at = T[:3, 3] + way * ((center[0] - T[0, 3]) / way[:, :1])
+            hidden |= (np.abs(at - center)[:, 1:] < size[1:] / 2).all(axis=1)
+        points = np.concatenate([wall[~hidden], *(surface(solid) for solid, _ in scene)])
+        seen = [observation(solid, class_id, T) for solid, class_id in scene]
+        in_sensor = (points - T[:3, 3]) @ T[:3, :3]
+        known.update((k + 1) * SECOND // 4, seen, RangeView(in_sensor, T, 0.012))
+    return known
+
+
+THING: Solid = ((2.0, 0.0, 0.1), (0.12, 0.12, 0.12))
+
+
+def only(known: ObjectMap) -> MapObject:
+    (object,) = known.confirmed()
+    return object
+
+
+def test_a_thing_that_is_called_by_turns_a_mover_and_not_is_one_object() -> None:
+    scenes = [[(THING, BALL if k % 3 == 0 else MUG)] for k in range(12)]
+    object = only(after(scenes))
+    assert object.class_id == MUG
+    assert object.views == 12
+
+
+def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:
+    """The foot of a thing, detected as something else where its top is hidden."""
+    foot: Solid = ((2.0, 0.0, 0.07), (0.12, 0.12, 0.06))
+    scenes: list[list[tuple[Solid, int]]] = [[(THING, BOX)]] * 6 + [[(foot, MUG)]] * 4 + [[(THING, BOX)]] * 2
+    assert only(after(scenes)).class_id == BOX
+
+
+@pytest.mark.parametrize("gap", [0.0, 0.03])
+def test_neighbours_that_are_seen_beside_each_other_are_two(gap: float) -> None:
+    beside: Solid = ((2.0, 0.12 + gap, 0.1), THING[1])
+    assert len(after([[(THING, BOX), (beside, MUG)]] * 8).confirmed()) == 2
+
+
+def test_a_ball_that_lies_still_is_remembered_and_one_that_is_moved_keeps_its_id() -> None:
+    lying = after([[(THING, BALL)]] * 6 + [[]] * 2)
+    assert only(lying).id == 1
+    moved = [[(((2.0, 0.08 * k, 0.1), THING[1]), BALL)] for k in range(1, 9)]
+    object = only(after([[(THING, BALL)]] * 6 + moved))
+    assert object.id == 1
+    assert abs(object.center[1] - 0.64) < 0.1
+
+
+def test_background_that_shows_through_a_small_thing_is_not_taken_for_a_large_one() -> None:
+    small, large = Usual((0.12, 0.12, 0.2), (0.3, 0.3, 0.2)), Usual((0.4, 0.45, 0.9), (0.3, 0.3, 0.2))
+    known = ObjectMap(1, [], MapSettings(), {BOX: (small, large)})
+    plant: Solid = ((2.0, 0.0, 0.1), (0.12, 0.12, 0.2))
+    for k in range(6):
+        T = looking(0.4 * np.sin(k))
+        seen = observation(plant, BOX, T)
+        behind = surface(plant)[::4] + np.array([0.6, 0.0, 0.0])
+        each = Observation(np.concatenate([seen.points, behind]), BOX, 0.8, None, seen.image)
+        known.update((k + 1) * SECOND // 4, [each], RangeView((each.points - T[:3, 3]) @ T[:3, :3], T, 0.012))
+    assert only(known).size.max() < 0.3
+
+
+def test_what_was_seen_beside_what_is_in_the_snapshot() -> None:
+    beside: Solid = ((2.0, 0.13, 0.1), THING[1])
+    known = after([[(THING, BOX), (beside, MUG)]] * 5)
+    again = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE)
+    again.restore(known.snapshot())
+    assert [o.beside for o in again.objects.values()] == [o.beside for o in known.objects.values()]
+    assert known.objects[1].beside[2] > 0
