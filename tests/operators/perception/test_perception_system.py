@@ -115,6 +115,7 @@ def test_without_fusion_the_camera_gives_the_pose_and_arrays_will_do(room: Room)
             result = system.process(stamp, image=step["image"].data, depth=step["depth"].data)
     assert result.pose is not None
     assert result.masks is result.segmentation is not None
+    assert {"odometry", "lifter", "objects"} <= result.status.keys()
     assert {"cloud", "detections", "tracks", "boxes", "objects", "graph"} <= result.made().keys()
 
 
@@ -157,7 +158,7 @@ def test_it_takes_what_is_there(room: Room, sensors: tuple[str, ...], there: set
 
 
 def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None:
-    (first, given), (second, _) = list(room.given("image", "depth"))[:2]
+    (first, given), (second, following) = list(room.given("image", "depth"))[:2]
     image, depth = given["image"].data, given["depth"].data
     with room.system() as system:
         with pytest.raises(ValueError, match="image has 10x20 pixels, but image_info describes 320x240"):
@@ -175,7 +176,7 @@ def test_what_does_not_fit_is_refused_and_the_system_goes_on(room: Room) -> None
         assert system.process(first, image=image, depth=depth).pose is not None
         with pytest.raises(ValueError, match="stamps must increase"):
             system.process(first, image=image, depth=depth)
-        assert system.process(second, image=image, depth=depth).cloud is not None
+        assert system.process(second, **following).cloud is not None
 
 
 @pytest.mark.parametrize(
