@@ -59,7 +59,7 @@ def read(seconds: float) -> tuple[Steps, Steps, dict[str, Message]]:
     return dict(sorted(measured.items())), true, statics
 
 
-def blacked(name: str, message: Any) -> Message:
+def blacked(name: str, message: Any) -> Any:
     """The measurement of a sensor that shows nothing."""
     if name in ("image", "depth"):
         return message.replace(data=np.zeros_like(message.data))
@@ -70,7 +70,7 @@ def blacked(name: str, message: Any) -> Message:
     return message.replace(linear=np.zeros(3), angular=np.zeros(3))
 
 
-def misscaled(name: str, message: Any) -> Message:
+def misscaled(name: str, message: Any) -> Any:
     if name == "depth":
         return message.replace(data=message.data * np.float32(SCALE))
     if name == "wheels":
@@ -224,7 +224,7 @@ def main() -> None:
         name = f"{sensor} {kind}".strip() or "none"
         if name in rows:
             continue
-        given = dict(statics)
+        given: dict[str, Any] = dict(statics)
         if kind == "miscalibrated" and sensor in FRAMES:
             given["extrinsics"] = turned(given["extrinsics"], FRAMES[sensor])
         try:

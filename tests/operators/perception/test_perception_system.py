@@ -58,7 +58,7 @@ def room() -> Room:
         for message in whole.between(0, END)[stream]:
             decoder = decoders.get(name)
             steps.setdefault(message.stamp, {})[name] = message if decoder is None else decoder.process(message)
-    infos = (whole[name][0] for name in ("image_info", "depth_info", "extrinsics"))
+    infos: Any = (whole[name][0] for name in ("image_info", "depth_info", "extrinsics"))
     return Room(dict(sorted(steps.items())), *infos)
 
 
@@ -99,7 +99,7 @@ def test_several_samples_of_one_step_are_taken_at_their_own_stamps(room: Room) -
         together = []
         for before, stamp in zip([-1, *stamps], stamps, strict=False):
             within = [step for at, step in room.steps.items() if before < at <= stamp]
-            batches = {n: [step[n] for step in within if n in step] for n in ("imu", "wheels")}
+            batches: dict[str, Any] = {n: [step[n] for step in within if n in step] for n in ("imu", "wheels")}
             together.append(two.process(stamp, **frames[stamp], **batches))
     first = [pose.digest() for result in singly for pose in result.poses]
     second = [pose.digest() for result in together for pose in result.poses]
@@ -133,7 +133,8 @@ def test_a_missing_sensor_takes_only_what_depends_on_it(room: Room) -> None:
                 system.process(stamp, **step)
     assert blind.detections is not None
     assert blind.pose is not None
-    assert blind.cloud is blind.graph is None
+    assert blind.cloud is None
+    assert blind.graph is None
 
 
 @pytest.mark.parametrize(
