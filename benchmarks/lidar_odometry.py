@@ -25,29 +25,19 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 
 import numpy as np  # noqa: E402
 import small_gicp  # noqa: E402
+from lidar_worlds import Drive, rendered  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
-from dataflow.messages import Odometry, PointCloud, Transforms  # noqa: E402
+from dataflow.messages import Odometry, PointCloud  # noqa: E402
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.geometry import se3  # noqa: E402
 from operators.odometry import LidarOdometry  # noqa: E402
-from operators.sources import KittiRaw, SimulatedRobot  # noqa: E402
+from operators.sources import KittiRaw  # noqa: E402
 
 Array = NDArray[np.float64]
 DATA = Path(os.environ.get("PERCEPTION_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
+WORLDS = tuple(f"{kind}:{seed}" for seed in (501, 502) for kind in ("office", "corridor", "table_top", "yard"))
 PEERS = ("kiss", "vgicp", "KissICP", "GenZICP", "MadICP", "CTICP", "LOAM", "FORM")
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """Scans with what is known of the sensor, and the true pose of each (empty where unknown)."""
-
-    clouds: list[PointCloud]
-    truth: list[Array]
-    sensor: dict[str, Any]
-
-    def without_times(self) -> Drive:
-        return Drive([cloud.replace(time_offsets=None) for cloud in self.clouds], self.truth, self.sensor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,25 +56,6 @@ def kitti() -> Drive:
     clouds = [messages["points"] for messages in source.stream()]
     assert all(isinstance(cloud, PointCloud) for cloud in clouds)
     return Drive(clouds, [], {"near": 2.0, "far": 100.0, "rate": 10.0, "rows": 64, "columns": 2048, "indoors": False})  # type: ignore[arg-type]
-
-
-def world(name: str, seed: int, seconds: int) -> Drive:
-    off = {"rate": 0.0}
-    truth_of: dict[str, Any] = {"poses": 10.0, "boxes": False, "relations": 0.0, "activities": 0.0}
-    robot = SimulatedRobot(
-        world=name, seed=seed, duration=f"{seconds}s", color_camera=off, depth_camera=off,
-        lidar={"rate": 10.0, "motion": True}, truth=truth_of,
-    )  # fmt: skip
-    robot.setup()
-    mount = robot.static_outputs()["extrinsics"]
-    assert isinstance(mount, Transforms)
-    clouds, truth = [], []
-    for messages in robot.stream():
-        cloud, base = messages.get("points"), messages.get("true_base")
-        if isinstance(cloud, PointCloud) and isinstance(base, Odometry):
-            clouds.append(cloud)
-            truth.append(base.matrix() @ mount.matrix("lidar"))
-    return Drive(clouds, truth, {"near": 0.5, "far": 30.0, "rate": 10.0, "rows": 16, "columns": 360, "indoors": True})
 
 
 def ours(drive: Drive) -> Outcome:
@@ -174,7 +145,7 @@ def table_of_drive(runners: dict[str, Callable[[Drive], Outcome]], rounds: int) 
 
 
 def table_of_worlds(
-    runners: dict[str, Callable[[Drive], Outcome]], worlds: list[tuple[str, int]], seconds: int
+    runners: dict[str, Callable[[Drive], Outcome]], worlds: list[tuple[str, int]], seconds: int, cache: Path
 ) -> None:
     print("| world | odometry | deskewed: ATE cm | end cm | end deg | as taken: ATE cm | end cm | CPU ms | said |")
     print("| --- " * 9 + "|")
@@ -182,7 +153,7 @@ def table_of_worlds(
     nees: list[Array] = []
     states: Counter[str] = Counter()
     for name, seed in worlds:
-        drive = world(name, seed, seconds)
+        drive = rendered(cache, name, seed, 70 if name == "corridor" else 60, 0.8).part(0, 10 * seconds)
         for label, run in runners.items():
             timed, plain = run(drive), run(drive.without_times())
             a, b = drift(timed.poses, drive.truth), drift(plain.poses, drive.truth)
@@ -212,8 +183,9 @@ def main() -> None:
     parser.add_argument("--peers", type=Path, help="virtual environment with the peers")
     parser.add_argument("--only", choices=["kitti", "worlds"])
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[21, 22])
-    parser.add_argument("--seconds", type=int, default=20)
+    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), help="KIND:SEED")
+    parser.add_argument("--seconds", type=int, default=30, help="of each drive, of 60 or 70 s at 0.8 m/s")
+    parser.add_argument("--cache", type=Path, default=Path("out") / "lidar_worlds", help="folder of rendered drives")
     parser.add_argument("--names", nargs="+", default=list(PEERS), help="which peers")
     arguments = parser.parse_args()
     runners: dict[str, Callable[[Drive], Outcome]] = {"ours": ours}
@@ -222,8 +194,8 @@ def main() -> None:
     if arguments.only != "worlds":
         table_of_drive(runners, arguments.rounds)
     if arguments.only != "kitti":
-        worlds = [(name, seed) for name in ("office", "corridor", "table_top") for seed in arguments.seeds]
-        table_of_worlds(runners, worlds, arguments.seconds)
+        worlds = [(name, int(seed)) for name, _, seed in (given.partition(":") for given in arguments.worlds)]
+        table_of_worlds(runners, worlds, arguments.seconds, arguments.cache)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from dataflow.cli.execution import Outputs, execute, plan_options
 from dataflow.cli.output import fail, friendly_errors, out, print_json, say
 from dataflow.cli.run_options import Quiet
 
-GRAPH, RECORDING = "simulated_robot", "demo"
+GRAPH, RECORDING = "perception", "demo"
 SHOWN = "dataflow-demo.rrd"
 """The file that the demo writes where there is no display."""
 
@@ -42,9 +42,9 @@ def demo(
 ) -> None:
     """Show a robot's perception at work: the bundled recording through all operators, in the viewer.
 
-    A robot drives through an office for 21 seconds. Clouds, odometry, objects and pixel classes are computed while you
-    look, in real time; at the end their accuracy is printed. Without a display everything that would have been shown
-    is written to a file, as fast as the machine goes.
+    A robot drives through an office for 21 seconds. Odometry, objects, a map of them and a scene graph are computed
+    while you look, in real time: what is where, who does what and where to; at the end their accuracy is printed.
+    Without a display everything that would have been shown is written to a file, as fast as the machine goes.
 
     Examples:
 
@@ -82,6 +82,8 @@ def demo(
         return
     if outputs.view_file is not None:
         out.print(Text(f"look at it where there is a display: rerun {outputs.view_file}"), soft_wrap=True)
+    again = f"dataflow replay {recording} --graph {GRAPH} --record demo.mcap"
+    out.print(Text(f"the same, recorded: {again}; then what it found: dataflow scene demo.mcap"), soft_wrap=True)
     out.print(Text(f"the graph: dataflow graphs {GRAPH}; all graphs: dataflow graphs"), soft_wrap=True)
 
 

@@ -44,17 +44,19 @@ class SceneSummary:
     """The relations of a graph that are worth telling.
 
     - `carriers`: by node, what it stands on, lies in or sits on: one relation at most, without loops.
+    - `children`: by node, the nodes that it carries.
     - `telling`: the others, those of agents first, then by score.
     - `intentions`: where agents may be going, likeliest first.
     """
 
     carriers: Mapping[int, Told]
+    children: Mapping[int, Sequence[int]]
     telling: tuple[Told, ...]
     intentions: tuple[Told, ...]
 
     def carried(self, node: int) -> tuple[int, ...]:
         """The nodes that `node` carries, by index."""
-        return tuple(child for child, relation in self.carriers.items() if relation.object == node)
+        return tuple(self.children.get(node, ()))
 
 
 def class_names(graph: SceneGraph) -> tuple[str, ...]:
@@ -65,27 +67,34 @@ def class_names(graph: SceneGraph) -> tuple[str, ...]:
 def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
     """Chooses what to tell of a graph: who carries what, intentions, and at most `most` other relations.
 
-    Of the others the commonest predicates are left out first, `near` and its like always unless an agent is in it and
-    there is nothing else.
+    `SURROUNDINGS` are left out, then the commonest predicates until few enough are left; an agent has its strongest
+    relation of each kind (it faces one thing, not five).
     """
     classes = class_names(graph)
     scores = [1.0] * len(graph.subjects) if graph.relation_scores is None else graph.relation_scores.tolist()
-    every = [Told(s, p, o, score) for (s, p, o), score in zip(graph.relations(), scores, strict=True) if s != o]
+    every = [
+        Told(s, p, o, score)
+        for (s, p, o), score in zip(graph.relations(), scores, strict=True)
+        if s != o and p not in SURROUNDINGS
+    ]
     carriers = _carriers([r for r in every if r.predicate in CARRYING and r.score >= LEAST])
     intentions = sorted((r for r in every if r.predicate == HEADS_FOR), key=lambda r: (r.subject, -r.score))
-    rest = [
-        r
-        for r in every
-        if r.predicate not in CARRYING and r.predicate != HEADS_FOR and r.score >= LEAST
-        and r.predicate not in SURROUNDINGS
-    ]  # fmt: skip
+    rest = [r for r in every if r.predicate not in CARRYING and r.predicate != HEADS_FOR and r.score >= LEAST]
     counts = Counter(r.predicate for r in rest)
     while len(rest) > most and len(counts) > 1:
         commonest = counts.most_common(1)[0][0]
         del counts[commonest]
         rest = [r for r in rest if r.predicate != commonest]
     rest.sort(key=lambda r: (classes[r.subject] not in AGENTS, -r.score, r.subject, r.object))
-    return SceneSummary(carriers, tuple(rest[:most]), tuple(intentions))
+    told: list[Told] = []
+    for r in rest:
+        before = any((r.subject, r.predicate) == (other.subject, other.predicate) for other in told)
+        if not (before and classes[r.subject] in AGENTS):
+            told.append(r)
+    children: dict[int, list[int]] = {}
+    for child, relation in carriers.items():
+        children.setdefault(relation.object, []).append(child)
+    return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions))
 
 
 def _carriers(relations: Sequence[Told]) -> dict[int, Told]:
@@ -131,10 +140,11 @@ def agents_in_words(graph: SceneGraph, summary: SceneSummary, activities: Activi
         if identity in acts:
             words.append(f"{spaced(acts[identity][0])} {percent(acts[identity][1])}")
         related = [r for r in summary.telling if r.subject == node]
-        if node in summary.carriers:
+        if node in summary.carriers and classes[summary.carriers[node].object] not in PLACES:
             related.insert(0, summary.carriers[node])
         words += [f"{spaced(r.predicate)} {names[r.object]}" for r in related]
-        words += [f"heads for {names[r.object]} ({percent(r.score)})" for r in summary.intentions if r.subject == node]
+        goals = [f"{names[r.object]} ({percent(r.score)})" for r in summary.intentions if r.subject == node]
+        words += ["heads for " + " or ".join(goals)] if goals else []
         rows.append(Row(name, ", ".join(words)))
     return sorted(rows, key=lambda row: (row.name.split()[0] not in PEOPLE, not row.text))
 

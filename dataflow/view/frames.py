@@ -150,7 +150,7 @@ class FrameTree:
                 return None
             poses = self._sightings[frame, edge.owner].poses if not edge.assumed else ()
             then = next((pose for at, pose in reversed(poses) if at == stamp), None)
-            if then is None and len(poses) > 1:
+            if then is None and (edge.rank not in (Rank.TREE, None) or len(poses) > 1):
                 return None
             T = (edge.T_parent_child if then is None else then) @ T
             frame = edge.parent

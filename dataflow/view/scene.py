@@ -56,7 +56,7 @@ class ViewOptions:
     max_points: int = 200_000
     point_step: float = 0.0
     kept_step: float = 0.05
-    kept_after: int = 5
+    kept_after: int = 4
     trail: float = 0.01
     track_history: int = 5_000_000_000
 

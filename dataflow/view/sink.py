@@ -37,6 +37,9 @@ SETTLE = 1_000_000_000
 FILE_OPTIONS = ViewOptions(jpeg_quality=75, depth_step=0.02, max_points=2_500, point_step=2.0**-7)
 """Contents of a file unless more is asked for: for looking, not for measuring."""
 
+_FILE_BATCHES = rr.ChunkBatcherConfig(flush_tick=10.0, flush_num_bytes=8 << 20)
+"""Rows of an entity go into a file together: one at a time, each has a header larger than most rows."""
+
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
@@ -112,7 +115,8 @@ class ViewerSink:
         self._graph = graph
         self._scene = SceneState(layout(streams, graph, static), self._options)
         name = graph.name if graph is not None else self._application
-        recording = rr.RecordingStream(name, recording_id=uuid.uuid4())
+        batches = _FILE_BATCHES if isinstance(self.target, Save) else None
+        recording = rr.RecordingStream(name, recording_id=uuid.uuid4(), batcher_config=batches)
         try:
             self._reach(recording)
         except ViewerError:

@@ -8,12 +8,22 @@ pictures of that data must not be passed on.
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 
 import cv2
+import numpy as np
+import numpy.typing as npt
+
+from dataflow.graph import load_graph
+from dataflow.recording import Recording
+from dataflow.view import Save, ViewerSink, from_recording
+
+Picture = npt.NDArray[np.uint8]
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent.parent
@@ -32,20 +42,76 @@ VIEWS: dict[str, tuple[str, ...]] = {
         "--set",
         f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}",
     ),
-    "perception": ("replay", "recordings/demo.mcap", "--graph", "graphs/perception.yaml"),
     "slam": ("run", "graphs/slam.yaml", "--set", "duration=26s"),
+    "slam_lidar": ("run", "graphs/slam_lidar.yaml", "--set", "duration=26s"),
     "stereo": ("run", "graphs/simulated_stereo.yaml"),
 }
 """The arguments of `dataflow` by the picture's name."""
 
-LATER = {"fusion": 39, "slam": 22}
+LATER = {"fusion": 39, "slam": 22, "slam_lidar": 22}
 """Seconds after the start of which a picture is, where there is little to be seen at first."""
+
+GROWN = "demo"
+"""The picture of the whole perception."""
+
+MOMENT = 9.2
+"""Seconds after its start at which it is taken: a person walks to a chair."""
+
+WIDE, HIGH = 4800, 3000
+"""The screen is so large that the pointer, in its middle, is not on the window."""
+
+
+def rendered(shown: Path) -> Picture:
+    """What the viewer shows of a file, a moment after it is opened."""
+    programs, large = Path(sys.executable).parent, shown.with_suffix(".png")
+    subprocess.run(
+        ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(programs / "rerun"), "--screenshot-to", str(large),
+         "--window-size", f"{SIZE[0]}x{SIZE[1]}", "--bind", "127.0.0.1", "--new", str(shown)],
+        check=True, capture_output=True, timeout=180,
+    )  # fmt: skip
+    pixels = cv2.imread(str(large))
+    if pixels is None:
+        raise SystemExit(f"the viewer wrote no picture of {shown.name}")
+    return np.asarray(cv2.resize(pixels, SIZE, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def perceived(folder: Path) -> tuple[Path, Path]:
+    """Runs the perception on the bundled recording; its graph and a recording of all that it shows, in the folder."""
+    shutil.copytree(REPOSITORY / "graphs", folder / "graphs")
+    graph, recorded = folder / "graphs" / "perception.yaml", folder / "perception.mcap"
+    text = re.sub("^record:.*\n", "", graph.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    graph.write_text(text, encoding="utf-8")
+    words = ["replay", "recordings/demo.mcap", "--graph", str(graph), "--record", str(recorded), "--quiet"]
+    subprocess.run([sys.executable, "-m", "dataflow.cli.main", *words], cwd=REPOSITORY, check=True)
+    return graph, recorded
+
+
+def at(seconds: float, graph: Path, recorded: Path, file: Path) -> None:
+    """Writes what the viewer shows after so many seconds."""
+    made = load_graph(graph)
+    with Recording(recorded) as recording:
+        begins = min(i.first for i in recording.streams.values() if i.first is not None and not i.static)
+        with ViewerSink(Save(file, at_end=True)) as sink:
+            streams = [name for name, info in recording.streams.items() if info.message_type is not None]
+            from_recording(recording, sink, streams, end=begins + round(seconds * 1e9), graph=made)
+
+
+def grown(folder: Path) -> Path:
+    """The picture of the whole perception."""
+    graph, recorded = perceived(folder)
+    at(MOMENT, graph, recorded, folder / "moment.rrd")
+    return written(rendered(folder / "moment.rrd"), f"{GROWN}.png")
+
+
+def written(pixels: Picture, name: str) -> Path:
+    file = HERE / name
+    cv2.imwrite(str(file), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    return file
 
 
 def picture(name: str, folder: Path) -> Path:
     """Runs a graph, renders what the viewer shows of it, and writes NAME.png beside this file."""
-    shown, large = folder / f"{name}.rrd", folder / f"{name}.png"
-    programs = Path(sys.executable).parent
+    shown = folder / f"{name}.rrd"
     command = [sys.executable, "-m", "dataflow.cli.main"]
     if name in LATER:
         recorded = folder / f"{name}.mcap"
@@ -56,29 +122,18 @@ def picture(name: str, folder: Path) -> Path:
         recorded.unlink()
     else:
         subprocess.run([*command, *VIEWS[name], "--view", str(shown), "--quiet"], cwd=REPOSITORY, check=True)
-    size = f"{SIZE[0]}x{SIZE[1]}"
-    # The screen is so large that the pointer, in its middle, is not on the window.
-    subprocess.run(
-        ["xvfb-run", "-a", "-s", "-screen 0 4800x3000x24", str(programs / "rerun"), "--screenshot-to", str(large),
-         "--window-size", size, "--bind", "127.0.0.1", "--new", str(shown)],
-        check=True, capture_output=True, timeout=180,
-    )  # fmt: skip
-    pixels = cv2.imread(str(large))
-    if pixels is None:
-        raise SystemExit(f"the viewer wrote no picture of {name}")
-    file = HERE / f"{name}.png"
-    cv2.imwrite(str(file), cv2.resize(pixels, SIZE, interpolation=cv2.INTER_AREA), [cv2.IMWRITE_PNG_COMPRESSION, 9])
-    return file
+    return written(rendered(shown), f"{name}.png")
 
 
 def main() -> None:
-    names = sys.argv[1:] or list(VIEWS)
-    unknown = [name for name in names if name not in VIEWS]
+    known = [GROWN, *VIEWS]
+    names = sys.argv[1:] or known
+    unknown = [name for name in names if name not in known]
     if unknown:
-        raise SystemExit(f"no view {unknown[0]!r}; there are {', '.join(VIEWS)}")
-    with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            print(picture(name, Path(folder)))
+        raise SystemExit(f"no view {unknown[0]!r}; there are {', '.join(known)}")
+    for name in names:
+        with tempfile.TemporaryDirectory() as folder:
+            print(grown(Path(folder)) if name == GROWN else picture(name, Path(folder)))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from operators.cloud.cloud_registration import CloudRegistration
     from operators.cloud.clusterer import Clusterer
     from operators.cloud.plane_segmenter import PlaneSegmenter
+    from operators.cloud.scan_watch import ScanWatch
 else:  # most need scipy, which a graph without them need not load
     __getattr__, __dir__ = lazily(
         __name__,
@@ -21,7 +22,16 @@ else:  # most need scipy, which a graph without them need not load
             "cloud_registration": ("CloudRegistration",),
             "clusterer": ("Clusterer",),
             "plane_segmenter": ("PlaneSegmenter",),
+            "scan_watch": ("ScanWatch",),
         },
     )
 
-__all__ = ["CloudBuilder", "CloudColorizer", "CloudFilter", "CloudRegistration", "Clusterer", "PlaneSegmenter"]
+__all__ = [
+    "CloudBuilder",
+    "CloudColorizer",
+    "CloudFilter",
+    "CloudRegistration",
+    "Clusterer",
+    "PlaneSegmenter",
+    "ScanWatch",
+]

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 import small_gicp
 from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
 from scipy.spatial import cKDTree
 
 from dataflow.messages.geometry import transform_points
@@ -21,10 +22,12 @@ Indices = NDArray[np.intp]
 
 
 FEWEST = 100  # voxels with a normal that a cloud must have
+_MODES = 60  # motions of RANSAC that are compared
+_SAME_TURN = 0.98  # cosine of the turn within which motions are like each other
 _TRIED = 12  # motions that are refined
 _RIVAL = 0.03  # a second motion whose score is that near to the best one's makes the result ambiguous
 _CORRELATED = 30.0  # voxels whose errors are alike, for the covariance
-_TELLING = 0.02  # share of the surfaces that must face along every direction
+_TELLING = 0.03  # share of the surfaces that must face along every direction
 
 
 @dataclass(frozen=True)
@@ -101,12 +104,11 @@ def register(source: Prepared, target: Prepared, settings: Settings, rng: np.ran
         return failure("no motion agrees with the features")
     tree = cKDTree(target.points)
     starts.sort(key=lambda T: -_agreement(source, target, tree, T, 3 * settings.voxel))
-    distinct: list[Array] = []
+    tried: list[Registered] = []
     for T in starts:
-        if all(apart(T, other, settings.voxel) for other in distinct):
-            distinct.append(T)
-    tried = [refine(source, target, T, settings) for T in distinct[:_TRIED]]
-    tried.sort(key=lambda found: -found.score)
+        if len(tried) < _TRIED and not any(_led_by(T, found.T, settings.voxel) for found in tried):
+            tried.append(refine(source, target, T, settings))
+    tried.sort(key=lambda found: (bool(found.reason), -found.score))
     best = tried[0]
     for other in tried[1:]:
         near = other.score > best.score - _RIVAL and other.overlap > 0.7 * best.overlap
@@ -172,13 +174,13 @@ def _told(source: Prepared, target: Prepared, T: Array, voxel: float) -> bool:
     near = np.isfinite(distance)
     points, normals = moved[near], target.normals[index[near]]
     centred = points - points.mean(axis=0)
-    arms = np.cross(centred, normals) / max(float(np.sqrt(np.square(centred).sum(axis=1).mean())), 1e-9)
-    for lean in (normals, arms):
-        _, axes = np.linalg.eigh(lean.T @ lean)
-        along = np.abs(lean @ axes)
-        if (np.where(along > 0.3, along**2, 0).mean(axis=0) < _TELLING).any():
-            return False
-    return True
+    arms = np.cross(centred, normals)
+    _, axes = np.linalg.eigh(arms.T @ arms)
+    # Over the points' distance from each axis: what is long is thin about its length.
+    aside = np.square(centred).sum(axis=1, keepdims=True) - np.square(centred @ axes)
+    turning = arms @ axes / np.sqrt(np.maximum(aside.mean(axis=0), 1e-12))
+    moving = normals @ np.linalg.eigh(normals.T @ normals)[1]
+    return not any((np.where(np.abs(x) > 0.3, x**2, 0).mean(axis=0) < _TELLING).any() for x in (moving, turning))
 
 
 def apart(A: Array, B: Array, voxel: float) -> bool:
@@ -187,7 +189,14 @@ def apart(A: Array, B: Array, voxel: float) -> bool:
     return bool(np.linalg.norm(off[:3]) > 4 * voxel or np.linalg.norm(off[3:]) > 0.1)
 
 
+def _led_by(start: Array, found: Array, voxel: float) -> bool:
+    """Tells whether a start is so near to a motion that it would lead to it again."""
+    off = se3.log(np.linalg.inv(start) @ found)
+    return bool(np.linalg.norm(off[:3]) < 10 * voxel and np.linalg.norm(off[3:]) < 0.35)
+
+
 _CELL = 0.03  # radians, of the panorama in which sight lines are compared
+_AROUND = int(2 * np.pi / _CELL) + 1  # cells around it
 
 
 def _panorama(points: Array) -> tuple[Indices, Array]:
@@ -216,13 +225,26 @@ def _visible(moved: Array, seen: Array) -> NDArray[np.bool_]:
 
 
 def _violation(moved: Array, seen: Array) -> float:
-    """Returns the share of points that hang in front of what the sensor at the origin saw in their direction."""
+    """Returns the share of points that hang before what the sensor at the origin saw in and around their direction.
+
+    Around, since beams pass beside what is thin and beside edges: something that hangs there stands before all of them.
+    """
     cell, distance = _panorama(moved)
-    sight = _sight(seen)[cell]
-    known = sight > 0
+    sight = _sight(seen)
+    known = sight[cell] > 0
     if known.sum() < 50:
         return 1.0
-    return float((known & (distance < 0.92 * sight - 0.1)).sum() / known.sum())
+    free = _free(sight)[cell]
+    return float((known & (distance < 0.92 * free - 0.1)).sum() / known.sum())
+
+
+def _free(sight: Array) -> Array:
+    """Returns the least of the sights in each cell of the panorama and in those around it that have one."""
+    grid = np.where(sight > 0, sight, np.inf).reshape(256, 256)[:_AROUND]
+    wrapped = np.concatenate([grid[-1:], grid, grid[:1]])
+    free = np.full((256, 256), np.inf)
+    free[:_AROUND] = minimum_filter(wrapped, size=3, mode="nearest")[1:-1]
+    return np.asarray(free.ravel())
 
 
 def _matches(source: Array, target: Array) -> Indices:
@@ -249,8 +271,23 @@ def _starts(source: Array, target: Array, settings: Settings, rng: np.random.Gen
     votes = np.zeros(len(motions), np.int64)
     for k, T in enumerate(motions):
         votes[k] = (np.linalg.norm(transform_points(T, source) - target, axis=1) <= 2.5 * settings.voxel).sum()
-    order = np.argsort(-votes, kind="stable")[:60]
-    return [motions[k] for k in order if votes[k] >= 4]
+    order = np.argsort(-votes, kind="stable")
+    return _modes(motions[order[votes[order] >= 4]], 5 * settings.voxel)
+
+
+def _modes(motions: Array, near: float) -> list[Array]:
+    """Returns motions (4, 4) that are apart, of (K, 4, 4) in their order: each stands for all that are like it.
+
+    A room that looks alike from both ends has many triples for one of two motions, and both are to be tried.
+    """
+    found: list[Array] = []
+    while len(motions) and len(found) < _MODES:
+        best = motions[0]
+        found.append(best)
+        cosine = (np.einsum("kij,ij->k", motions[:, :3, :3], best[:3, :3]) - 1) / 2
+        away = np.linalg.norm(motions[:, :3, 3] - best[:3, 3], axis=1)
+        motions = motions[(away > near) | (cosine < _SAME_TURN)]
+    return found
 
 
 def _rigid(source: Array, target: Array) -> Array:

@@ -27,7 +27,7 @@ class CustomDetector(Operator):
         None, doc="network file written by `dataflow train detector`; none means the shipped one"
     )
     score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes below are dropped")
-    nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which a class's weaker box joins the other")
+    nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which a box of a class joins a stronger")
     max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
 
     def setup(self) -> None:

@@ -77,7 +77,7 @@ def log_rotation(R: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Wander:
-    """How lasting errors of sensors change: rates of decay (K,) in 1/s, densities of noise (K,) in their unit/√s."""
+    """Holds how lasting errors of sensors change: rates of decay (K,) in 1/s, noise (K,) in their unit/√s."""
 
     decay: Array = field(default_factory=lambda: np.zeros(0))
     noise: Array = field(default_factory=lambda: np.zeros(0))

@@ -22,7 +22,7 @@ _CLOCK_WALK = 1e-4
 
 @dataclass(frozen=True)
 class SensorErrors:
-    """Which errors are states, by sensor, in the order of the state's `errors`.
+    """Says which errors are states, by sensor, in the order of the state's `errors`.
 
     `clocks`: standard deviation of the first time offset, s; `drifts`: standard deviations of what is added to a
     position (east, north, up, m) and the time in which that changes, s; `scales`: that of the share by which a forward
@@ -41,7 +41,7 @@ class SensorErrors:
 
     @property
     def wander(self) -> Wander:
-        """How they change."""
+        """Returns how they change."""
         decay = [0.0] * len(self.clocks)
         noise = [_CLOCK_WALK] * len(self.clocks)
         for _, sigmas, seconds in self.drifts:

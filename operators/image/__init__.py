@@ -1,6 +1,7 @@
-"""Operators that prepare images: without distortion, rectified, cropped, scaled, evenly bright."""
+"""Operators that prepare images: without distortion, rectified, cropped, scaled, evenly bright, none twice."""
 
 from operators.image.image_preprocess import ImagePreprocess
 from operators.image.stereo_preprocess import StereoPreprocess
+from operators.image.watch import DepthWatch, ImageWatch
 
-__all__ = ["ImagePreprocess", "StereoPreprocess"]
+__all__ = ["DepthWatch", "ImagePreprocess", "ImageWatch", "StereoPreprocess"]

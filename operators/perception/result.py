@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 
 from dataflow.messages import (
     Activity,
@@ -50,6 +51,8 @@ class PerceptionResult:
     """Nodes and relations that began and ended."""
     poses: tuple[Odometry, ...] = ()
     """Every pose of the step."""
+    status: Mapping[str, Diagnostics] = field(default_factory=dict)
+    """Each operator's newest word of the step about what its results rest on."""
 
     @property
     def masks(self) -> SegmentationMap | None:
@@ -58,5 +61,5 @@ class PerceptionResult:
 
     def made(self) -> dict[str, Message]:
         """The messages that are there, by name."""
-        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        found = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in found.items() if isinstance(value, Message)}

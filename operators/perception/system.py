@@ -109,14 +109,13 @@ class PerceptionSystem:
         graph.add(PERCEPTION, CORE, **{"fusion": believed, **params})
         graph.connect(PERCEPTION, **{name: f"{SENSORS_NODE}/{name}" for name in (*self.sensors, *given)})
         built = graph.build({f"{PERCEPTION}/{name}": value for name, value in (settings or {}).items()})
+        made = {f"{PERCEPTION}/{output}" for output in OUTPUTS.values()}
+        outputs = [name for name in sorted(made) if f"{built.namespace}/{name}" in built.aliases]
+        self._status = [name for name, stream in built.streams.items() if stream.port == "status"]
         self._session = Session(
             built,
             static={f"{SENSORS_NODE}/{name}": message for name, message in given.items()},
-            outputs=[
-                f"{PERCEPTION}/{output}"
-                for output in OUTPUTS.values()
-                if f"{built.namespace}/{PERCEPTION}/{output}" in built.aliases
-            ],
+            outputs=[*outputs, *(built.relative(stream) for stream in self._status)],
             record=record,
             overwrite=overwrite,
         )
@@ -165,7 +164,11 @@ class PerceptionSystem:
                 made.setdefault(name.removeprefix(f"{PERCEPTION}/"), []).extend(found)
         self._last = stamp
         newest: dict[str, Any] = {field: made[output][-1] for field, output in OUTPUTS.items() if output in made}
-        return PerceptionResult(stamp=stamp, poses=tuple(made.get("odometry", ())), **newest)  # type: ignore[arg-type]
+        status: dict[str, Any] = {
+            name.removesuffix("/status"): found[-1] for name, found in made.items() if name.endswith("/status")
+        }
+        poses: Any = tuple(made.get("odometry", ()))
+        return PerceptionResult(stamp=stamp, poses=poses, status=status, **newest)
 
     def _steps(self, stamp: int, given: Mapping[str, Any]) -> dict[int, dict[str, Message]]:
         """Stamp → the messages by stream."""

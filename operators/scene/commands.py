@@ -11,7 +11,15 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from dataflow.messages import SceneGraph
+from dataflow.messages import Activity, SceneGraph
+from dataflow.messages.scene_summary import (
+    AGENTS,
+    agents_in_words,
+    carriers_in_words,
+    class_names,
+    spaced,
+    summarize,
+)
 from dataflow.recording import Recording, RecordingError
 from operators.scene.query import QueryError, as_json, ask
 from operators.scene.spark import as_spark_dsg
@@ -29,18 +37,19 @@ def show(
         str | None, typer.Option(help="Whatever fits, such as 'mug on table near person'; 'not' denies a relation.")
     ] = None,
     stream: Annotated[str | None, typer.Option(help="The stream of the graph, where there are several.")] = None,
+    nodes: Annotated[bool, typer.Option("--nodes", help="List every node with position, size and relations.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print nodes, relations and matches as JSON.")] = False,
     export: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write it for Spark-DSG, which Hydra's tools open.")
     ] = None,
 ) -> None:
-    """Show the scene graph of a recording at a time, or what in it a question asks for.
+    """Show the scene graph of a recording at a time in short, all its nodes, or what in it a question asks for.
 
     A question names a class and conditions on it: `mug on table near person` is a mug that is on a table and near a
     person. A class may be `anything` or have a number, as in `on table 3`. Exit code 1 where nothing fits.
     """
     try:
-        graph, since = _graph(recording, stream, at)
+        graph, activities, since = _graph(recording, stream, at)
         matches = None if query is None else ask(graph, query)
     except (QueryError, RecordingError, ValueError, FileNotFoundError) as error:
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
@@ -55,8 +64,10 @@ def show(
             content["query"] = query
             content["matches"] = [{"id": int(graph.ids[m.node]), "score": round(m.score, 4)} for m in matches]
         typer.echo(jsonlib.dumps(content))
-    elif matches is None:
+    elif nodes:
         _show(graph, since)
+    elif matches is None:
+        _tell(recording, graph, activities, since)
     else:
         out = Console()
         for m in matches:
@@ -71,8 +82,8 @@ def show(
         raise typer.Exit(1)
 
 
-def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph, float]:
-    """Returns the newest graph at a time and how long after the recording's first message it is, in seconds."""
+def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph, Activity | None, float]:
+    """Returns the newest graph at a time, its operator's activities then, and its age (s) since the recording began."""
     if not path.is_file():
         raise FileNotFoundError(f"there is no file {path}")
     with Recording(path) as recording:
@@ -89,7 +100,39 @@ def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph
             graph = record.message
         if not isinstance(graph, SceneGraph):
             raise ValueError(f"{built[0]} has no graph up to {at} s")
-        return graph, (graph.stamp - first) * 1e-9
+        beside = f"{built[0].rpartition('/')[0]}/activities"
+        activities = None
+        if beside in recording.streams and recording.streams[beside].message_type is Activity:
+            for record in recording.messages([beside], start=graph.stamp, end=graph.stamp):
+                activities = record.message
+        return graph, activities if isinstance(activities, Activity) else None, (graph.stamp - first) * 1e-9
+
+
+def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since: float) -> None:
+    """Who does what, what carries what, the strongest other relations, and what to ask next."""
+    told, names = summarize(graph, most=8), graph.names()
+    out = Console(highlight=False)
+    out.print(
+        f"[bold]{graph.count} nodes, {len(graph.subjects)} relations[/bold] at {since:.1f} s, in {escape(graph.frame)}"
+    )
+    agents = {i for i, name in enumerate(class_names(graph)) if name in AGENTS}
+    who = [(row.name, row.text) for row in agents_in_words(graph, told, activities)]
+    what = [(row.name, row.text) for row in carriers_in_words(graph, told)]
+    others = [
+        (names[r.subject], f"{spaced(r.predicate)} {names[r.object]} {r.score:.2f}")
+        for r in told.telling
+        if r.subject not in agents
+    ]
+    for title, rows in (("who does what", who), ("what carries what", what), ("strongest other relations", others)):
+        if rows:
+            table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2, 0, 1))
+            for name, text in rows:
+                table.add_row(f"[bold]{escape(name)}[/bold]", escape(text))
+            out.print(table)
+    out.print(
+        f'next: dataflow scene {recording} --query "chair near table"; also --at SECONDS, --nodes, --json',
+        soft_wrap=True,
+    )
 
 
 def _show(graph: SceneGraph, since: float) -> None:

@@ -117,7 +117,7 @@ class MapObject:
         cells.restore(state["cells"])
         fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
         made = cls(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
-        made.beside = Counter({int(other): int(count) for other, count in state["beside"]})
+        made.beside = Counter({int(other): int(count) for other, count in state.get("beside", ())})
         for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():
             view = ImageView(np.array(P), np.array(box), np.array(edges, np.bool_), np.array(eye))
             made.images.append(view)

@@ -109,17 +109,24 @@ class ObjectMap:
         rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
         moves = np.array([self._kinds.is_mover(o) for o in known])
         still = np.array([self._kinds.is_still(o) for o in known])
+        classes = np.array([o.class_id for o in known])
         images = in_image(seen, rows, np.array([self._kinds.is_round(o) for o in known]))
+        left: dict[int, bool] = {}
         for k, each in enumerate(seen):
             mover = each.class_id in self._kinds.movers
-            more = s.mover_reach + 2 * s.mover_speed if mover else s.reach
             near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
             near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
-            for j in np.flatnonzero((near <= more) & ((moves == mover) | still)).tolist():
-                if not moves[j]:
-                    image = None if images is None else images[k][j]
-                    value[k, j] = alike(each, cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
-                if moves[j] or (mover and not value[k, j] and self._has_left(known[j], view)):
+            here = ~moves & (near <= s.reach) & (still if mover else True)
+            for j in np.flatnonzero(here).tolist():
+                image = None if images is None else images[k][j]
+                value[k, j] = alike(each, cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
+            if not mover:
+                continue
+            around = (near <= s.mover_reach + 2 * s.mover_speed) & (classes == each.class_id) & (value[k] == 0)
+            for j in np.flatnonzero(around).tolist():
+                if not moves[j] and j not in left:
+                    left[j] = self._has_left(known[j], view)
+                if moves[j] or left[j]:
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
 

@@ -58,7 +58,7 @@ class LidarSlam(LidarOdometry):
     place_range: float = Param(10.0, gt=1, doc="farther points do not describe a place", unit="m")
     map_voxel: float = Param(0.1, gt=0.01, doc="side of the voxels by which scans are compared and shown", unit="m")
     min_overlap: float = Param(0.5, gt=0, le=1, doc="least share of a scan that the other could see")
-    min_fitness: float = Param(0.9, gt=0, le=1, doc="least share of that which agrees")
+    min_fitness: float = Param(0.85, gt=0, le=1, doc="least share of that which agrees")
     max_violation: float = Param(
         0.04, ge=0, lt=0.5, doc="most of a scan that hangs in what the other saw to be free; twice that where expected"
     )

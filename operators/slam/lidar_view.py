@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.cloud.registration import FEWEST, Prepared, Registered, Settings, apart, explained, refine
+from operators.cloud.registration import FEWEST, Prepared, Registered, Settings, apart, explained, failure, refine
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.lidar_fit import Fit, Prior, fit
@@ -27,6 +27,7 @@ _SIDE, _LEVELS = 2.0, 3  # planes, as in the odometry
 _ABOUT, _MOST = 2.5, 6  # metres around a view, and views there, that another is measured against
 _SEARCH = 3.0  # metres to each side of a view that looks alike
 _STARTS = 5  # poses found there that are refined
+_WORTH = 0.7  # share of the best pose's agreement from which another is worth a look
 _RIVAL = 0.03  # a second pose whose score is that near to the best one's makes a place ambiguous
 _OFF = (0.15, 0.05)  # metres and radians by which the planes may correct the registration
 _GUESS = np.diag([0.3**-2.0] * 3 + [0.1**-2.0] * 3)  # information of where a scan is expected, which hardly counts
@@ -76,9 +77,7 @@ class LidarEyes:
         cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
         return float(np.linalg.norm(T[:3, 3]) + PER_TURN * np.arccos(cosine))
 
-    def sight(
-        self, nodes: Mapping[int, Node[LidarView]], known: int, seen: int, expected: bool
-    ) -> LidarSight | str:  # fmt: skip
+    def sight(self, nodes: Mapping[int, Node[LidarView]], known: int, seen: int, expected: bool) -> LidarSight | str:
         """Registers the two scans, and measures the pose against the planes of the scans around the known one.
 
         Where nothing tells where to look, poses around the known one are tried in all headings, and if two of them
@@ -89,7 +88,7 @@ class LidarEyes:
         assert other is not None
         if min(len(one.prepared.points), len(other.prepared.points)) < FEWEST:
             return "too few points"
-        planes = self._planes(nodes, known)
+        planes = _planes(nodes, known, seen)
         if expected:
             return self._near(one, other, planes, invert(nodes[known].T) @ nodes[seen].T)
         found = self._searched(one, other, planes)
@@ -104,34 +103,18 @@ class LidarEyes:
         found = refine(other.prepared, one.prepared, guess, self.expected)
         return found.reason or self._checked(self._fitted(other, planes, found.T), found)
 
-    def _planes(self, nodes: Mapping[int, Node[LidarView]], known: int) -> PlaneMap:
-        """Returns the planes of the scans around a known one, in its frame."""
-        here = nodes[known]
-        ranked = sorted(
-            (distance, k)
-            for k, node in nodes.items()
-            if node.view is not None
-            and node.island == here.island
-            and abs(k - known) <= 2 * _MOST
-            and (distance := float(np.linalg.norm((node.T - here.T)[:3, 3]))) < _ABOUT
-        )
-        planes = PlaneMap(_SIDE, _LEVELS)
-        for _, k in ranked[:_MOST]:
-            view = nodes[k].view
-            assert view is not None
-            T = invert(here.T) @ nodes[k].T
-            planes.add(view.points @ T[:3, :3].T + T[:3, 3], 0)
-        return planes
-
     def _searched(self, one: LidarView, other: LidarView, planes: PlaneMap) -> Registered:
-        poses, _ = around(other.points.astype(np.float64), planes, np.eye(4), _SEARCH, TURNS, 2 * self.noise)
+        poses, scores = around(other.points.astype(np.float64), planes, np.eye(4), _SEARCH, TURNS, 2 * self.noise)
         starts: list[Array] = []
-        for T in poses[:200]:
+        for T in poses[scores > _WORTH * scores[0]]:
             if all(_far_apart(T, start) for start in starts):
                 starts.append(T)
             if len(starts) == _STARTS:
                 break
-        tried = sorted((refine(other.prepared, one.prepared, T, self.judge) for T in starts), key=lambda r: -r.score)
+        if not starts:
+            return failure("nothing of the scan lies on surfaces that were seen there")
+        tried = [refine(other.prepared, one.prepared, T, self.judge) for T in starts]
+        tried.sort(key=lambda found: (bool(found.reason), -found.score))
         best = tried[0]
         for rival in tried[1:]:
             near = rival.score > best.score - _RIVAL and rival.overlap > 0.7 * best.overlap
@@ -152,6 +135,23 @@ class LidarEyes:
             return "the planes say something else than the points"
         covariance = np.linalg.inv(fitted.information / self.correlation + _GUESS)
         return LidarSight(fitted.T, np.asarray(covariance, np.float64), found)
+
+
+def _planes(nodes: Mapping[int, Node[LidarView]], known: int, seen: int) -> PlaneMap:
+    """Returns the planes of the scans around a known one, in its frame; of none that was taken on the way to `seen`."""
+    here, new = nodes[known], nodes[seen]
+    ranked = []
+    for k, node in nodes.items():
+        distance = float(np.linalg.norm((node.T - here.T)[:3, 3]))
+        if node.view is None or node.island != here.island or distance >= _ABOUT or abs(k - known) > 2 * _MOST:
+            continue
+        if node.island != new.island or new.travel - node.travel > 0.5 * (new.travel - here.travel):
+            ranked.append((distance, k, node.view))
+    planes = PlaneMap(_SIDE, _LEVELS)
+    for _, k, view in sorted(ranked, key=lambda item: item[:2])[:_MOST]:
+        T = invert(here.T) @ nodes[k].T
+        planes.add(view.points @ T[:3, :3].T + T[:3, 3], 0)
+    return planes
 
 
 def _far_apart(A: Matrix, B: Matrix) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Transforms
-from dataflow.messages.geometry import normalize, transform_matrix
+from dataflow.messages.geometry import normalize
 from dataflow.operator import Out, Param, Source
 from operators.sources.rgbd_layouts import (
     Dataset,
@@ -38,7 +38,9 @@ class RgbdFolder(Source):
     depth: Out[DepthImage] = Out(doc="depth, metres; 0 where there was no return or it lies beyond max_depth")
     image_info: Out[CameraInfo] = Out(static=True, doc="calibration of the colour camera")
     depth_info: Out[CameraInfo] = Out(static=True, doc="calibration of the depth camera")
-    extrinsics: Out[Transforms] = Out(static=True, doc="the colour camera in the depth camera's frame")
+    extrinsics: Out[Transforms] = Out(
+        static=True, doc="the colour camera in the depth camera's frame, and that on its base if its place is given"
+    )
     ground_truth: Out[Pose] = Out(doc="T_world_camera of the depth camera")
 
     path: str = Param(doc="folder of the dataset")
@@ -63,6 +65,12 @@ class RgbdFolder(Source):
         doc="x, y, z, qx, qy, qz, qw of the colour camera in the depth camera's frame",
         unit="m",
     )
+    T_base_depth: tuple[float, float, float, float, float, float, float] | None = Param(
+        None,
+        doc="x, y, z, qx, qy, qz, qw of the depth camera on what carries it, z up; none leaves the base out",
+        unit="m",
+    )
+    base_frame: str = Param("base_link", min_length=1, doc="frame of what carries the camera")
     world_frame: str = Param("world", min_length=1, doc="frame of the ground truth")
     image_frame: str = Param("camera_color_optical", min_length=1, doc="optical frame of the colour camera")
     depth_frame: str = Param("camera_depth_optical", min_length=1, doc="optical frame of the depth camera")
@@ -90,17 +98,20 @@ class RgbdFolder(Source):
 
     def static_outputs(self) -> Mapping[str, Message]:
         stamp, data = self._frames[0].stamp, self._dataset
-        *translation, qx, qy, qz, qw = self.T_depth_image
-        if not abs(np.linalg.norm([qx, qy, qz, qw]) - 1) < 1e-3:
-            raise DatasetError(f"T_depth_image: its last four numbers must be a unit quaternion, got {qx, qy, qz, qw}")
-        extrinsics = transform_matrix(translation, normalize([qx, qy, qz, qw]))
+        places = {(self.depth_frame, self.image_frame): _transform("T_depth_image", self.T_depth_image)}
+        if self.T_base_depth is not None:
+            places = {(self.base_frame, self.depth_frame): _transform("T_base_depth", self.T_base_depth), **places}
         image = _camera(self.image_intrinsics, data.image_intrinsics)
         depth = _camera(self.depth_intrinsics, data.depth_intrinsics)
         return {
             "image_info": _info(stamp, self.image_frame, self._image_size, image),
             "depth_info": _info(stamp, self.depth_frame, self._depth_size, depth),
-            "extrinsics": Transforms.from_matrix(
-                extrinsics, stamp=stamp, frame=self.depth_frame, child_frame=self.image_frame
+            "extrinsics": Transforms(
+                stamp=stamp,
+                frames=tuple(frame for frame, _ in places),
+                child_frames=tuple(child for _, child in places),
+                translations=np.array([place[0] for place in places.values()]),
+                rotations=np.array([place[1] for place in places.values()]),
             ),
         }
 
@@ -167,6 +178,14 @@ def depth_in_metres(
     metres[metres > np.float32(max_depth)] = 0
     metres[list(invalid)] = 0
     return metres[raw]
+
+
+def _transform(name: str, numbers: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Returns translation (3,) and unit quaternion (4,). Raises DatasetError."""
+    translation, rotation = np.array(numbers[:3], np.float64), np.array(numbers[3:], np.float64)
+    if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
+        raise DatasetError(f"{name}: its last four numbers must be a unit quaternion, got {tuple(numbers[3:])}")
+    return translation, normalize(rotation)
 
 
 def _why(file: Path) -> str:

@@ -8,7 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+import dataflow
 from dataflow.cli.main import app
+from dataflow.graph import load_graph
+from dataflow.messages import SceneGraph
 from operators.scene.commands import scene
 from operators.weights import shipped
 
@@ -38,3 +41,28 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
     asked = CliRunner().invoke(scene, [str(file), "--query", "bin on floor"])
     assert asked.exit_code == 0
     assert "on floor" in asked.output
+
+
+@pytest.mark.parametrize(
+    ("name", "folder", "cut", "left_out", "must"),
+    [
+        ("perception_rgbd", "rgbd_7scenes", "camera.stop=12", {"scans", "fusion", "wheeled", "segmenter"}, set()),
+        ("perception_kitti", "kitti_lidar_camera", "car.stop=6", {"odometry", "cloud", "fusion"}, {"car"}),
+    ],
+)
+def test_real_frames_become_a_scene_graph_that_verifies(
+    name: str, folder: str, cut: str, left_out: set[str], must: set[str], data_dir: Path, tmp_path: Path
+) -> None:
+    data = data_dir
+    if not ((data / folder).is_dir() and (data / "models" / "FastestDet.onnx").is_file()):
+        pytest.skip(f"no {folder} and models/FastestDet.onnx in {data}")
+    file, settings = tmp_path / "real.mcap", {"data": str(data), cut.partition("=")[0]: int(cut.partition("=")[2])}
+    graph = load_graph(REPOSITORY / "graphs" / f"{name}.yaml", settings=[f"{k}={v}" for k, v in settings.items()])
+    assert {f"perception/{each}" for each in left_out} <= graph.left_out.keys()
+
+    dataflow.run(graph, record=file)
+
+    assert dataflow.verify(file, jobs=1).identical
+    last = dataflow.open(file)["robot1/perception/scene/graph"][-1]
+    assert isinstance(last, SceneGraph)
+    assert must <= {last.class_names[c] for c in last.class_ids.tolist()}

@@ -76,6 +76,11 @@ def test_the_commonest_predicates_give_way_and_agents_come_first() -> None:
     assert [r.predicate for r in told.telling] == ["facing", "above"]
 
 
+def test_an_agent_faces_one_thing() -> None:
+    told = summarize(graph("person mug box", (0, "facing", 1, 0.6), (0, "facing", 2, 0.8), (1, "above", 2, 0.9)))
+    assert [(r.subject, r.predicate, r.object) for r in told.telling] == [(0, "facing", 2), (1, "above", 2)]
+
+
 def test_intentions_are_told_however_unlikely_and_the_likeliest_first() -> None:
     told = summarize(graph("person chair door", (0, "heads_for", 1, 0.2), (0, "heads_for", 2, 0.7)))
     assert [(r.object, round(r.score, 1)) for r in told.intentions] == [(2, 0.7), (1, 0.2)]

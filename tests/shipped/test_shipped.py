@@ -94,6 +94,6 @@ def test_the_demo_runs_to_its_end_without_a_display(tmp_path: Path, monkeypatch)
 
     told = call("demo", "--seconds", 1, "-q").stdout
 
-    assert "simulated_robot  complete" in told
+    assert "perception  complete" in told
     assert "rerun dataflow-demo.rrd" in told
     assert (tmp_path / "dataflow-demo.rrd").stat().st_size > 100_000

@@ -60,7 +60,8 @@ def test_the_wheel_carries_the_packages_the_graphs_the_demo_and_the_licence(whee
     tops = {name.partition("/")[0] for name in names}
     assert {top for top in tops if not top.endswith(".dist-info")} == {"dataflow", "operators"}
     assert {
-        "dataflow/shipped/graphs/simulated_robot.yaml",
+        "dataflow/shipped/graphs/perception.yaml",
+        "dataflow/shipped/graphs/core/perception.yaml",
         "dataflow/shipped/graphs/chaos/plan.yaml",
         "dataflow/shipped/recordings/demo.mcap",
         "dataflow/py.typed",

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
+import rerun as rr
+from rrd_rows import at, rows
+
+from dataflow.messages import Message, Odometry, PointCloud
+from dataflow.view import SceneState, ViewOptions, visualize
 from dataflow.view.keeping import KeptPoints, Points
+from dataflow.view.layout import layout
 
 
 def still(frame: str, stamp: int) -> Points:
@@ -55,3 +63,29 @@ def test_clouds_whose_pose_never_comes_do_not_pile_up() -> None:
 def test_points_too_far_off_for_a_cell_are_left_out() -> None:
     kept = KeptPoints(step=0.001, after=1)
     assert drawn(kept, 0, [[1e9, 0.0, 0.0], [0.0, 0.0, 0.0]]) == [[0.0, 0.0, 0.0]]
+
+
+def test_a_kept_cloud_is_drawn_in_the_root_frame_at_the_stamp_of_its_own_pose(tmp_path: Path) -> None:
+    types: dict[str, type[Message]] = {"r/cloud": PointCloud, "r/odometry": Odometry}
+    state = SceneState(replace(layout(types), kept=frozenset({"r/cloud"})), ViewOptions(kept_after=2))
+    path = tmp_path / "drawn.rrd"
+    with rr.RecordingStream("test", recording_id="test") as recording:
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        recording.save(path)
+        for k in range(4):  # the robot drives on, the wall stays, and each pose comes after its cloud
+            points = np.array([[5.0 - k, 0.0, 1.0]], np.float32)
+            cloud = PointCloud(stamp=10 * k, frame="base", points=points)
+            odometry = Odometry(
+                stamp=10 * k,
+                frame="odom",
+                child_frame="base",
+                position=np.array([float(k), 0, 0]),
+                orientation=np.array([0, 0, 0, 1.0]),
+            )
+            visualize(recording, "/r/cloud", cloud, state, "r/cloud")
+            visualize(recording, "/r/odometry", odometry, state, "r/odometry")
+    (drawn_points,) = at(rows(path), "/r/cloud/space/kept", "Points3D:positions")
+    assert np.allclose(drawn_points.values, [[5.0, 0.0, 1.0]])
+    assert drawn_points.stamp == 10, "the second cloud that saw it"
+    assert state.keeps

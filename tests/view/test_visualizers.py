@@ -122,6 +122,23 @@ def test_inverse_depth_is_decoded(tmp_path: Path) -> None:
     np.testing.assert_allclose(np.frombuffer(bytes(buffer.values[0]), np.float32), [0.0, 1.0, 0.5])
 
 
+def test_a_depth_png_finer_than_asked_for_is_written_anew(tmp_path: Path) -> None:
+    import cv2
+
+    noise = np.random.default_rng(0).integers(0, 20, (48, 64)).astype(np.uint16)
+    png = cv2.imencode(".png", 2000 + noise)[1].ravel()
+    message = CompressedDepth(stamp=STAMP, frame="c", quantizer="linear", scale=0.001, offset=0.0, data=png)
+    later = message.replace(stamp=STAMP + 1)
+    fine = at(draw(tmp_path, ("c/d", message), ("c/d", later)), "/c/d", "EncodedDepthImage:blob")[-1]
+    options = ViewOptions(depth_step=0.02)
+    found = draw(tmp_path, ("c/d", message), ("c/d", later), options=options)
+    coarse = at(found, "/c/d", "EncodedDepthImage:blob")[-1]
+    assert bytes(fine.values[0]) == png.tobytes()
+    assert len(coarse.values[0]) < len(fine.values[0]) / 2
+    metres = cv2.imdecode(np.array(coarse.values[0], np.uint8), cv2.IMREAD_UNCHANGED) * 0.02
+    np.testing.assert_allclose(metres, 2.0 + noise * 0.001, atol=0.0101)
+
+
 def test_depth_keeps_its_colours_and_has_a_scale(tmp_path: Path) -> None:
     near = DepthImage(stamp=STAMP, frame="c", data=np.full((32, 32), 1.7, np.float32))
     far = DepthImage(stamp=STAMP + 1, frame="c", data=np.full((32, 32), 40.0, np.float32))

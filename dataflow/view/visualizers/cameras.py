@@ -68,9 +68,14 @@ def depth_image(canvas: Canvas, message: DepthImage) -> None:
 
 @visualizer(CompressedDepth, "image")
 def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
-    """As a depth image; the file is passed on as it is where its values are proportional to depth."""
+    """As a depth image; a PNG of values proportional to depth and no finer than asked for is passed on as it is."""
+    step = canvas.scene.options.depth_step
     proportional = message.quantizer == "linear" and message.offset == 0.0
-    if proportional and (canvas.entity, "depth scale") in canvas.scene.remembered:
+    if (
+        proportional
+        and (step is None or message.scale > step / 2)
+        and (canvas.entity, "depth scale") in canvas.scene.remembered
+    ):
         _encoded_depth(canvas, message.data.tobytes(), 1.0 / message.scale)
         return
     values = cv2.imdecode(message.data, cv2.IMREAD_UNCHANGED)

@@ -15,6 +15,7 @@ from dataflow.view.keeping import KeptPoints
 from dataflow.view.scene import TIMELINE
 
 _FARTHEST = 1e30  # metres
+_KEPT_AT_ONCE = 6_000  # points of one cloud that are looked at for cells: more clouds will come
 
 
 @visualizer(PointCloud, "space")
@@ -48,6 +49,7 @@ def _kept(canvas: Canvas, message: PointCloud) -> None:
     scene.see(canvas.recording, message.frame, canvas.stamp)
     there = scene.remembered.setdefault((canvas.entity, "kept"), KeptPoints(options.kept_step, options.kept_after))
     chosen = np.flatnonzero(np.isfinite(message.points).all(axis=1))
+    chosen = chosen[:: -(-len(chosen) // _KEPT_AT_ONCE) or 1]
     points = message.points[chosen].astype(np.float64)
     scene.saw_points(message.frame, points[::16])
     paint = _paint(message, chosen)

@@ -83,7 +83,7 @@ def arranged(
     blocks = _in_columns(_blocks(message, told))
     nodes = [node for block in blocks for node in (block.carrier, *block.carried)]
     edges = [(block.carrier.key, node.key) for block in blocks for node in block.carried]
-    more, links = _agents(message, told, activities, {node.key for node in nodes})
+    more, links = _agents(message, told, activities)
     return nodes + more, edges + links
 
 
@@ -138,9 +138,9 @@ def _in_columns(blocks: list[Block]) -> list[Block]:
 
 
 def _agents(
-    message: SceneGraph, told: SceneSummary, activities: Activity | None, there: set[str]
+    message: SceneGraph, told: SceneSummary, activities: Activity | None
 ) -> tuple[list[Node], list[tuple[str, str]]]:
-    """The agents, each with what it does with what; a thing that is `there` already is linked to, not shown again."""
+    """The agents, each with what it does with what; a thing that carries is there twice, so that no lines cross."""
     names, classes, acts = message.names(), class_names(message), doing(activities)
     nodes: list[Node] = []
     edges: list[tuple[str, str]] = []
@@ -157,13 +157,11 @@ def _agents(
             word = words_of(relation.predicate)
             if relation in told.intentions:
                 word += f" ({percent(relation.score)})"
-            thing, link = _key(message, relation.object), f"{key} {relation.predicate} {relation.object}"
+            link = f"{key} {relation.predicate} {_key(message, relation.object)}"
+            paint = colors.of_class(classes[relation.object])
             nodes.append(Node(link, word, _WORD, 0.13, row / rows))
-            edges += [(key, link), (link, thing)]
-            if thing not in there:
-                there.add(thing)
-                paint = colors.of_class(classes[relation.object])
-                nodes.append(Node(thing, names[relation.object], paint, 0.24, row / rows))
+            nodes.append(Node(f"{link} there", names[relation.object], paint, 0.24, row / rows))
+            edges += [(key, link), (link, f"{link} there")]
             row += 1
         row += 0 if ways[agent] else 1
     return nodes, edges

@@ -9,6 +9,7 @@ from dataflow.messages import Diagnostics, Message, PointCloud, Pose
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import play
 from operators.cloud import CloudRegistration
+from operators.cloud.registration import Prepared, Registered, Settings, refine
 from operators.geometry import se3
 
 BOXES = np.array(  # centre and half extents of what stands in a room of 6 x 4 x 2.4 m
@@ -76,6 +77,33 @@ def test_two_scans_of_a_room_are_registered_without_a_guess(there: tuple[float, 
     assert pose.covariance is not None
     assert np.linalg.eigvalsh(pose.covariance).min() > 0
     assert off[:3] @ np.linalg.solve(pose.covariance[:3, :3], off[:3]) < 30
+
+
+def explained_at_the_truth(one: np.ndarray, other: np.ndarray, A: np.ndarray, B: np.ndarray) -> Registered:
+    source, target = (Prepared.of_cloud(points.astype(np.float32), 0.1) for points in (other, one))
+    return refine(source, target, invert(A) @ B, Settings(0.1, 1, 0.5, 0.85, 0.04))
+
+
+def test_thin_things_and_somebody_who_walks_are_no_contradiction() -> None:
+    """Beams pass beside poles, so the same poles are seen before and behind them from two places."""
+    poles = np.array([[x, y, 1.2, 0.02, 0.02, 1.2] for x in (-1.8, 1.8) for y in (-1.5, -0.5, 0.5, 1.5)])
+    A, B = at(0.2, 0.1, 0.0), at(0.9, -0.2, 0.6)
+    walks = [np.vstack([BOXES, poles, [[x, 1.0, 0.85, 0.2, 0.2, 0.85]]]) for x in (-0.9, 1.3)]
+    found = explained_at_the_truth(scan(A, 1, walks[0]), scan(B, 2, walks[1]), A, B)
+    assert found.reason == ""
+    wrong = invert(A) @ B @ se3.exp(np.array([0, 0, 0, 0, 0, np.pi]))
+    assert refine(
+        *(Prepared.of_cloud(scan(T, 1, walks[0]).astype(np.float32), 0.1) for T in (B, A)),
+        wrong, Settings(0.1, 1, 0.5, 0.85, 0.04),
+    ).reason  # fmt: skip
+
+
+def test_a_long_room_is_told_about_its_length() -> None:
+    """Its walls are near to its long axis, which is no reason to doubt how it is turned about that."""
+    long = np.array([9.0, 0.9, 1.2])
+    niches = np.array([[x, y, 1.0, 0.3, 0.2, 1.0] for x, y in ((-6, 0.8), (-3, -0.8), (1, 0.8), (4, -0.8), (7, 0.8))])
+    A, B = at(0.0, 0.0, 0.0), at(0.8, 0.1, 0.1)
+    assert explained_at_the_truth(scan(A, 1, niches, long), scan(B, 2, niches, long), A, B).reason == ""
 
 
 def test_scans_of_different_rooms_fail() -> None:

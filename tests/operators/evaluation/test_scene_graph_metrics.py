@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from typing import Any
 
 import numpy as np
@@ -118,3 +120,8 @@ def test_objects_count_that_were_plainly_seen(images: int, objects: int, recall:
 def test_a_robot_in_another_frame_than_its_graph_is_refused() -> None:
     with pytest.raises(OperatorFailure, match="the robot is in 'map', its graph in 'odom'"):
         scored([(7, 1, TABLE[2], TABLE[3])], [], frame="map")
+
+
+def test_scores_load_nothing_of_what_a_map_needs() -> None:
+    code = "import sys; from operators.evaluation import SceneGraphMetrics; print('scipy' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "False\n"

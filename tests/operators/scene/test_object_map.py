@@ -121,3 +121,13 @@ def test_what_was_seen_beside_what_is_in_the_snapshot() -> None:
     again.restore(known.snapshot())
     assert [o.beside for o in again.objects.values()] == [o.beside for o in known.objects.values()]
     assert known.objects[1].beside[2] > 0
+
+
+def test_a_snapshot_from_before_that_was_counted_is_taken_up() -> None:
+    known = after([[(THING, BOX)]] * 5)
+    earlier = known.snapshot()
+    for entry in earlier["objects"]:
+        del entry["beside"]
+    again = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE)
+    again.restore(earlier)
+    assert list(again.objects) == list(known.objects)

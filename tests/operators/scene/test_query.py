@@ -115,7 +115,19 @@ def test_the_command_answers_from_a_recording(recording: Path) -> None:
     assert code == 0
     assert json.loads(out)["stamp"] == 2_000_000_000
     assert [m["id"] for m in json.loads(out)["matches"]] == [2, 3]
-    assert "holding" in asked(str(recording))[1]
+    assert "holding" in asked(str(recording), "--nodes")[1]
+
+
+def test_without_a_question_the_command_tells_the_graph_in_short(recording: Path) -> None:
+    code, out = asked(str(recording))
+    assert code == 0
+    assert "nodes," in out.splitlines()[0]
+    assert "who does what" in out
+    assert "person 4" in out
+    assert "what carries what" in out
+    assert "near" not in out.split("next:")[0], "what is near what is not told unasked"
+    listed = asked(str(recording), "--nodes")[1]
+    assert "position, m" in listed
 
 
 def test_the_command_says_what_is_wrong(recording: Path, tmp_path: Path) -> None:
