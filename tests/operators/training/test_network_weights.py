@@ -19,6 +19,7 @@ from operators.segmentation.network import ClassDecoder  # noqa: E402
 from operators.segmentation.training import SegmenterTask  # noqa: E402
 from operators.sources.simulator.classes import CLASSES, THINGS  # noqa: E402
 from operators.training.augmentation import fitted, tensor_of, warp  # noqa: E402
+from operators.training.averaging import average  # noqa: E402
 from operators.training.backbone import SmallResNet  # noqa: E402
 from operators.training.files import TrainingFileError  # noqa: E402
 from operators.training.loop import Settings, train  # noqa: E402
@@ -120,3 +121,22 @@ def test_a_file_that_does_not_fit_is_refused_with_what_differs(trained: Path, wo
     fewer = DetectorTask(read_detection_data(worlds).only(["chair"]), SIZE, width=0.25, architecture="smallresnet")
     with pytest.raises(TrainingFileError, match=r"its classes is|its strides is"):
         fewer.begin_with(trained / "detector.onnx")
+
+
+def test_the_mean_of_two_trainings_lies_between_them(trained: Path, worlds: Path, tmp_path: Path) -> None:
+    other = pair(worlds, seed=2)
+    other.begin_with(trained / "detector.onnx")
+    train(other, Settings(epochs=1, batch=4, threads=1), tmp_path / "pair.onnx")
+
+    task = pair(worlds)
+    average(task, trained / "detector.onnx", tmp_path / "detector.onnx")
+
+    ends = []
+    for file in (trained / "detector.onnx", tmp_path / "detector.onnx"):
+        end = pair(worlds)
+        end.begin_with(file)
+        ends.append(end.network.state_dict()["grid.lateral.0.weight"])
+    assert torch.allclose(task.network.state_dict()["grid.lateral.0.weight"], (ends[0] + ends[1]) / 2, atol=1e-6)
+    norms = [m for m in task.network.modules() if isinstance(m, nn.BatchNorm2d)]
+    assert all(not m.training and m.momentum == 0.1 for m in norms)
+    assert all(bool(torch.isfinite(m.running_var).all()) for m in norms)
