@@ -55,7 +55,7 @@ def _measure(task: PairTask) -> None:
         norm.momentum = None  # the mean over all batches
         norm.train()
     with torch.inference_mode():
-        for images in sample_images(task).split(_AT_ONCE):
+        for images in torch.split(sample_images(task), _AT_ONCE):
             task.network(images)
     task.network.eval()
     for norm, momentum in zip(norms, momenta, strict=True):
