@@ -152,6 +152,12 @@ class LayeredGraph:
                 table.pop(i, None)
 
 
+def _ground(bodies: Sequence[Body]) -> float:
+    """The height of the floor, which is 0 unless a quarter of the bodies reach below: one box that is too large does
+    not lower it, or nothing else would stand on it."""
+    return min(0.0, float(np.quantile([b.bottom for b in bodies], 0.25)))
+
+
 def _with_room(bodies: Sequence[Body], T_world_robot: Array | None) -> list[Body]:
     """Adds the floor where there is none, the room around everything, and the robot; by rising id."""
     made = list(bodies)
@@ -161,7 +167,7 @@ def _with_room(bodies: Sequence[Body], T_world_robot: Array | None) -> list[Body
         corners = np.concatenate([b.corners() for b in made])
         low, high = corners.min(axis=0), corners.max(axis=0)
         height = max(b.top for b in made)
-        ground = floors[0].top if floors else min(0.0, min(b.bottom for b in made))
+        ground = floors[0].top if floors else _ground(made)
         middle = (low + high) / 2
         if not floors:
             made.append(Body(FLOOR, "floor", np.array([*middle, ground]), np.array([*(high - low), 0.0]), 0.0, still))

@@ -88,6 +88,12 @@ def test_a_room_has_the_relations_that_a_person_would_name() -> None:
     assert (1, "left_of", 3) in found
 
 
+def test_one_box_that_reaches_through_the_floor_does_not_take_it_from_the_others() -> None:
+    plant: Thing = (8, "plant", (3, -2, 0.1), (0.6, 0.5, 1.2))  # to half a metre below the floor
+    found = relations(built([[TABLE, CHAIR, SHELF, CRATE, plant]])["graph"][0])
+    assert {s for s, p, o in found if (p, o) == ("on", 0)} == {1, 3, 4, 6, 8}
+
+
 def test_left_and_front_are_those_of_the_robots_view() -> None:
     """The robot looks along x from the origin; y is to its left."""
     nearer: Thing = (1, "box", (2.0, 0, 0.1), (0.2, 0.2, 0.2))
