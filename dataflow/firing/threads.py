@@ -25,16 +25,9 @@ THREADS = (*_VARIABLES, "DATAFLOW_THREADS")
 """Environment variables by which libraries are told their number of threads; most read them when they load."""
 
 
-_ALLOCATION = {"MALLOC_TRIM_THRESHOLD_": str(2**26), "MALLOC_MMAP_THRESHOLD_": str(2**25)}
-"""Settings of glibc's malloc (mallopt(3)): a process keeps up to 64 MiB of freed memory, arrays of up to 32 MiB among
-it. Otherwise every image and every chunk of a recording is made of pages that the kernel has to find and to clear."""
-
-
 def environment(threads: int) -> dict[str, str]:
-    """Returns the environment of operators: thread counts, the import path of this process, hashing without a salt,
-    and memory that is kept for the next message unless the user's environment says otherwise."""
+    """Returns the environment of operators: thread counts, the import path of this process, hashing without a salt."""
     return {
-        **_ALLOCATION,
         **os.environ,
         "PYTHONPATH": import_path(),
         **dict.fromkeys(_VARIABLES, str(threads)),

@@ -63,6 +63,9 @@ def _make(
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:
     """The sink that writes an MCAP recording; options: `path` (or `flight`: a folder), `metadata`,
     `compression`, `overwrite`."""
+    from dataflow.process.freed_memory import keep_freed_memory
+
+    keep_freed_memory()
     if "flight" in config.options:
         from dataflow.process.flight import FlightSink
 

@@ -29,12 +29,3 @@ def test_a_library_that_setup_loads_is_limited(monkeypatch: pytest.MonkeyPatch) 
     OperatorRunner(node(Echo, {"x": ["t/s/x"]}), Collector(), static=frozenset()).setup()
 
     assert limits == [3]
-
-
-def test_operators_keep_freed_memory_unless_the_user_says_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"):
-        monkeypatch.delenv(name, raising=False)
-    assert int(threads.environment(1)["MALLOC_TRIM_THRESHOLD_"]) > 2**25
-
-    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", "131072")
-    assert threads.environment(1)["MALLOC_TRIM_THRESHOLD_"] == "131072"
