@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import xxhash
 from numpy.typing import NDArray
 
-from dataflow.messages import Diagnostics
+from dataflow.messages import Diagnostics, Message
 from dataflow.messages.diagnostics import Level
 from operators.status import counted_status
 
@@ -45,3 +45,32 @@ class Watcher:
     def restore(self, state: Mapping[str, Any]) -> None:
         self.last, self._row = bytes.fromhex(state["last"]), int(state["row"])
         self.counts = Counter({key: int(n) for key, n in state["counts"].items()})
+
+
+class Watching:
+    """Makes an operator pass measurements on at a port `checked` unless they have a flaw or repeat the last ones, and
+    say so at a port `status`; `named` is its own name and that of what it watches."""
+
+    named: ClassVar[tuple[str, str]]
+
+    def setup(self) -> None:
+        self._watcher = Watcher(*self.named)
+
+    def passed(self, message: Message, data: NDArray[Any], flaw: str | None) -> Mapping[str, Message]:
+        """Gives the outputs for a message with these data, whose flaw, if it has one, is the given one."""
+        found = self._watcher.judge(data, flaw)
+        status = self._watcher.status(message.stamp, found)
+        return {"status": status} if found else {"checked": message, "status": status}
+
+    def on_reset(self, input: str) -> None:
+        """The clock began anew; the same measurement may come again."""
+        self._watcher.last = b""
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return self._watcher.snapshot()
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._watcher.restore(state)
+
+    def summary(self) -> Mapping[str, int]:
+        return dict(self._watcher.counts)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dataflow import Played, play
-from dataflow.messages import DepthImage, Diagnostics, Image, PointCloud
-from operators.cloud import ScanWatch
+from dataflow.messages import DepthImage, Diagnostics, Image
 from operators.image import DepthWatch, ImageWatch
 
 
@@ -47,15 +46,6 @@ def test_a_depth_image_without_news_is_held_back(kept: float) -> None:
     data = [rng.uniform(1, 3, (24, 32)).astype(np.float32) for _ in range(3)]
     data[1] = data[0] * np.float32(kept)
     played = play(DepthWatch(), {"depth": [DepthImage(stamp=k, frame="depth", data=d) for k, d in enumerate(data)]})
-    assert [m.stamp for m in played["checked"]] == [0, 2]
-
-
-@pytest.mark.parametrize("kept", [0, 100], ids=["empty", "frozen"])
-def test_a_scan_without_news_is_held_back(kept: int) -> None:
-    rng = np.random.default_rng(3)
-    data = [rng.uniform(1, 3, (100, 3)).astype(np.float32) for _ in range(3)]
-    data[1] = data[0][:kept]
-    played = play(ScanWatch(), {"cloud": [PointCloud(stamp=k, frame="lidar", points=d) for k, d in enumerate(data)]})
     assert [m.stamp for m in played["checked"]] == [0, 2]
 
 
