@@ -72,6 +72,15 @@ def test_rooms_and_floors_are_outlines_on_the_ground_and_hide_nothing(tmp_path: 
     assert np.allclose(np.array(boxes.values), [(0.5, 0.5, 0.4), (0.25, 0.25, 0.5)]), "table and chair alone"
 
 
+def test_walls_are_upright_outlines(tmp_path: Path) -> None:
+    made = scene().replace(class_names=("wall", *CLASSES[1:]))
+    sizes, turned = made.sizes.copy(), np.tile([0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)], (made.count, 1))
+    sizes[0] = (4, 0.02, 2)
+    found = draw(tmp_path, ("s/graph", made.replace(sizes=sizes, orientations=turned)))
+    (outlines,) = at(found, "/s/graph/space/places", "LineStrips3D:strips")
+    assert np.allclose(np.ptp(np.array(outlines.values[0]), axis=0), [0, 4, 2], atol=1e-6)
+
+
 def test_things_that_are_carried_are_drawn_without_labels(tmp_path: Path) -> None:
     found = draw(tmp_path, ("s/graph", scene()))
     (parts,) = at(found, "/s/graph/space/parts", "Boxes3D:show_labels")

@@ -36,6 +36,7 @@ _RELATION = (235, 235, 235)
 _STILL = 0.02  # metres: a box that moved by less is not drawn again
 _GOALS = 3  # of an agent, the likeliest
 _LIKELY = 0.1  # goals that are less probable are not drawn
+_SHEET = 0.05  # metres: half the thickness up to which a place is a wall
 _THIN = 0.05  # metres: least radius of a capsule
 
 
@@ -98,11 +99,13 @@ def _words(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: 
 
 
 def _places(canvas: Canvas, message: SceneGraph, places: Sequence[int]) -> None:
-    """The outline of each room or floor, on its ground."""
+    """The outline of each place: of a room or floor on its ground, of a wall upright."""
     outlines = []
     for i in places:
         half = message.sizes[i] / 2
-        corners = np.array([(x, y, -1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]) * half
+        around = np.array([(x, y, -1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
+        thin = int(np.argmin(half))
+        corners = (around if thin == 2 or half[thin] > _SHEET else np.roll(around, thin + 1, axis=1)) * half
         outlines.append(corners @ _axes_of(message, i).T + message.positions[i])
     if not _moved(canvas, "places", outlines):
         return
