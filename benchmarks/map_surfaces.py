@@ -4,8 +4,8 @@
 
 A depth camera and true camera poses; a cloud every other second is searched for planes. A true surface counts that was
 seen so far: a wall with 1 m² and 1.2 m above the floor, a table top with 0.25 m², in three clouds or more. A surface of
-the map is right that is of its class and whose box, made 0.3 m thick, has an IoU of 0.25 or more with the box of what was
-seen of the true one; surfaces of which less was seen are ignored.
+the map is right that is of its class and whose box, made 0.3 m thick, has an IoU of 0.25 or more with the box of what
+was seen of the true one; surfaces of which less was seen are ignored.
 """
 
 from __future__ import annotations
