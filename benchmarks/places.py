@@ -1,19 +1,13 @@
 """Places known again by their look: the share of views whose likest view of an earlier drive shows the same place.
 
-    python benchmarks/places.py render PLACES                       images of training worlds, sorted by place
-    dataflow train classifier PLACES --out places.onnx --size 96x64 --no-flip --variation 0.7 --epochs 8 --bfloat16
-    python benchmarks/places.py score places.onnx [--mobilenet FILE]
+    python benchmarks/places.py [--mobilenet FILE] [--weights FILE]
 
-A place is a square of 1 m and a heading of 45 degrees in one world; a network that learns to tell places apart
-describes them by its last hidden layer (Berton et al., "Rethinking Visual Geo-localization", 2022), which
-`FeatureExtractor` gives.
-
-Scored in worlds that nothing was chosen by: a robot drives through each, and again later, slower, with its camera
+In simulated worlds that nothing was chosen by a robot drives through each, and again later, slower, with its camera
 mounted elsewhere (`higher`, `turned`). The views of the second drive are looked for among those of the first of *all*
 worlds. The answer is right within 1 m and 45 degrees of where the second was; only views that have such an answer
 count. Also, as a loop closure asks: the views of the first drive among those of the same drive that are 10 s older.
-Baselines: a histogram of colours, the image shrunk to 16x12, and, with `--mobilenet FILE`, torchvision's mobilenet_v2
-with these weights of ImageNet.
+Views are described by `FeatureExtractor`, with torchvision's mobilenet_v2 and the weights of ImageNet in `--mobilenet`,
+or with a file of `dataflow train classifier`; beside them a histogram of colours and the image shrunk to 16x12.
 """
 
 from __future__ import annotations
@@ -23,7 +17,7 @@ import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,12 +38,10 @@ from operators.sources.simulator.worlds import INDOOR, make_world  # noqa: E402
 Pixels = NDArray[np.uint8]
 Describe = Callable[[Pixels], NDArray[np.float32]]
 
-TRAINING, HELD_OUT = 74_000, 75_000
-"""First seeds of the worlds to learn in and to judge by."""
+FIRST = 75_000
+"""Seed of the first world."""
 SIZE = (192, 128)
 SECONDS, RATE = 50, 2.0
-EVERY = 2  # of the views of a training world, one is kept
-CELL, TURN = 1.0, np.pi / 4
 NEAR, ALIKE = 1.0, np.pi / 4
 OLDER = 10.0  # seconds, of a loop closure
 MOUNTS: dict[str, tuple[float, tuple[float, ...]]] = {  # speed, shift of the camera (metres, radians)
@@ -113,31 +105,8 @@ def _rendered(world: str, seed: int, mount: str) -> tuple[Pixels, NDArray[np.flo
     )
 
 
-def worlds(first: int, count: int) -> Iterator[tuple[str, int]]:
-    for k in range(count):
-        yield INDOOR[k % len(INDOOR)], first + k
-
-
-def render(folder: Path, count: int, cache: Path) -> None:
-    """Writes views of `count` training worlds as PLACE/VIEW.jpg; places that were seen once are left out."""
-    written = places = 0
-    for world, seed in worlds(TRAINING, count):
-        by_place: dict[str, list[Pixels]] = {}
-        for mount in MOUNTS:
-            d = drive(world, seed, mount, cache)
-            for view, position, heading in zip(d.views, d.positions, d.headings, strict=True):
-                x, y = np.floor(position / CELL).astype(int)
-                place = f"{world}_{seed}_{x}_{y}_{round(heading / TURN) % 8}"
-                by_place.setdefault(place, []).append(view)
-        for place, views in by_place.items():
-            kept = views[::EVERY]
-            if len(kept) < 2:
-                continue
-            (folder / place).mkdir(parents=True, exist_ok=True)
-            for k, view in enumerate(kept):
-                cv2.imwrite(str(folder / place / f"{k:03d}.jpg"), cv2.cvtColor(view, cv2.COLOR_RGB2BGR))
-            places, written = places + 1, written + len(kept)
-        print(f"{world} {seed}: {places} places, {written} views so far", flush=True)
+def worlds(count: int) -> list[tuple[str, int]]:
+    return [(INDOOR[k % len(INDOOR)], FIRST + k) for k in range(count)]
 
 
 def colors(view: Pixels) -> NDArray[np.float32]:
@@ -159,7 +128,7 @@ def extractor(**parameters: Any) -> Describe:
     operator.setup()
 
     def describe(view: Pixels) -> NDArray[np.float32]:
-        features = operator.process(Image(stamp=0, frame="camera", encoding="rgb8", data=view), None)
+        features = operator.process(Image(stamp=0, frame="camera", data=view), None)
         return np.asarray(features.vectors[0], np.float32)
 
     return describe
@@ -229,9 +198,9 @@ def score(weights: Path | None, mobilenet: Path | None, count: int, cache: Path)
             checkpoint = with_head(mobilenet, Path(folder) / "mobilenet_v2.pt")
             ways["mobilenet_v2, ImageNet"] = extractor(model="mobilenet_v2", checkpoint=str(checkpoint))
     if weights is not None:
-        ways[f"classifier of places ({weights.name})"] = extractor(weights=str(weights))
-    own = [drive(world, seed, "own", cache) for world, seed in worlds(HELD_OUT, count)]
-    others = {m: [drive(w, s, m, cache) for w, s in worlds(HELD_OUT, count)] for m in MOUNTS if m != "own"}
+        ways[weights.name] = extractor(weights=str(weights))
+    own = [drive(world, seed, "own", cache) for world, seed in worlds(count)]
+    others = {m: [drive(w, s, m, cache) for w, s in worlds(count)] for m in MOUNTS if m != "own"}
     table: dict[str, Any] = {}
     for name, describe in ways.items():
         base = described(own, describe)
@@ -247,22 +216,14 @@ def score(weights: Path | None, mobilenet: Path | None, count: int, cache: Path)
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=["render", "score"])
-    parser.add_argument(
-        "file", type=Path, nargs="?", help="render: the folder to write; score: weights of a classifier"
-    )
-    parser.add_argument("--worlds", type=int, help="how many (30 to train on, 12 to score on)")
     parser.add_argument("--mobilenet", type=Path, help="state dict of torchvision's mobilenet_v2")
+    parser.add_argument("--weights", type=Path, help="a file of `dataflow train classifier`")
+    parser.add_argument("--worlds", type=int, default=12, help="how many")
     parser.add_argument("--cache", type=Path, default=Path("out") / "places", help="folder of rendered drives")
     parser.add_argument("--json", type=Path, help="file for all figures")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    if arguments.what == "render":
-        if arguments.file is None:
-            parser.error("render needs the folder to write")
-        render(arguments.file, arguments.worlds or 30, arguments.cache)
-        return
-    table = score(arguments.file, arguments.mobilenet, arguments.worlds or 12, arguments.cache)
+    table = score(arguments.weights, arguments.mobilenet, arguments.worlds, arguments.cache)
     if arguments.json:
         arguments.json.write_text(json.dumps(table, indent=2) + "\n")
 
