@@ -42,6 +42,7 @@ from operators.training.loop import Settings, train  # noqa: E402
 from operators.training.running import prepare  # noqa: E402
 
 CAMVID = ("sky", "building", "pole", "road", "pavement", "tree", "sign", "fence", "car", "pedestrian", "bicyclist")
+SIDE = (64, 64)
 MOST, LEAST = 150, 24
 """Cut-outs of a class at most to train on; width and height in pixels at least."""
 
@@ -155,9 +156,9 @@ def objects(worlds: Path, epochs: int) -> dict[str, Any]:
         known, asked = (np.array([histogram(i) for i in part]) for part in (data.training, data.validation))
         rows["the nearest colour histogram"] = scored(labels[(asked @ known.T).argmax(axis=1)], truth)
         for name, task in (
-            ("plain", ClassifierTask(data)),
-            ("residual", ClassifierTask(data, architecture="residual")),
-            ("torchvision's resnet18", Torchvision(data, (96, 96))),
+            ("plain", ClassifierTask(data, SIDE)),
+            ("residual", ClassifierTask(data, SIDE, architecture="residual")),
+            ("torchvision's resnet18", Torchvision(data, SIDE)),
         ):
             rows[name] = trained(task, epochs, 32)
     for name, row in rows.items():
@@ -246,12 +247,12 @@ def main() -> None:
     parser.add_argument("what", choices=["objects", "streets"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--backbone", type=Path, help="state dict of torchvision's mobilenet_v2")
-    parser.add_argument("--epochs", type=int, help="12 for objects, 60 for streets")
+    parser.add_argument("--epochs", type=int, help="8 for objects, 60 for streets")
     parser.add_argument("--json", type=Path, help="file for all figures")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     if arguments.what == "objects":
-        rows = objects(arguments.folder, arguments.epochs or 12)
+        rows = objects(arguments.folder, arguments.epochs or 8)
     else:
         rows = streets(arguments.folder, arguments.backbone, arguments.epochs or 60)
     if arguments.json:
