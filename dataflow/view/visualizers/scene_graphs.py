@@ -14,6 +14,7 @@ from dataflow.messages.scene_summary import (
     AGENTS,
     PEOPLE,
     PLACES,
+    Row,
     SceneSummary,
     Told,
     agents_in_words,
@@ -83,19 +84,20 @@ def _operator(stream: str) -> str:
 
 def _words(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: Activity | None) -> None:
     """The graph as a list in Markdown, sent where it differs from the last."""
-    agents = agents_in_words(message, told, activities)
-    rows = carriers_in_words(message, told)
-    text = "\n".join(
-        (
-            "| who | does |\n|---|---|",
-            *(f"| **{row.name}** | {row.text} |" for row in agents),
-            "\n| what | carries |\n|---|---|",
-            *(f"| **{row.name}** | {row.text} |" for row in rows),
-            f"\n{message.count} nodes, {len(message.subjects)} relations",
-        )
+    tables = (
+        _table("who", "does", agents_in_words(message, told, activities)),
+        _table("what", "carries", carriers_in_words(message, told)),
     )
+    counted = f"{message.count} nodes, {len(message.subjects)} relations"
+    text = "\n\n".join((*filter(None, tables), counted))
     if canvas.scene.changed(canvas.entity, "words", text):
         canvas.log("text", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _table(first: str, second: str, rows: Sequence[Row]) -> str:
+    """A table in Markdown; nothing without rows."""
+    lines = (f"| **{row.name}** | {row.text} |" for row in rows)
+    return "\n".join((f"| {first} | {second} |\n|---|---|", *lines)) if rows else ""
 
 
 def _places(canvas: Canvas, message: SceneGraph, places: Sequence[int]) -> None:
