@@ -38,8 +38,8 @@ class CloudRegistration(Operator):
     voxel: float = Param(0.1, gt=0.005, doc="side of the voxels that the clouds are thinned to", unit="m")
     trials: int = Param(2_000, ge=100, le=10_000_000, doc="motions, one for each match, that are put to the vote")
     min_overlap: float = Param(0.5, gt=0, le=1, doc="least share of each cloud that the other sensor could see")
-    min_fitness: float = Param(0.85, gt=0, le=1, doc="least share of that which lies on the other cloud")
-    max_violation: float = Param(0.03, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
+    min_fitness: float = Param(0.87, gt=0, le=1, doc="least share of that which lies on the other cloud")
+    max_violation: float = Param(0.04, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
 
     def setup(self) -> None:
         self._settings = Settings(

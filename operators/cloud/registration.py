@@ -97,9 +97,7 @@ class Registered:
         """
         shared = 0.7 if self.settled else 0.9
         return (
-            self.score > best.score - _RIVAL
-            and self.overlap > shared * best.overlap
-            and apart(best.T, self.T, voxel)
+            self.score > best.score - _RIVAL and self.overlap > shared * best.overlap and apart(best.T, self.T, voxel)
         )
 
     def refused(self, reason: str) -> Registered:
