@@ -220,15 +220,16 @@ class Open3d:
 
     def mesh(self, stamp: int, frame: str) -> tuple[Array, NDArray[Any]]:
         mesh = self.volume.extract_triangle_mesh()
-        return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        sane = np.abs(vertices).max(axis=1) < 100  # some corners are not finite, others at 1e30
+        return vertices, triangles[sane[triangles].all(axis=1)]
 
 
 def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float, rng: np.random.Generator) -> Array:
     """Points (N, 3) drawn evenly from the surface."""
     corners = vertices[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    usable = (area > 0) & np.isfinite(area)  # Open3D gives some corners that are not finite
-    corners, area = corners[usable], area[usable]
+    corners, area = corners[area > 0], area[area > 0]
     chosen = rng.choice(len(corners), int(area.sum() * per_square_metre), p=area / area.sum())
     root, second = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
     weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)

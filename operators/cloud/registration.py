@@ -161,7 +161,7 @@ def refine(source: Prepared, target: Prepared, guess: Array, settings: Settings)
 
 def explained(source: Prepared, target: Prepared, T: Array, settings: Settings) -> Registered:
     """Returns what speaks for a motion; its covariance is not known."""
-    one, two = _Seen.of(source, target, T), _Seen.of(target, source, np.linalg.inv(T))
+    one, two = _Seen.of(source, target, T), _Seen.of(target, source, np.asarray(np.linalg.inv(T), np.float64))
     overlap, fitness = min(one.overlap, two.overlap), min(one.fitness, two.fitness)
     violation, settled = max(one.violation, two.violation), one.settled
     reason = ""
