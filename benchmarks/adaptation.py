@@ -206,7 +206,7 @@ def markdown(worlds: Mapping[str, Figures], command: str) -> str:
         changes = [
             100 * sign * (world[condition][mode][figure] / world[condition]["off"][figure] - 1) for world in several
         ]
-        return f"{min(changes):+.1f} %"
+        return f"{min(changes) + 0.0:+.1f} %"
 
     lines = ["# Adaptation to light and noise", "", f"    {command}", ""]
     lines += [f"{len(worlds)} worlds: {', '.join(worlds)}. Means over worlds; *worst* is the change in the world that "
