@@ -33,7 +33,7 @@ from operators.fusion.gate import GateConfig
 from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.nodes import Measurement
-from operators.fusion.output import diagnostics, odometry_of
+from operators.fusion.output import diagnostics, figures, odometry_of
 from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, unheard, use_of
 from operators.geometry.extrinsics import transform_between
 
@@ -203,18 +203,10 @@ class EkfFusion(Operator):
         self._body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
 
     def summary(self) -> Mapping[str, float | int | str]:
-        figures: dict[str, float | int | str] = {}
-        if self._filter is not None:
-            for name, health in sorted(self._filter.health.items()):
-                figures[f"{name}, used"] = health.used + health.widened
-                figures[f"{name}, used after making room"] = health.widened
-                figures[f"{name}, refused"] = health.refused
-                figures[f"{name}, unconfirmed"] = health.unconfirmed
-            for name, (offset, sigma) in self._offsets().items():
-                figures |= {f"{name}, offset (s)": offset, f"{name}, sigma of the offset (s)": sigma}
-        ignored = self._ignored + (self._filter.ignored if self._filter is not None else Counter())
-        figures |= {f"settings of {name}": f"of no stream{near}" for name, near in self._unheard()}
-        return figures | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}
+        fused = self._filter
+        health = {} if fused is None else fused.health
+        ignored = self._ignored + (Counter() if fused is None else fused.ignored)
+        return figures(health, self._offsets(), dict(self._unheard()), ignored)
 
     def _follows(self, name: str, stamp: int) -> bool:
         """Tells whether a message comes after the sensor's last; one that does not is counted."""

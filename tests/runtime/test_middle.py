@@ -20,7 +20,8 @@ HERE = Path(__file__).resolve().parent
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("middle") / "run.mcap"
-    run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_process", record=path)
+    report = run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_process", record=path)
+    assert not report.interrupted  # a signal that ends tests is taken by the run, whose recording is then a part
     return path
 
 
