@@ -34,7 +34,8 @@ from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.nodes import Measurement
 from operators.fusion.output import diagnostics, figures, odometry_of
-from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, unheard, use_of
+from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, turning, unheard, use_of
+from operators.fusion.silence import Silence
 from operators.geometry.extrinsics import transform_between
 
 Array = NDArray[np.float64]
@@ -120,6 +121,7 @@ class EkfFusion(Operator):
         self._inertial = InertialSensor(
             InertialConfig(self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience)
         )
+        self._silence = Silence(self.max_gap, self.gravity, self._unknown())
         self._reported = -1
         self._stamps: dict[str, int] = {}
         self._before: dict[str, Message] = {}
@@ -154,7 +156,7 @@ class EkfFusion(Operator):
             if not (isinstance(message, Imu) and use_of(name, message, self._settings(name)) == "inertial"):
                 self._measure(name, message, around)
         self._origin = around.origin
-        if self._filter is None or not (felt or self.motion == "constant_velocity"):
+        if self._filter is None or not (felt or self.motion == "constant_velocity" or self._bridge(context.stamp)):
             return None
         return {"odometry": self._odometry(context.stamp), "status": self._status(context.stamp)}
 
@@ -166,6 +168,7 @@ class EkfFusion(Operator):
         return {
             "filter": None if self._filter is None else self._filter.snapshot(),
             "inertial": self._inertial.snapshot(),
+            "silence": self._silence.snapshot(),
             "reported": self._reported,
             "stamps": dict(self._stamps),
             "before": {
@@ -195,6 +198,8 @@ class EkfFusion(Operator):
         else:  # as snapshots were before the sensor kept its own part
             *stamps, self._reported = (int(stamp) for stamp in state["stamps"])
             self._inertial.restore({"samples": state["samples"], "stamps": stamps})
+        if "silence" in state:
+            self._silence.restore(state["silence"])
         self._before = {
             name: Odometry(stamp=int(stamp), frame=frame, child_frame=child, position=p, orientation=q)
             for name, (stamp, frame, child, p, q) in state["before"].items()
@@ -247,12 +252,24 @@ class EkfFusion(Operator):
             gravity=self.gravity,
             max_gap=self.max_gap,
             inertial=inertial,
-            unknown=Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
-            if inertial
-            else Noise(0.0, self.free_acceleration, self.free_turning, 0.0),
+            unknown=self._unknown(),
             gates=self._gates,
             errors=errors_of(self.sensors),
         )
+
+    def _unknown(self) -> Noise:
+        """The noise of a motion that no inertial sensor tells of."""
+        if self.motion == "inertial":
+            return Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
+        return Noise(0.0, self.free_acceleration, self.free_turning, 0.0)
+
+    def _bridge(self, stamp: int) -> bool:
+        """Takes the inertial sensor's place where it is silent; False where it is not."""
+        assert self._filter is not None
+        if not self._silence.lasts(stamp):
+            return False
+        self._filter.feel(self._silence.sample(stamp, self._filter.estimate(stamp)[0]))
+        return True
 
     def _prior(self) -> Prior:
         prior = Prior(
@@ -282,6 +299,7 @@ class EkfFusion(Operator):
             self._ignored[f"{name}: {reason}"] += 1
             return False
         self._body = imu.frame
+        self._silence.felt(sample.time)
         if self._filter is not None:
             self._filter.feel(sample)
             return True
@@ -308,6 +326,8 @@ class EkfFusion(Operator):
             self._command(name, message, settings, around)
             return
         clock, assumed = self._clock(name)
+        if (seen := turning(message, before, around)) is not None:
+            self._silence.saw(message.stamp, seen)
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
                 self._filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
@@ -348,6 +368,8 @@ class EkfFusion(Operator):
         self._reported = stamp
         ignored = self._ignored + self._filter.ignored
         unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
+        if self._silence.lasts(stamp):
+            unused["inertial sensor"] = "silent: the motion is bridged by what others see"
         return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)
 
     def _unheard(self) -> list[tuple[str, str]]:
