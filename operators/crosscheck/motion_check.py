@@ -19,16 +19,18 @@ from operators.status import counted_status
 _NEWEST = 350_000_000  # ns: what an older pose says of the speed is not compared with the wheels'
 _SLACK = 300_000_000  # ns that a window waits for the slowest sensor
 _WHEELS = "wheels"
+_HANGS = 500_000_000  # ns for which a sensor gives the same reading of a motion when it counts as hanging
 
 
 class MotionCheck(Operator, merge=True):
     """Compares the robot's motion by wheels, odometries and gyroscopes, and holds wheels back that are contradicted.
 
     Window by window each two sensors are compared: their ways, their turns, and the directions of both on the robot.
-    What differs by more than a limit and its noise is said, with the sensor that the others contradict; of two
-    nobody knows which is wrong. A camera whose depths are too long, wheels of another radius, a gyroscope of another
-    scale and a sensor that is turned against its extrinsic show so. Wheels are passed on at `checked` unless two others
-    that agree contradict them, over many windows or at once (wheels that slip or say nothing).
+    What differs by more than a limit and its noise is said, with the sensor that the others contradict; of two nobody
+    knows which is wrong. A camera whose depths are too long, wheels of another radius, a gyroscope of another scale and
+    a sensor that is turned against its extrinsic show so; so does one that repeats a reading of motion. Wheels are
+    passed on at `checked` unless two others that agree contradict them, over many windows or at once (wheels that slip
+    or say nothing).
     """
 
     wheels: In[Odometry] = In(doc="odometry of the wheels, with velocities")
@@ -60,6 +62,9 @@ class MotionCheck(Operator, merge=True):
         self._slipping = self._said = False
         self._slipped = -1
         """When the wheels last did: a window with it tells nothing of their radii."""
+        self._readings: dict[str, tuple[int, np.ndarray]] = {}
+        """Since when each of the moving sensors gives the reading that it gives."""
+        self._hanging: set[str] = set()
         self._counts: Counter[str] = Counter()
 
     def process(
@@ -78,6 +83,7 @@ class MotionCheck(Operator, merge=True):
             name = f"gyroscope of {sample.frame}"
             self._blind.add(name)
             rate = turns[sample.frame] @ sample.angular_velocity
+            self._follow(name, sample.stamp, sample.angular_velocity)
             self._track(name).twist(sample.stamp, np.concatenate([np.zeros(3), rate]))
         for stream, odometry in (motions or {}).items():
             T = transform_between(extrinsics, odometry.child_frame, self.base_frame)
@@ -100,6 +106,8 @@ class MotionCheck(Operator, merge=True):
             "agreement": self._agreement.snapshot(),
             "end": self._end,
             "slipping": [self._slipping, self._said, self._slipped],
+            "readings": {name: [since, reading] for name, (since, reading) in self._readings.items()},
+            "hanging": sorted(self._hanging),
             "counts": dict(self._counts),
         }
 
@@ -111,6 +119,8 @@ class MotionCheck(Operator, merge=True):
         self._agreement.restore(state["agreement"])
         self._found = self._agreement.contradictions()
         self._end = int(state["end"])
+        self._readings = {n: (int(since), np.array(r, np.float64)) for n, (since, r) in state["readings"].items()}
+        self._hanging = set(state["hanging"])
         slipping, said, slipped = state["slipping"]
         self._slipping, self._said, self._slipped = bool(slipping), bool(said), int(slipped)
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
@@ -126,11 +136,20 @@ class MotionCheck(Operator, merge=True):
         if wheels.linear is None or wheels.angular is None:
             return {"checked": wheels}
         self._track(_WHEELS).twist(wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
+        self._follow(_WHEELS, wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
         self._slipping = self._slips(wheels)
         self._slipped = wheels.stamp if self._slipping else self._slipped
         held = self._slipping or any(c.alone and c.sensor == _WHEELS for c in self._found)
         self._counts["held back" if held else "passed on"] += 1
         return {} if held else {"checked": wheels}
+
+    def _follow(self, name: str, stamp: int, reading: np.ndarray) -> None:
+        """Notices a sensor that gives the same reading over and over, unless it is that of rest."""
+        since, last = self._readings.get(name, (stamp, reading))
+        same = bool(np.array_equal(reading, last))
+        self._readings[name] = (since if same else stamp, reading)
+        hangs = same and stamp - since >= _HANGS and bool(reading.any())
+        (self._hanging.add if hangs else self._hanging.discard)(name)
 
     def _slips(self, wheels: Odometry) -> bool:
         """Tells whether two others that agree, or more, say that the robot moves at another speed than the wheels."""
@@ -170,5 +189,6 @@ class MotionCheck(Operator, merge=True):
         texts = [contradiction.text() for contradiction in self._found]
         if self._slipping:
             texts.insert(0, "the wheels turn otherwise than the robot moves")
+        texts += [f"{name} repeats its last reading" for name in sorted(self._hanging)]
         text = "; ".join(texts) or "motions agree"
         return counted_status("motion_check", stamp, text, Level.WARN if texts else Level.OK, self._counts)

@@ -263,7 +263,7 @@ def _twist(message: Message, before: Message | None) -> tuple[int, Array, Array,
 
 
 def turning(message: Message, before: Message | None, around: Surroundings) -> Array | None:
-    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist; None where it is untold."""
+    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist, if they tell."""
     if not isinstance(message, Odometry | Twist):
         return None
     try:

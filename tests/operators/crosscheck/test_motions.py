@@ -136,6 +136,21 @@ def test_a_camera_whose_depths_are_too_long_is_named_by_the_others() -> None:
     assert "motions/lidar and wheels" in said[-1]
 
 
+@pytest.mark.parametrize("sensor", ["wheels", "imu"])
+def test_a_sensor_that_repeats_a_reading_of_motion_is_said_and_one_at_rest_is_not(sensor: str) -> None:
+    given: list[Any] = wheels() if sensor == "wheels" else gyroscope()
+    held = next(m for m in given if m.stamp >= 6_000_000_000)
+    hung = [held.replace(stamp=m.stamp) if 6 <= m.stamp * 1e-9 < 7.5 else m for m in given]
+    said = warnings(checked(**{sensor: hung}))
+    assert [text for text in said if "repeats its last reading" in text]
+    assert "repeats" not in said[-1] or len(said) < 4
+    resting = [m.replace(linear=np.zeros(3), angular=np.zeros(3)) for m in wheels()]
+    standing = [
+        m.replace(position=np.zeros(3), orientation=np.array([0, 0, 0, 1.0])) for m in odometry("camera", 10, 1)
+    ]
+    assert not warnings(checked(wheels=resting, camera=standing, lidar=[], imu=[]))
+
+
 def test_a_gyroscope_of_another_scale_is_named() -> None:
     said = warnings(checked(imu=gyroscope(1.06)))
     assert said[-1].startswith("gyroscope of imu: 5.8% more turning than")
