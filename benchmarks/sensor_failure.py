@@ -213,6 +213,7 @@ def table(rows: Mapping[str, dict[str, Any]]) -> str:
     for name, row in rows.items():
         spoken = {who: n - usual.get(who, 0) for who, n in row["warnings"].items() if n > usual.get(who, 0)}
         said = "; ".join(f"{who} ({row['words'].get(who, 'before')})" for who in spoken) or "**silent**"
+        said = said.replace("perception/", "").replace("/odometry", "")
         lines.append(
             f"| {name} | {row['rms']:.3f} / {row['max']:.3f} | {row['ap50']:.2f} ({row['images']}) "
             f"| {row['recall']:.2f} / {row['precision']:.2f} | {row['relations']:.2f} "
