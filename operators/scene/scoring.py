@@ -142,7 +142,7 @@ class RelationScore:
     *mapped*: of pairs whose nodes are both matched; *all*: every relation of ours, and every true one between objects
     that must be mapped. Relations with a thing that does not count as a node do not count in *all* either, right or
     wrong: no true relation with it could be missed, so a false one would be held against what cannot be found. The
-    floor counts as matched.
+    floor counts as matched; other surfaces, which the truth does not have, are left out.
     """
 
     def __init__(self) -> None:
@@ -184,7 +184,8 @@ class RelationScore:
 
 def _triples(graph: SceneGraph) -> set[Triple]:
     ids = graph.ids.tolist()
-    return {(ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES}
+    rows = ((ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES)
+    return {row for row in rows if min(row[0], row[2]) >= FLOOR}
 
 
 def _ordered(triple: Triple) -> Triple:
