@@ -1,4 +1,4 @@
-"""Depth images against LiDAR scans: what transform and scale of the depth would make the two lie on each other."""
+"""Depth images against LiDAR scans: the transform and the scale that make the two lie on each other."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PRIOR = np.array([0.02, 0.02, 0.02, 0.1, 0.1, 0.1, 0.1])  # m, rad, share: stan
 
 @dataclass(frozen=True)
 class Misfit:
-    """How the LiDAR's extrinsic and the scale of depths seem wrong, with standard deviations.
+    """Says how far the LiDAR's extrinsic and the scale of depths seem wrong, with standard deviations.
 
     `turn` (3,) rad and `shift` (3,) m are what must be put on the LiDAR's points, in the depth camera's axes; `scale`
     is the share by which depths are too long.
@@ -84,6 +84,7 @@ class DepthScanAgreement:
         return True
 
     def misfit(self) -> Misfit:
+        """Returns what the pairs so far tell."""
         sigmas = np.sqrt(np.diag(np.linalg.inv(self._posterior())))
         return Misfit(self._x[:3].copy(), self._x[3:6].copy(), float(self._x[6]), sigmas)
 

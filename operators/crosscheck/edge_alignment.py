@@ -1,4 +1,4 @@
-"""Edges of colour images against edges of depth: by how many pixels one must be moved to lie on the other."""
+"""Edges of colour images against edges of depth: the shift that makes one lie on the other."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HALVES = ("left half", "right half")
 
 @dataclass(frozen=True)
 class Shift:
-    """Where the edges of the depth fit those of the colour image best.
+    """Says where the edges of the depth fit those of the colour image best.
 
     `x` and `y` in working pixels; `here` is how well they fit unmoved, as a share of that; `peak` how far the best fit
     stands out, in standard deviations of all; `edges` the pixels that it rests on; `part` names that of the image.
@@ -71,7 +71,7 @@ class EdgeAlignment:
             self._edges[k] += float(template.sum())
 
     def shifts(self) -> list[Shift]:
-        """The shift of the whole image and of its halves, of those that have edges."""
+        """Returns the shift of the whole image and of its halves, of those that have edges."""
         parts = [("image", self._sums.sum(axis=0), float(self._edges.sum()))]
         parts += [(name, s, float(n)) for name, s, n in zip(_HALVES, self._sums, self._edges.tolist(), strict=True)]
         return [_best(name, surface, edges, self._reach) for name, surface, edges in parts if surface.max() > 0]

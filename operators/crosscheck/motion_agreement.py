@@ -1,4 +1,4 @@
-"""Motions of one body by several sensors, against each other: who turns, drives or points differently from the rest."""
+"""Motions of one body by several sensors, against each other: who is off is named."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _SURE = 3.0  # standard deviations by which a disagreement must stand out
 
 @dataclass(frozen=True)
 class Limits:
-    """What counts as a disagreement: share of a way, share of a turn, that of a coarse one, and an angle (rad)."""
+    """Holds what counts as a disagreement: share of a way, share of a turn, that of a coarse one, and an angle (rad)."""
 
     way: float = 0.03
     turn: float = 0.03
@@ -33,7 +33,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Window:
-    """What a sensor says of the body's motion in a window: a twist (6,), metres and rad, NaN in what it cannot tell."""
+    """Holds what a sensor says of the body's motion in a window: a twist (6,), metres and rad, NaN in what it cannot tell."""
 
     twist: Array
     coarse: bool = False
@@ -41,7 +41,7 @@ class Window:
 
 @dataclass
 class Pair:
-    """How motions of one sensor differ from another's, added up over windows and forgotten by `keep`."""
+    """Adds up, window by window, how the motions of one sensor differ from another's, and forgets by `keep`."""
 
     coarse: bool
     information: Array = field(default_factory=lambda: np.diag(1.0 / _PRIOR**2))
@@ -68,7 +68,7 @@ class Pair:
             self.gain = self.gain + weight * J.T @ residual
 
     def estimate(self) -> Array:
-        """(5,): the turn (rad) by which the first sees the same motion, and shares: how much more way and turning."""
+        """Returns (5,): by what turn (rad), share of way and share of turning the first sensor differs."""
         return np.asarray(np.linalg.solve(self.information, self.gain))
 
     def sigmas(self) -> Array:
@@ -77,7 +77,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Contradiction:
-    """A sensor that is contradicted: by whom, in what (`way`, `turn`, `direction`), and how far (shares, rad).
+    """Names a sensor that is contradicted: by whom, in what (`way`, `turn`, `direction`), and how far (shares, rad).
 
     `alone`: by two or more that agree with each other; else nobody knows which of the two is wrong.
     """
@@ -160,7 +160,7 @@ class MotionAgreement:
 
 
 class Track:
-    """Poses of the body by one sensor over the last seconds, (stamp, T (4, 4)) in order."""
+    """Keeps the poses (4, 4) of the body by one sensor over the last seconds."""
 
     def __init__(self, span: int = 3_000_000_000, gap: int = 350_000_000) -> None:
         self._span, self._gap = span, gap
@@ -183,7 +183,7 @@ class Track:
             self.pose(stamp, self.poses[-1] @ se3.exp(step))
 
     def between(self, begin: int, end: int) -> Array | None:
-        """The motion (6,) from one stamp to another; None where poses are missing."""
+        """Returns the motion (6,) from one stamp to another; None where poses are missing."""
         first, last = self._at(begin), self._at(end)
         if first is None or last is None:
             return None
@@ -192,7 +192,7 @@ class Track:
         return se3.log(inverse @ last)
 
     def newest(self, now: int, age: int) -> Array | None:
-        """The mean velocity (6,) between the last two poses; None where they are older than `age` (ns)."""
+        """Returns the mean velocity (6,) between the last two poses; None where they are older than `age` (ns)."""
         if len(self.stamps) < 2 or now - self.stamps[-1] > age or self.stamps[-1] - self.stamps[-2] > self._gap:
             return None
         motion = self.between(self.stamps[-2], self.stamps[-1])

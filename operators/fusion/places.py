@@ -1,4 +1,4 @@
-"""Where the sensors are on the body whose state is estimated."""
+"""Places of the sensors on the body whose state is estimated."""
 
 from __future__ import annotations
 

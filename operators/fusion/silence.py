@@ -1,4 +1,4 @@
-"""What moves the estimate while the inertial sensor is silent: the turning that others see, and no acceleration."""
+"""Samples while the inertial sensor is silent: the turning that others see, and no acceleration."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ class Silence:
         self.bridged = 0
 
     def felt(self, time: int) -> None:
-        """The inertial sensor gave a sample."""
+        """Takes note that the inertial sensor gave a sample."""
         self._felt = time
 
     def saw(self, time: int, turning: Array) -> None:
-        """Another sensor saw the body turn (3,), rad/s."""
+        """Takes note of a turning (3,), rad/s, that another sensor saw."""
         if np.isfinite(turning).all():
             self._seen, self._turning = time, turning
 
@@ -41,7 +41,7 @@ class Silence:
         return self._felt >= 0 and time - self._felt > self._patience
 
     def sample(self, time: int, state: State) -> Sample:
-        """What the sensor would read if the body kept its velocity and turned as others see it."""
+        """Returns what the sensor would read if the body kept its velocity and turned as others see it."""
         self.bridged += 1
         seen = self._seen >= 0 and time - self._seen <= _SEEN
         turning = self._turning if seen else np.zeros(3)
