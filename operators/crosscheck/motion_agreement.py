@@ -23,7 +23,7 @@ _SURE = 3.0  # standard deviations by which a disagreement must stand out
 
 @dataclass(frozen=True)
 class Limits:
-    """Holds what counts as a disagreement: share of a way, share of a turn, that of a coarse one, and an angle (rad)."""
+    """Holds what counts as a disagreement: shares of a way, of a turn, of a coarse turn, and an angle (rad)."""
 
     way: float = 0.03
     turn: float = 0.03
@@ -33,7 +33,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Window:
-    """Holds what a sensor says of the body's motion in a window: a twist (6,), metres and rad, NaN in what it cannot tell."""
+    """Holds what a sensor says of the motion in a window: a twist (6,), metres and rad, NaN where it cannot tell."""
 
     twist: Array
     coarse: bool = False
