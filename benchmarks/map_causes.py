@@ -195,7 +195,7 @@ def main() -> None:
         print(
             f"{world.name}: {figures.must} objects, recall {figures.recall:.3f}, precision "
             f"{figures.precision:.3f}, doubles {len(figures.doubles)}, IoU {np.mean(figures.ious):.2f}, "
-            f"ignored {figures.ignored}",
+            f"ignored {len(figures.ignored)}",
             flush=True,
         )
     print("objects", sum(f.must for f in every))
