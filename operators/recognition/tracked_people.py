@@ -79,23 +79,17 @@ def tracked_moments(episode: Episode, stride: int, rng: Rng) -> Iterator[Moment]
 
 
 class _Noise:
-    """Errors of one tracker, whose strength is drawn.
-
-    What is hidden of an agent stays hidden for a while: its feet behind a table, its depth from one side.
-    """
+    """Errors of one tracker, whose strength is drawn."""
 
     def __init__(self, rng: Rng) -> None:
         self._rng = rng
-        self._sides: dict[int, float] = {}
-        self._feet: dict[int, float] = {}
         self.place = rng.uniform(0.005, 0.09)
         self.extent = rng.uniform(0.005, 0.08)
-        self.one_sided = rng.uniform(0, 1.0)
-        self.cut = rng.uniform(0, 0.6)
-        self.lasts = rng.uniform(0, 0.95)
+        self.one_sided = rng.uniform(0, 0.8)
+        self.cut = rng.uniform(0, 0.25)
         self.hides = rng.uniform(0, 0.12)
         self.loses = rng.uniform(0, 1)
-        self.top = -rng.uniform(0, 0.12)
+        self.top = -rng.uniform(0, 0.03)
 
     def lost(self, label: str) -> float:
         """Returns the probability that a thing is not in the map."""
@@ -108,15 +102,13 @@ class _Noise:
         if shown is None:
             return None
         bottom, height = body.bottom + shown[0] * body.size[2], (shown[1] - shown[0]) * body.size[2]
-        if body.id not in self._feet or rng.uniform() >= self.lasts:  # a table or a shelf hides its foot
-            self._feet[body.id] = rng.uniform(0.05, 0.5) if rng.uniform() < self.cut else 0.0
-        if body.id not in self._sides or rng.uniform() >= self.lasts:
-            self._sides[body.id] = rng.uniform(0, 1) ** 2 if rng.uniform() < self.one_sided else 1.0
-        raised = self._feet[body.id] * height
-        bottom, height = bottom + raised, height - raised
+        if rng.uniform() < self.cut:  # a table or a shelf hides its foot
+            raised = rng.uniform(0.1, 0.5) * height
+            bottom, height = bottom + raised, height - raised
         sides = np.sort(body.size[:2])
-        if body.label == "person":
-            sides = self._sides[body.id] * sides + (1 - self._sides[body.id]) * _USUAL
+        if body.label == "person" and rng.uniform() < self.one_sided:
+            keep = rng.uniform(0, 1)
+            sides = keep * sides + (1 - keep) * _USUAL
         sides = np.maximum(sides + rng.normal(0, self.extent, 2), 0.05)
         center = np.array([body.center[0], body.center[1], bottom + height / 2])
         center += rng.normal(0, 1, 3) * np.array([self.place, self.place, 0.3 * self.place])

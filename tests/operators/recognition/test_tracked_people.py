@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -63,17 +62,6 @@ def test_who_walks_out_of_the_image_stays_where_it_was_for_six_seconds() -> None
             assert max(m.unseen[7] for m in there) <= 6.01
             return
     raise AssertionError("no seed had a camera that sees only what is before it")
-
-
-def test_feet_that_are_hidden_stay_hidden_for_a_while() -> None:
-    hidden, then = [], []
-    for seed in range(40):
-        seen = [m for m in tracked_moments(episode(), 1, np.random.default_rng(seed)) if m.unseen.get(7) == 0]
-        feet = [next(b.bottom for b in m.bodies if b.id == 7) > 0.12 for m in seen]
-        hidden += feet[1:]
-        then += [after for before, after in pairwise(feet) if before]
-    assert 0.05 < np.mean(hidden) < 0.5
-    assert np.mean(then) > 1.5 * np.mean(hidden)
 
 
 def test_features_are_finite_and_labels_trail_by_a_quarter_of_a_second() -> None:
