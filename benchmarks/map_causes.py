@@ -78,7 +78,7 @@ def _note(trails: dict[int, Trail], frame: Frame, world: World, boxes: Boxes3D, 
     strong = np.flatnonzero(mine.scores >= 0.3)
     shared = overlap(true.boxes[plain].astype(float), mine.boxes[strong].astype(float))
     names, said = true.labels(), mine.labels()
-    instance = _instances(frame, world)
+    instance = instances_of(frame, world)
     of_box: dict[int, set[str]] = defaultdict(set)
     for k in range(boxes.count):
         ids, counts = np.unique(instance[labels == k], return_counts=True)
@@ -93,17 +93,25 @@ def _note(trails: dict[int, Trail], frame: Frame, world: World, boxes: Boxes3D, 
         trail.lifted += names[t] in of_box[int(true.ids[t])]
 
 
-def _instances(frame: Frame, world: World) -> Any:
+def instances_of(frame: Frame, world: World) -> Any:
     """Returns the true object of each point of the cloud, -1 outside the image."""
+    assert frame.masks.instances is not None
+    return _at_points(frame.masks.instances, frame, world)
+
+
+def classes_of(frame: Frame, world: World) -> Any:
+    """Returns the true class of each point of the cloud, -1 outside the image."""
+    return _at_points(frame.masks.classes, frame, world)
+
+
+def _at_points(image: Any, frame: Frame, world: World) -> Any:
     points = frame.cloud.points.astype(float)
     seen = transform_points(transform_between(world.extrinsics, frame.cloud.frame, frame.detections.frame), points)
     with np.errstate(all="ignore"):
         uv = np.nan_to_num(np.rint(project(seen, world.image_info.K)), nan=-1, posinf=-1, neginf=-1).astype(int)
-    instances = frame.masks.instances
-    assert instances is not None
-    inside = (uv >= 0).all(axis=1) & (uv < [instances.shape[1], instances.shape[0]]).all(axis=1) & (seen[:, 2] > 0)
+    inside = (uv >= 0).all(axis=1) & (uv < [image.shape[1], image.shape[0]]).all(axis=1) & (seen[:, 2] > 0)
     out = np.full(len(points), -1)
-    out[inside] = instances[uv[inside, 1], uv[inside, 0]]
+    out[inside] = image[uv[inside, 1], uv[inside, 0]]
     return out
 
 

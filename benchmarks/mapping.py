@@ -57,10 +57,10 @@ def depth_cloud(depth: DepthImage, info: CameraInfo) -> PointCloud:
 class Scored:
     """One mapper on one sensor, with the true cells that its points fell into."""
 
-    def __init__(self, truth: OccupancyGrid, **params: Any) -> None:
+    def __init__(self, truth: OccupancyGrid, solid: Mask, **params: Any) -> None:
         self.mapper = OccupancyMapper(period=1_000_000, **params)
         self.mapper.setup()
-        self.truth, self.far = truth, params["far"]
+        self.truth, self.solid, self.far = truth, solid, params["far"]
         self.touched = np.zeros(truth.cells.shape, np.bool_)
         self.milliseconds: list[float] = []
         self.stamp = 0
@@ -82,25 +82,38 @@ class Scored:
         """IoU of free, of taken, of taken to within a cell; precision and recall of the last, known share, ms.
 
         Scored are the cells that the map knows or a point fell into. Taken cells that no point fell into (the inside
-        of furniture) are left out of taken, and count as wrong where the map calls them free.
+        of furniture) are left out of taken, and count as wrong where the map calls them free. Cells that are neither
+        free nor hold a surface (the inside of walls, where no robot can be) are left out of taken.
         """
         found = _on_grid(self.mapper.process(*_last(self))["map"], self.truth)
         taken, free = found > 50, (found >= 0) & (found <= 50)
-        true_taken, true_free = self.truth.cells == 100, self.truth.cells == 0
-        seen_taken = true_taken & self.touched
+        true_free = (self.truth.cells == 0) & ~self.solid
+        seen = self.solid & self.touched
         known = (found >= 0) | self.touched
-        near_true, near_found = (binary_dilation(m, np.ones((3, 3))) for m in (true_taken, taken))
-        right, false, missed = (taken & near_true).sum(), (taken & ~near_true).sum(), (seen_taken & ~near_found).sum()
-        strict_right = taken & true_taken
+        near_true, near_found = (binary_dilation(m, np.ones((3, 3))) for m in (self.solid, taken))
+        right, false, missed = (taken & near_true).sum(), (taken & ~near_true).sum(), (seen & ~near_found).sum()
+        strict = (taken & self.solid).sum()
         return [
             _iou(free, true_free & known),
-            float(strict_right.sum() / (taken | seen_taken).sum()),
+            float(strict / (strict + (taken & true_free).sum() + (seen & ~taken).sum())),
             float(right / (right + false + missed)),
             float(right / max(1, right + false)),
-            float(1 - missed / max(1, seen_taken.sum())),
+            float(1 - missed / max(1, seen.sum())),
             float((known & (self.truth.cells >= 0)).sum() / (self.truth.cells >= 0).sum()),
             float(np.median(self.milliseconds)),
         ]
+
+
+def solid(truth: OccupancyGrid, mesh: Mesh) -> Mask:
+    """Cells that hold a surface of the mesh within the band, those on either side of a surface on their border too."""
+    points = on_surface(mesh.vertices.astype(np.float64), mesh.triangles, 8000, np.random.default_rng(0))
+    points = points[(points[:, 2] >= BAND[0]) & (points[:, 2] <= BAND[1])]
+    found = truth.cells == 100
+    for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        cell = np.floor((points[:, :2] + [1e-3 * x, 1e-3 * y] - truth.position[:2]) / truth.resolution).astype(int)
+        cell = cell[(cell >= 0).all(axis=1) & (cell < found.shape[::-1]).all(axis=1)]
+        found[cell[:, 1], cell[:, 0]] = True
+    return found
 
 
 def _last(scored: Scored) -> tuple[PointCloud, Pose]:
@@ -135,13 +148,16 @@ def occupancy(worlds: list[str], seeds: list[int], seconds: int) -> None:
     rows: dict[str, list[list[float]]] = {"lidar": [], "depth": []}
     for world in worlds:
         for seed in seeds:
-            source = robot(world, seed, seconds, truth={"occupancy": True, "band": BAND})
+            source = robot(world, seed, seconds, truth={"occupancy": True, "band": BAND, "mesh": True})
             static = source.static_outputs()
             truth, info, extrinsics = static["occupancy"], static["depth_info"], static["extrinsics"]
+            mesh = static["mesh"]
             assert isinstance(truth, OccupancyGrid)
+            assert isinstance(mesh, Mesh)
             assert isinstance(info, CameraInfo)
             assert isinstance(extrinsics, TransformSet)
-            scored = {"lidar": Scored(truth, far=8.0), "depth": Scored(truth, far=5.0)}
+            true = solid(truth, mesh)
+            scored = {"lidar": Scored(truth, true, far=8.0), "depth": Scored(truth, true, far=5.0)}
             for messages in source.stream():
                 depth, points = messages.get("depth"), messages.get("points")
                 base, camera = messages.get("true_base"), messages.get("ground_truth")
@@ -204,14 +220,16 @@ class Open3d:
 
     def mesh(self, stamp: int, frame: str) -> tuple[Array, NDArray[Any]]:
         mesh = self.volume.extract_triangle_mesh()
-        return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
+        sane = np.abs(vertices).max(axis=1) < 100  # some corners are not finite, others at 1e30
+        return vertices, triangles[sane[triangles].all(axis=1)]
 
 
 def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float, rng: np.random.Generator) -> Array:
     """Points (N, 3) drawn evenly from the surface."""
     corners = vertices[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    corners, area = corners[area > 0], area[area > 0]  # Open3D gives some corners that are not finite
+    corners, area = corners[area > 0], area[area > 0]
     chosen = rng.choice(len(corners), int(area.sum() * per_square_metre), p=area / area.sum())
     root, second = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
     weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)

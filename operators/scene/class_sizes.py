@@ -1,4 +1,7 @@
-"""Usual sizes of the simulated world's classes: what tells how deep an object is of which only one side was seen."""
+"""Knowledge about the simulated world's classes: usual sizes, and what a label of a detector tells.
+
+Sizes tell how deep an object is of which only one side was seen.
+"""
 
 from __future__ import annotations
 
@@ -41,3 +44,10 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
 }
 """By class, each way in which such things stand: medians over the objects of 36 training worlds (seeds 10000 to 10011
 of office, corridor and table_top)."""
+
+TELLING: dict[str, float] = {"ball": 2.0}
+"""Labels of another class that one of this class outweighs, where that is not one.
+
+Far balls are often called mugs, mugs seldom balls: of the labels of balls in five worlds (seeds 501, 502, 601,
+603 and 604) 13 % are `mug`, below 16 pixels 62 %; of those of mugs 2 % are `ball`.
+"""

@@ -56,9 +56,10 @@ class ObjectMap:
         movers: Iterable[int],
         settings: MapSettings,
         usual: Mapping[int, Sequence[Usual]] | None = None,
+        telling: Mapping[int, float] | None = None,
     ) -> None:
-        """`usual` are the sizes of classes whose size is known."""
-        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {})
+        """`usual` are the sizes of classes whose size is known, `telling` how much their labels count, where not 1."""
+        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {}, telling)
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -91,6 +92,11 @@ class ObjectMap:
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
+
+    @property
+    def heading(self) -> float | None:
+        """Heading of most things around, in [0, pi / 2); None where none stands out."""
+        return self._heading
 
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that are surely there, by rising id."""
@@ -139,7 +145,7 @@ class ObjectMap:
         object.view = direction * object.views if mover else object.view + direction
         before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
         voted = object.class_id
-        object.votes[each.class_id] += each.score
+        object.votes[each.class_id] += self._kinds.vote(each.class_id, each.score)
         object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
@@ -168,7 +174,7 @@ class ObjectMap:
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
-        votes[each.class_id] = each.score
+        votes[each.class_id] = self._kinds.vote(each.class_id, each.score)
         made = MapObject(self._next, cells, votes, _log_odds(each.score, self._settings.gain), stamp, stamp)
         if each.color is not None:
             made.color = each.color

@@ -140,7 +140,7 @@ class RelationScore:
     """Counts relations that are right, false and missed, by predicate, over several times.
 
     *mapped*: of pairs whose nodes are both matched; *all*: every relation of ours, and every true one between objects
-    that must be mapped. The floor counts as matched.
+    that must be mapped. The floor counts as matched; other surfaces, which the truth does not have, are left out.
     """
 
     def __init__(self) -> None:
@@ -170,7 +170,8 @@ class RelationScore:
 
 def _triples(graph: SceneGraph) -> set[Triple]:
     ids = graph.ids.tolist()
-    return {(ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES}
+    rows = ((ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES)
+    return {row for row in rows if min(row[0], row[2]) >= FLOOR}
 
 
 def _ordered(triple: Triple) -> Triple:
