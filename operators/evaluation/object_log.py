@@ -13,7 +13,7 @@ from dataflow.messages import Detections2D
 
 @dataclass(frozen=True, eq=False)
 class Objects:
-    """What scoring needs of an image: boxes (N, 4) in pixels, class names, scores, which objects are ignored."""
+    """Holds what scoring needs of an image: boxes (N, 4) in pixels, class names, scores, which objects are ignored."""
 
     size: NDArray[np.float64]
     boxes: NDArray[np.float64]
