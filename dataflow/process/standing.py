@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 class Standing:
-    """Whether one process has ended, and whether anything there is still to come without news from outside."""
+    """Knows whether one process has ended, and whether anything is still to come there without news from outside."""
 
     def __init__(self, process: OperatorProcess) -> None:
         self._process = process

@@ -282,8 +282,8 @@ def test_a_track_that_was_not_matched_for_a_while_leaves_the_image(tmp_path: Pat
         class_ids=[0, 0], ages=[1.0, 1.0], unseen=[0.1, 0.8], boxes=[[1, 2, 11, 22], [30, 2, 41, 22]],
     )  # fmt: skip
     found = draw(tmp_path, ("t/t", message))
-    (boxes,) = [at(found, entity, c) for entity, c in found if c == "Boxes2D:half_sizes"]
-    assert [values for row in boxes for values in row.values] == [[5.0, 10.0]]
+    (boxes,) = at(found, "/t/t/overlay", "Boxes2D:half_sizes")
+    assert np.allclose(np.array(boxes.values), [(5.0, 10.0)])
 
 
 def test_segmentation_names_its_classes_and_hides_void(tmp_path: Path) -> None:
