@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from semantic_map import IOU, PIXELS, VISIBLE, scored
+from semantic_map import IOU, PIXELS, SEARCH, VISIBLE, scored
 from sensed_worlds import Frame, World, sensed
 
 from dataflow.messages import Boxes3D, SceneGraph
 from dataflow.messages.geometry import transform_points
+from operators.cloud import PlaneSegmenter
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.scene import ObjectLifter, SemanticMap
@@ -46,9 +47,9 @@ class Trail:
 
 def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], list[SceneGraph], SemanticMap]:
     """Runs lifter and map on what was sensed, and notes what became of every object that was plainly seen."""
-    lifter, known = ObjectLifter(), SemanticMap(**params)
-    lifter.setup()
-    known.setup()
+    lifter, planes, known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
+    for operator in (lifter, planes, known):
+        operator.setup()
     trails: dict[int, Trail] = defaultdict(Trail)
     nodes: list[SceneGraph] = []
     for frame in world.frames[::every]:
@@ -63,6 +64,7 @@ def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], l
             world.extrinsics,
             found["images"],
             world.image_info,
+            planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
         )
         nodes.append(made["nodes"])
         _note(trails, frame, world, found["boxes"], found["clusters"].labels)
@@ -195,7 +197,7 @@ def main() -> None:
         print(
             f"{world.name}: {figures.must} objects, recall {figures.recall:.3f}, precision "
             f"{figures.precision:.3f}, doubles {len(figures.doubles)}, IoU {np.mean(figures.ious):.2f}, "
-            f"ignored {figures.ignored}",
+            f"ignored {len(figures.ignored)}",
             flush=True,
         )
     print("objects", sum(f.must for f in every))

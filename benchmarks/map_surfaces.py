@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from map_causes import classes_of, instances_of
 from numpy.typing import NDArray
+from semantic_map import SEARCH
 from sensed_worlds import KINDS, Frame, World, sensed
 
 from dataflow.messages import SceneGraph
@@ -33,8 +34,6 @@ from operators.sources.simulator.worlds import make_world
 Array = NDArray[np.float64]
 THICK, IOU, VIEWS, SIDE = 0.3, 0.25, 3, 0.1
 CLASSES = ("floor", "wall", "tabletop")
-SEARCH = {"voxel": 0.08, "period": 2.0}
-"""Parameters of PlaneSegmenter, as in graphs/core/perception.yaml."""
 
 
 @dataclass(frozen=True)

@@ -21,12 +21,11 @@ from scipy.spatial import cKDTree  # noqa: E402
 
 from dataflow.messages import CameraInfo, DepthImage, Mesh, Message, OccupancyGrid, Odometry, PointCloud, Pose  # noqa: E402
 from dataflow.messages import Transforms as TransformSet  # noqa: E402
-from dataflow.messages.geometry import invert, transform_points  # noqa: E402
+from dataflow.messages.geometry import transform_points  # noqa: E402
 from operators.cloud.back_projection import Rays, beside_edge, within_range  # noqa: E402
 from operators.mapping import OccupancyMapper, TsdfMap  # noqa: E402
 from operators.mapping.placing import placed  # noqa: E402
 from operators.sources import SimulatedRobot  # noqa: E402
-from operators.sources.simulator.native import open3d  # noqa: E402
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -198,33 +197,6 @@ class Ours:
         return mesh.vertices.astype(np.float64), mesh.triangles
 
 
-class Open3d:
-    """Open3D's ScalableTSDFVolume with the same voxels, truncation and range."""
-
-    def __init__(self, info: CameraInfo) -> None:
-        self.o3d = open3d()
-        volume = self.o3d.pipelines.integration
-        self.volume = volume.ScalableTSDFVolume(0.03, 0.09, volume.TSDFVolumeColorType.NoColor)
-        K = info.K
-        self.camera = self.o3d.camera.PinholeCameraIntrinsic(
-            info.width, info.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        )
-
-    def add(self, depth: DepthImage, pose: Pose) -> None:
-        grey = self.o3d.geometry.Image(np.zeros(depth.data.shape, np.float32))
-        z = np.where(depth.data <= 4.0, depth.data, 0).astype(np.float32)
-        both = self.o3d.geometry.RGBDImage.create_from_color_and_depth(
-            grey, self.o3d.geometry.Image(z), 1.0, 4.0, convert_rgb_to_intensity=False
-        )
-        self.volume.integrate(both, self.camera, invert(pose.matrix()))
-
-    def mesh(self, stamp: int, frame: str) -> tuple[Array, NDArray[Any]]:
-        mesh = self.volume.extract_triangle_mesh()
-        vertices, triangles = np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-        sane = np.abs(vertices).max(axis=1) < 100  # some corners are not finite, others at 1e30
-        return vertices, triangles[sane[triangles].all(axis=1)]
-
-
 def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float, rng: np.random.Generator) -> Array:
     """Points (N, 3) drawn evenly from the surface."""
     corners = vertices[triangles]
@@ -242,9 +214,9 @@ def near(points: Array, others: Array, distance: float) -> Mask:
 
 def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
     """Precision is over the mesh; recall over the true surface within 2 cm of noise-free returns nearer than 4 m."""
-    print("| world | map | F(5 cm) | precision | recall | mean distance, cm | CPU ms an image | mesh, s |")
-    print("| --- " * 8 + "|")
-    rows: dict[str, list[list[float]]] = {"ours": [], "Open3D": []}
+    print("| world | F(5 cm) | precision | recall | mean distance, cm | CPU ms an image | mesh, s |")
+    print("| --- " * 7 + "|")
+    rows: list[list[float]] = []
     for world in worlds:
         for seed in seeds:
             source = robot(world, seed, seconds, truth={"mesh": True}, lidar={"rate": 0.0})
@@ -254,18 +226,16 @@ def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
             true, info = static["mesh"], static["depth_info"]
             assert isinstance(true, Mesh)
             assert isinstance(info, CameraInfo)
-            maps: dict[str, Ours | Open3d] = {"ours": Ours(info), "Open3D": Open3d(info)}
-            spent: dict[str, list[float]] = {name: [] for name in maps}
+            one, spent = Ours(info), list[float]()
             returns = []
             for measured, sharp in zip(source.stream(), clean.stream(), strict=True):
                 depth, pose, ideal = measured["depth"], measured["ground_truth"], sharp["depth"]
                 assert isinstance(depth, DepthImage)
                 assert isinstance(pose, Pose)
                 assert isinstance(ideal, DepthImage)
-                for name, one in maps.items():
-                    begin = time.process_time()
-                    one.add(depth, pose)
-                    spent[name].append(1e3 * (time.process_time() - begin))
+                begin = time.process_time()
+                one.add(depth, pose)
+                spent.append(1e3 * (time.process_time() - begin))
                 seen = depth_cloud(ideal, info).points.astype(np.float64)
                 returns.append(transform_points(pose.matrix(), seen[seen[:, 2] < 4.0]))
             rng = np.random.default_rng(0)
@@ -273,21 +243,19 @@ def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
             due = still[rng.random(len(still)) < 0.2]
             due = due[near(due, np.concatenate(returns), 0.02)]
             tree = cKDTree(still)
-            for name, one in maps.items():
-                begin = time.process_time()
-                vertices, triangles = one.mesh(depth.stamp, pose.frame)
-                took = time.process_time() - begin
-                found = on_surface(vertices, triangles, 1000, rng)
-                off = tree.query(found, distance_upper_bound=0.3)[0]
-                precision, recall = float((off < 0.05).mean()), float(near(due, found, 0.05).mean())
-                score = 2 * precision * recall / (precision + recall)
-                mean = 100 * float(np.minimum(off, 0.3).mean())
-                rows[name].append([score, precision, recall, mean, float(np.median(spent[name])), took])
-                print(f"| {world} {seed} | {name} | " + _figures(rows[name][-1]), flush=True)
-    for name, values in rows.items():
-        print(f"| mean | {name} | " + _figures(np.mean(values, axis=0).tolist()))
-        worst = [*np.min(values, axis=0)[:3], *np.max(values, axis=0)[3:]]
-        print(f"| worst | {name} | " + _figures(worst))
+            begin = time.process_time()
+            vertices, triangles = one.mesh(depth.stamp, pose.frame)
+            took = time.process_time() - begin
+            found = on_surface(vertices, triangles, 1000, rng)
+            off = tree.query(found, distance_upper_bound=0.3)[0]
+            precision, recall = float((off < 0.05).mean()), float(near(due, found, 0.05).mean())
+            score = 2 * precision * recall / (precision + recall)
+            mean = 100 * float(np.minimum(off, 0.3).mean())
+            rows.append([score, precision, recall, mean, float(np.median(spent)), took])
+            print(f"| {world} {seed} | " + _figures(rows[-1]), flush=True)
+    worst = [*np.min(rows, axis=0)[:3], *np.max(rows, axis=0)[3:]]
+    print("| mean | " + _figures(np.mean(rows, axis=0).tolist()))
+    print("| worst | " + _figures(worst))
 
 
 def _figures(values: list[float]) -> str:

@@ -25,6 +25,10 @@ from dataflow.operator import Operator
 from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 
+MOST_TRIED = 256
+"""Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
+ticks one by one, while new ones come due: its process would never look at anything else."""
+
 Fault = Callable[[Firing], BaseException | None]
 """A fault on purpose: is asked before each firing, may take its time, and gives an error to fail with instead."""
 
@@ -159,7 +163,10 @@ class LiveRunner(OperatorRunner):
     # Work
 
     def step(self) -> bool:
-        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough."""
+        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough.
+
+        True also after `MOST_TRIED` of the latter without a firing: what has arrived meanwhile is to be looked at.
+        """
         if self.restarts.pending:
             if self.restarts.due_in() > 0:
                 return False
@@ -170,7 +177,9 @@ class LiveRunner(OperatorRunner):
                 self._wake_again()
                 return True
             self._told = self.node.every is not None
-        while not self.ended:
+        for _ in range(MOST_TRIED):
+            if self.ended:
+                return False
             taken = self.queue.take()
             if taken is not None:
                 self._admit(*taken)
@@ -181,7 +190,8 @@ class LiveRunner(OperatorRunner):
                 self._wake_again()
                 return True
             self._told = self.node.every is not None
-        return False
+        self.wake()
+        return True
 
     def _wake_again(self) -> None:
         """Asks for another step, unless nothing is left that could be decided now or later."""

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry
 from dataflow.messages.diagnostics import Level
-from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State
+from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
 from operators.fusion.gate import Health
 from operators.geometry.se3 import skew
 
@@ -33,7 +33,7 @@ def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame
         stamp=stamp,
         frame=frame,
         child_frame=child_frame,
-        linear=turn.T @ (own + np.cross(angular, lever)),
+        linear=turn.T @ (own + cross(angular, lever)),
         angular=turn.T @ angular,
         pose_covariance=pose @ P @ pose.T,
         twist_covariance=twist @ P @ twist.T,

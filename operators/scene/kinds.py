@@ -51,6 +51,10 @@ class Kinds:
     def is_round(self, object: MapObject) -> bool:
         return any(u.round for u in self.usual.get(object.class_id, ()))
 
+    def is_on_floor(self, object: MapObject) -> bool:
+        """Tells whether an object is of a class that stands on the floor."""
+        return any(u.on_floor for u in self.usual.get(object.class_id, ()))
+
     def near_side(self, points: Array, class_id: int, eye: Array, noise: float) -> Array:
         """Returns one view's points (N, 3) without those that are farther behind most than such a thing is deep.
 

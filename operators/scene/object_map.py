@@ -67,6 +67,8 @@ class ObjectMap:
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
         self._heading: float | None = None
+        self.floor: float | None = None
+        """Height of the floor, where it is known: what stands on it reaches down to it."""
 
     def update(self, stamp: int, seen: Sequence[Observation], view: RangeView) -> None:
         """Takes the observations of one time and the view that they come from."""
@@ -153,7 +155,7 @@ class ObjectMap:
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
             object.cells, object.most = cells, len(cells)
-            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+            self._fit(object)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
@@ -164,7 +166,12 @@ class ObjectMap:
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
-            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+            self._fit(object)
+
+    def _fit(self, object: MapObject) -> None:
+        object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+        if self.floor is not None and self._kinds.is_on_floor(object):
+            object.stand_on(self.floor)
 
     def _has_left(self, object: MapObject, view: RangeView) -> bool:
         """Tells whether a view looks through the place of an object."""
@@ -182,7 +189,7 @@ class ObjectMap:
         made.center = cells.middle
         if each.image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
             made.look(each.image)
-        made.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+        self._fit(made)
         self.objects[made.id] = made
         self._next += 1
 
@@ -262,7 +269,7 @@ class ObjectMap:
                 if are_one(a, b, self._kinds, self._settings.voxel):
                     del self.objects[i], self.objects[j]
                     one = merge(a, b, self._kinds)
-                    one.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+                    self._fit(one)
                     self.objects[one.id] = one
 
     def _drop(self, stamp: int) -> None:

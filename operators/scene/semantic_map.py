@@ -46,7 +46,8 @@ class SemanticMap(Operator):
     are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
     and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
     by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
-    out of sight. Surfaces are joined by their planes and by where they lie; there is one floor.
+    out of sight. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand
+    on it.
 
     Method: after Hughes et al., "Hydra: a real-time spatial perception system", 2022, and Gu et al., "ConceptGraphs",
     2024, with free space from the views themselves.
@@ -129,6 +130,7 @@ class SemanticMap(Operator):
             self._observation(boxes, cloud, rows, usable, world, k, shown[k])
             for k, rows in enumerate(_rows_of(labels, boxes.count))
         ]
+        known.floor = self._surfaces.floor
         view = RangeView(points[:: 1 + len(points) // 20_000], T, 0.012)
         known.update(cloud.stamp, [each for each in seen if each is not None], view)
         if surfaces is not None and surfaces.stamp == cloud.stamp:

@@ -81,6 +81,12 @@ class SurfaceMap:
         for surface in self.confirmed:
             surface.settle(heading)
 
+    @property
+    def floor(self) -> float | None:
+        """Height of the floor; None where it is not known."""
+        floors = [s for s in self.confirmed if s.label == FLOOR]
+        return float(floors[0].middle[2]) if floors else None
+
     def _best(self, part: MapSurface) -> MapSurface | None:
         """Returns the known surface that a part is of, the one with most voxels near it."""
         near = [(count, -s.id) for s in self.surfaces.values() if (count := shared(s, part))]

@@ -252,6 +252,16 @@ class Tuned(Operator):
         self.total = state["total"]
 
 
+class TunedByConstant(Tuned):
+    """Weighs by a static message, too."""
+
+    constant: Sampled[FeatureVector]
+
+    def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:  # type: ignore[override]
+        made = super().process(x)
+        return value(made.stamp, number(made) * number(constant))
+
+
 class TunedAtStart(Tuned):
     """Keeps the factor with which it was started."""
 

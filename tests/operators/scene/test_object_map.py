@@ -86,6 +86,21 @@ def test_a_label_that_is_seldom_said_of_other_things_counts_more(mugs: int, ball
     assert only(after([[(THING, label)] for label in said])).class_id == MUG
 
 
+@pytest.mark.parametrize(("bottom", "reaches_down"), [(0.7, True), (1.6, False)])
+def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reaches_down: bool) -> None:
+    size = {BOX: (Usual((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), on_floor=True),)}
+    known = ObjectMap(3, [BOX], MapSettings(), size)
+    known.floor = -0.4
+    T = looking(0.0)
+    half: Solid = ((2.0, 0.0, bottom - 0.4 + 0.4), (0.5, 0.5, 0.8))
+    for k in range(4):
+        known.update((k + 1) * SECOND // 4, [observation(half, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
+    center, box, _ = only(known).box
+    top = float(center[2] + box[2] / 2)
+    assert abs(top - (bottom + 0.4)) < 0.1
+    assert (abs(float(center[2] - box[2] / 2) + 0.4) < 1e-9) == reaches_down
+
+
 def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:
     """The foot of a thing, detected as something else where its top is hidden."""
     foot: Solid = ((2.0, 0.0, 0.07), (0.12, 0.12, 0.06))
