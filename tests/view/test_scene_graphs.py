@@ -120,6 +120,16 @@ def test_the_list_says_who_does_what_and_what_carries_what(tmp_path: Path) -> No
     assert "near" not in text.values[0]
 
 
+def test_an_empty_list_has_no_bare_headings(tmp_path: Path) -> None:
+    empty = SceneGraph(
+        stamp=0, frame="map", class_names=CLASSES, predicates=(), ids=[], class_ids=np.zeros(0, np.int32),
+        positions=np.zeros((0, 3)), sizes=np.zeros((0, 3)), subjects=np.zeros(0, np.int32),
+        objects=np.zeros(0, np.int32),
+    )  # fmt: skip
+    (text,) = at(draw(tmp_path, ("s/graph", empty)), "/s/graph/text", "TextDocument:text")
+    assert text.values == ["Nothing is mapped yet."]
+
+
 @given(st.integers(0, 12), st.integers(0, 40), st.integers(0, 15))
 def test_every_node_of_the_tree_is_in_view_and_no_two_are_at_one_place(tables: int, mugs: int, people: int) -> None:
     classes = ["floor"] + ["table"] * tables + ["mug"] * mugs * bool(tables) + ["person"] * people

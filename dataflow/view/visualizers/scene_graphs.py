@@ -84,15 +84,13 @@ def _words(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: 
     """The graph as a list in Markdown, sent where it differs from the last."""
     agents = agents_in_words(message, told, activities)
     rows = carriers_in_words(message, told)
-    text = "\n".join(
-        (
-            "| who | does |\n|---|---|",
-            *(f"| **{row.name}** | {row.text} |" for row in agents),
-            "\n| what | carries |\n|---|---|",
-            *(f"| **{row.name}** | {row.text} |" for row in rows),
-            f"\n{message.count} nodes, {len(message.subjects)} relations",
-        )
+    tables = (
+        "\n".join((f"| {heading} |\n|---|---|", *(f"| **{row.name}** | {row.text} |" for row in found)))
+        for heading, found in (("who | does", agents), ("what | carries", rows))
+        if found
     )
+    seen = f"{message.count} nodes, {len(message.subjects)} relations" if message.count else "Nothing is mapped yet."
+    text = "\n\n".join((*tables, seen))
     if canvas.scene.changed(canvas.entity, "words", text):
         canvas.log("text", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
