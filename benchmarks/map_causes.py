@@ -18,11 +18,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from semantic_map import IOU, PIXELS, VISIBLE, scored
+from semantic_map import IOU, PIXELS, SEARCH, VISIBLE, scored
 from sensed_worlds import Frame, World, sensed
 
 from dataflow.messages import Boxes3D, SceneGraph
 from dataflow.messages.geometry import transform_points
+from operators.cloud import PlaneSegmenter
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.scene import ObjectLifter, SemanticMap
@@ -46,9 +47,9 @@ class Trail:
 
 def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], list[SceneGraph], SemanticMap]:
     """Runs lifter and map on what was sensed, and notes what became of every object that was plainly seen."""
-    lifter, known = ObjectLifter(), SemanticMap(**params)
-    lifter.setup()
-    known.setup()
+    lifter, planes, known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
+    for operator in (lifter, planes, known):
+        operator.setup()
     trails: dict[int, Trail] = defaultdict(Trail)
     nodes: list[SceneGraph] = []
     for frame in world.frames[::every]:
@@ -63,6 +64,7 @@ def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], l
             world.extrinsics,
             found["images"],
             world.image_info,
+            planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
         )
         nodes.append(made["nodes"])
         _note(trails, frame, world, found["boxes"], found["clusters"].labels)
@@ -78,7 +80,7 @@ def _note(trails: dict[int, Trail], frame: Frame, world: World, boxes: Boxes3D, 
     strong = np.flatnonzero(mine.scores >= 0.3)
     shared = overlap(true.boxes[plain].astype(float), mine.boxes[strong].astype(float))
     names, said = true.labels(), mine.labels()
-    instance = _instances(frame, world)
+    instance = instances_of(frame, world)
     of_box: dict[int, set[str]] = defaultdict(set)
     for k in range(boxes.count):
         ids, counts = np.unique(instance[labels == k], return_counts=True)
@@ -93,17 +95,25 @@ def _note(trails: dict[int, Trail], frame: Frame, world: World, boxes: Boxes3D, 
         trail.lifted += names[t] in of_box[int(true.ids[t])]
 
 
-def _instances(frame: Frame, world: World) -> Any:
+def instances_of(frame: Frame, world: World) -> Any:
     """Returns the true object of each point of the cloud, -1 outside the image."""
+    assert frame.masks.instances is not None
+    return _at_points(frame.masks.instances, frame, world)
+
+
+def classes_of(frame: Frame, world: World) -> Any:
+    """Returns the true class of each point of the cloud, -1 outside the image."""
+    return _at_points(frame.masks.classes, frame, world)
+
+
+def _at_points(image: Any, frame: Frame, world: World) -> Any:
     points = frame.cloud.points.astype(float)
     seen = transform_points(transform_between(world.extrinsics, frame.cloud.frame, frame.detections.frame), points)
     with np.errstate(all="ignore"):
         uv = np.nan_to_num(np.rint(project(seen, world.image_info.K)), nan=-1, posinf=-1, neginf=-1).astype(int)
-    instances = frame.masks.instances
-    assert instances is not None
-    inside = (uv >= 0).all(axis=1) & (uv < [instances.shape[1], instances.shape[0]]).all(axis=1) & (seen[:, 2] > 0)
+    inside = (uv >= 0).all(axis=1) & (uv < [image.shape[1], image.shape[0]]).all(axis=1) & (seen[:, 2] > 0)
     out = np.full(len(points), -1)
-    out[inside] = instances[uv[inside, 1], uv[inside, 0]]
+    out[inside] = image[uv[inside, 1], uv[inside, 0]]
     return out
 
 
@@ -187,7 +197,7 @@ def main() -> None:
         print(
             f"{world.name}: {figures.must} objects, recall {figures.recall:.3f}, precision "
             f"{figures.precision:.3f}, doubles {len(figures.doubles)}, IoU {np.mean(figures.ious):.2f}, "
-            f"ignored {figures.ignored}",
+            f"ignored {len(figures.ignored)}",
             flush=True,
         )
     print("objects", sum(f.must for f in every))

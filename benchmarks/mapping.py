@@ -21,12 +21,11 @@ from scipy.spatial import cKDTree  # noqa: E402
 
 from dataflow.messages import CameraInfo, DepthImage, Mesh, Message, OccupancyGrid, Odometry, PointCloud, Pose  # noqa: E402
 from dataflow.messages import Transforms as TransformSet  # noqa: E402
-from dataflow.messages.geometry import invert, transform_points  # noqa: E402
+from dataflow.messages.geometry import transform_points  # noqa: E402
 from operators.cloud.back_projection import Rays, beside_edge, within_range  # noqa: E402
 from operators.mapping import OccupancyMapper, TsdfMap  # noqa: E402
 from operators.mapping.placing import placed  # noqa: E402
 from operators.sources import SimulatedRobot  # noqa: E402
-from operators.sources.simulator.native import open3d  # noqa: E402
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -57,10 +56,10 @@ def depth_cloud(depth: DepthImage, info: CameraInfo) -> PointCloud:
 class Scored:
     """One mapper on one sensor, with the true cells that its points fell into."""
 
-    def __init__(self, truth: OccupancyGrid, **params: Any) -> None:
+    def __init__(self, truth: OccupancyGrid, solid: Mask, **params: Any) -> None:
         self.mapper = OccupancyMapper(period=1_000_000, **params)
         self.mapper.setup()
-        self.truth, self.far = truth, params["far"]
+        self.truth, self.solid, self.far = truth, solid, params["far"]
         self.touched = np.zeros(truth.cells.shape, np.bool_)
         self.milliseconds: list[float] = []
         self.stamp = 0
@@ -82,25 +81,38 @@ class Scored:
         """IoU of free, of taken, of taken to within a cell; precision and recall of the last, known share, ms.
 
         Scored are the cells that the map knows or a point fell into. Taken cells that no point fell into (the inside
-        of furniture) are left out of taken, and count as wrong where the map calls them free.
+        of furniture) are left out of taken, and count as wrong where the map calls them free. Cells that are neither
+        free nor hold a surface (the inside of walls, where no robot can be) are left out of taken.
         """
         found = _on_grid(self.mapper.process(*_last(self))["map"], self.truth)
         taken, free = found > 50, (found >= 0) & (found <= 50)
-        true_taken, true_free = self.truth.cells == 100, self.truth.cells == 0
-        seen_taken = true_taken & self.touched
+        true_free = (self.truth.cells == 0) & ~self.solid
+        seen = self.solid & self.touched
         known = (found >= 0) | self.touched
-        near_true, near_found = (binary_dilation(m, np.ones((3, 3))) for m in (true_taken, taken))
-        right, false, missed = (taken & near_true).sum(), (taken & ~near_true).sum(), (seen_taken & ~near_found).sum()
-        strict_right = taken & true_taken
+        near_true, near_found = (binary_dilation(m, np.ones((3, 3))) for m in (self.solid, taken))
+        right, false, missed = (taken & near_true).sum(), (taken & ~near_true).sum(), (seen & ~near_found).sum()
+        strict = (taken & self.solid).sum()
         return [
             _iou(free, true_free & known),
-            float(strict_right.sum() / (taken | seen_taken).sum()),
+            float(strict / (strict + (taken & true_free).sum() + (seen & ~taken).sum())),
             float(right / (right + false + missed)),
             float(right / max(1, right + false)),
-            float(1 - missed / max(1, seen_taken.sum())),
+            float(1 - missed / max(1, seen.sum())),
             float((known & (self.truth.cells >= 0)).sum() / (self.truth.cells >= 0).sum()),
             float(np.median(self.milliseconds)),
         ]
+
+
+def solid(truth: OccupancyGrid, mesh: Mesh) -> Mask:
+    """Cells that hold a surface of the mesh within the band, those on either side of a surface on their border too."""
+    points = on_surface(mesh.vertices.astype(np.float64), mesh.triangles, 8000, np.random.default_rng(0))
+    points = points[(points[:, 2] >= BAND[0]) & (points[:, 2] <= BAND[1])]
+    found = truth.cells == 100
+    for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+        cell = np.floor((points[:, :2] + [1e-3 * x, 1e-3 * y] - truth.position[:2]) / truth.resolution).astype(int)
+        cell = cell[(cell >= 0).all(axis=1) & (cell < found.shape[::-1]).all(axis=1)]
+        found[cell[:, 1], cell[:, 0]] = True
+    return found
 
 
 def _last(scored: Scored) -> tuple[PointCloud, Pose]:
@@ -135,13 +147,16 @@ def occupancy(worlds: list[str], seeds: list[int], seconds: int) -> None:
     rows: dict[str, list[list[float]]] = {"lidar": [], "depth": []}
     for world in worlds:
         for seed in seeds:
-            source = robot(world, seed, seconds, truth={"occupancy": True, "band": BAND})
+            source = robot(world, seed, seconds, truth={"occupancy": True, "band": BAND, "mesh": True})
             static = source.static_outputs()
             truth, info, extrinsics = static["occupancy"], static["depth_info"], static["extrinsics"]
+            mesh = static["mesh"]
             assert isinstance(truth, OccupancyGrid)
+            assert isinstance(mesh, Mesh)
             assert isinstance(info, CameraInfo)
             assert isinstance(extrinsics, TransformSet)
-            scored = {"lidar": Scored(truth, far=8.0), "depth": Scored(truth, far=5.0)}
+            true = solid(truth, mesh)
+            scored = {"lidar": Scored(truth, true, far=8.0), "depth": Scored(truth, true, far=5.0)}
             for messages in source.stream():
                 depth, points = messages.get("depth"), messages.get("points")
                 base, camera = messages.get("true_base"), messages.get("ground_truth")
@@ -182,36 +197,11 @@ class Ours:
         return mesh.vertices.astype(np.float64), mesh.triangles
 
 
-class Open3d:
-    """Open3D's ScalableTSDFVolume with the same voxels, truncation and range."""
-
-    def __init__(self, info: CameraInfo) -> None:
-        self.o3d = open3d()
-        volume = self.o3d.pipelines.integration
-        self.volume = volume.ScalableTSDFVolume(0.03, 0.09, volume.TSDFVolumeColorType.NoColor)
-        K = info.K
-        self.camera = self.o3d.camera.PinholeCameraIntrinsic(
-            info.width, info.height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]
-        )
-
-    def add(self, depth: DepthImage, pose: Pose) -> None:
-        grey = self.o3d.geometry.Image(np.zeros(depth.data.shape, np.float32))
-        z = np.where(depth.data <= 4.0, depth.data, 0).astype(np.float32)
-        both = self.o3d.geometry.RGBDImage.create_from_color_and_depth(
-            grey, self.o3d.geometry.Image(z), 1.0, 4.0, convert_rgb_to_intensity=False
-        )
-        self.volume.integrate(both, self.camera, invert(pose.matrix()))
-
-    def mesh(self, stamp: int, frame: str) -> tuple[Array, NDArray[Any]]:
-        mesh = self.volume.extract_triangle_mesh()
-        return np.asarray(mesh.vertices), np.asarray(mesh.triangles)
-
-
 def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float, rng: np.random.Generator) -> Array:
     """Points (N, 3) drawn evenly from the surface."""
     corners = vertices[triangles]
     area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
-    corners, area = corners[area > 0], area[area > 0]  # Open3D gives some corners that are not finite
+    corners, area = corners[area > 0], area[area > 0]
     chosen = rng.choice(len(corners), int(area.sum() * per_square_metre), p=area / area.sum())
     root, second = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
     weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)
@@ -224,9 +214,9 @@ def near(points: Array, others: Array, distance: float) -> Mask:
 
 def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
     """Precision is over the mesh; recall over the true surface within 2 cm of noise-free returns nearer than 4 m."""
-    print("| world | map | F(5 cm) | precision | recall | mean distance, cm | CPU ms an image | mesh, s |")
-    print("| --- " * 8 + "|")
-    rows: dict[str, list[list[float]]] = {"ours": [], "Open3D": []}
+    print("| world | F(5 cm) | precision | recall | mean distance, cm | CPU ms an image | mesh, s |")
+    print("| --- " * 7 + "|")
+    rows: list[list[float]] = []
     for world in worlds:
         for seed in seeds:
             source = robot(world, seed, seconds, truth={"mesh": True}, lidar={"rate": 0.0})
@@ -236,18 +226,16 @@ def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
             true, info = static["mesh"], static["depth_info"]
             assert isinstance(true, Mesh)
             assert isinstance(info, CameraInfo)
-            maps: dict[str, Ours | Open3d] = {"ours": Ours(info), "Open3D": Open3d(info)}
-            spent: dict[str, list[float]] = {name: [] for name in maps}
+            one, spent = Ours(info), list[float]()
             returns = []
             for measured, sharp in zip(source.stream(), clean.stream(), strict=True):
                 depth, pose, ideal = measured["depth"], measured["ground_truth"], sharp["depth"]
                 assert isinstance(depth, DepthImage)
                 assert isinstance(pose, Pose)
                 assert isinstance(ideal, DepthImage)
-                for name, one in maps.items():
-                    begin = time.process_time()
-                    one.add(depth, pose)
-                    spent[name].append(1e3 * (time.process_time() - begin))
+                begin = time.process_time()
+                one.add(depth, pose)
+                spent.append(1e3 * (time.process_time() - begin))
                 seen = depth_cloud(ideal, info).points.astype(np.float64)
                 returns.append(transform_points(pose.matrix(), seen[seen[:, 2] < 4.0]))
             rng = np.random.default_rng(0)
@@ -255,21 +243,19 @@ def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
             due = still[rng.random(len(still)) < 0.2]
             due = due[near(due, np.concatenate(returns), 0.02)]
             tree = cKDTree(still)
-            for name, one in maps.items():
-                begin = time.process_time()
-                vertices, triangles = one.mesh(depth.stamp, pose.frame)
-                took = time.process_time() - begin
-                found = on_surface(vertices, triangles, 1000, rng)
-                off = tree.query(found, distance_upper_bound=0.3)[0]
-                precision, recall = float((off < 0.05).mean()), float(near(due, found, 0.05).mean())
-                score = 2 * precision * recall / (precision + recall)
-                mean = 100 * float(np.minimum(off, 0.3).mean())
-                rows[name].append([score, precision, recall, mean, float(np.median(spent[name])), took])
-                print(f"| {world} {seed} | {name} | " + _figures(rows[name][-1]), flush=True)
-    for name, values in rows.items():
-        print(f"| mean | {name} | " + _figures(np.mean(values, axis=0).tolist()))
-        worst = [*np.min(values, axis=0)[:3], *np.max(values, axis=0)[3:]]
-        print(f"| worst | {name} | " + _figures(worst))
+            begin = time.process_time()
+            vertices, triangles = one.mesh(depth.stamp, pose.frame)
+            took = time.process_time() - begin
+            found = on_surface(vertices, triangles, 1000, rng)
+            off = tree.query(found, distance_upper_bound=0.3)[0]
+            precision, recall = float((off < 0.05).mean()), float(near(due, found, 0.05).mean())
+            score = 2 * precision * recall / (precision + recall)
+            mean = 100 * float(np.minimum(off, 0.3).mean())
+            rows.append([score, precision, recall, mean, float(np.median(spent)), took])
+            print(f"| {world} {seed} | " + _figures(rows[-1]), flush=True)
+    worst = [*np.min(rows, axis=0)[:3], *np.max(rows, axis=0)[3:]]
+    print("| mean | " + _figures(np.mean(rows, axis=0).tolist()))
+    print("| worst | " + _figures(worst))
 
 
 def _figures(values: list[float]) -> str:

@@ -22,7 +22,7 @@ from sensed_worlds import Frame, World, sensed
 
 from dataflow.messages import Activity, SceneGraph
 from operators.scene import SceneGraphBuilder
-from operators.scene.scoring import PREDICATES, RelationScore, match_nodes
+from operators.scene.scoring import PREDICATES, RelationScore, score_nodes
 
 ARRIVALS = ("sitting_down", "sitting", "reaching")
 
@@ -102,8 +102,8 @@ def run(world: World, every: int, *, true: bool) -> dict[str, Any]:
         nodes = [f.scene for f in frames]
     else:
         nodes = mapped(World(world.name, world.image_info, world.extrinsics, frames), true=False)
-        score = scored(world, nodes[-1])
-        figures = {"recall": score.recall, "precision": score.precision, "doubles": len(score.doubles)}
+        last = scored(world, nodes[-1])
+        figures = {"recall": last.recall, "precision": last.precision, "doubles": len(last.doubles)}
     must = seen(world).countable()
     relations = RelationScore()
     made, graphs = [], []
@@ -111,10 +111,11 @@ def run(world: World, every: int, *, true: bool) -> dict[str, Any]:
         out = builder.process(node, frame.base)
         graphs.append(out["graph"])
         late = k >= len(frames) // 2
-        of = {i: i for i in node.ids.tolist()} if true else match_nodes(out["graph"], frame.scene)
+        score = score_nodes(out["graph"], frame.scene, must)
+        of = {i: i for i in node.ids.tolist()} if true else score.match
         made.append((out["activities"], of))
         if late and k % max(1, round(len(frames) / 50)) == 0:
-            relations.add(out["graph"], frame.scene, of, must if not true else set(of))
+            relations.add(out["graph"], frame.scene, of, set(of) if true else must, () if true else score.ignored)
     return figures | {
         "relations": relations.counts,
         "f1 mapped": relations.f1("mapped"),

@@ -18,17 +18,20 @@ import numpy as np
 from sensed_worlds import World, sensed
 
 from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
+from operators.cloud import PlaneSegmenter
 from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.scoring import MOVERS, NodeScore, PlainlySeen, score_nodes
 
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5
+SEARCH: dict[str, Any] = {"voxel": 0.08, "period": 2.0}
+"""Parameters of PlaneSegmenter, as in graphs/core/perception.yaml."""
 
 
 def mapped(world: World, *, true: bool, **params: Any) -> list[SceneGraph]:
     """Returns the map after each frame."""
-    lifter, known = ObjectLifter(), SemanticMap(**params)
-    lifter.setup()
-    known.setup()
+    lifter, planes, known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
+    for operator in (lifter, planes, known):
+        operator.setup()
     nodes: list[SceneGraph] = []
     for frame in world.frames:
         detections: Detections2D = frame.objects if true else frame.detections
@@ -45,6 +48,7 @@ def mapped(world: World, *, true: bool, **params: Any) -> list[SceneGraph]:
             world.extrinsics,
             found["images"],
             world.image_info,
+            planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
         )
         nodes.append(made["nodes"])
     return nodes

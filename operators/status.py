@@ -9,7 +9,7 @@ import numpy as np
 from dataflow.messages import Diagnostics, Level
 
 
-def counted_status(operator: str, stamp: int, text: str, level: Level, counts: Mapping[str, int]) -> Diagnostics:
+def counted_status(operator: str, stamp: int, text: str, level: Level, counts: Mapping[str, int | str]) -> Diagnostics:
     """Returns diagnostics of one entry, with `counts` as its values."""
     return Diagnostics(
         stamp=stamp,

@@ -148,12 +148,7 @@ def load(family: Family, name: str, weights: str, file: Path | None, device: str
         model = _empty(family, name, count, state)
         classes = classes or tuple(map(str, range(count)))
     else:
-        from torchvision.models import get_model_weights
-
-        choices = get_model_weights(name)
-        if weights != DEFAULT and weights not in choices.__members__:
-            raise WeightsError(f"{name} has no weights {weights!r}; torchvision has {', '.join(choices.__members__)}")
-        chosen = choices.DEFAULT if weights == DEFAULT else choices[weights]
+        chosen = _choice(name, weights)
         state = _cached(name, chosen)
         classes = tuple(chosen.meta["categories"])
         model = _empty(family, name, len(classes), state)
@@ -164,6 +159,45 @@ def load(family: Family, name: str, weights: str, file: Path | None, device: str
         raise WeightsError(f"{file or 'the weights'} do not fit {name}: {_first_lines(str(error))}") from None
     model.eval().to(where)
     return Loaded(model, classes, where, transforms)
+
+
+def new_model(family: Family, name: str, classes: int) -> nn.Module:
+    """Returns a model for so many classes, the background among them, with random weights.
+
+    Raises ModelError for a name that torchvision lacks.
+    """
+    _known(family, name)
+    return _empty(family, name, classes, {})
+
+
+def family_of(name: str) -> Family:
+    """Returns whether a model is a detector or a segmenter. Raises ModelError for one that is neither."""
+    families: tuple[Family, ...] = ("detection", "segmentation")
+    names = {family: model_names(family) for family in families}
+    for family in families:
+        if name in names[family]:
+            return family
+    every = [each for family in families for each in names[family]]
+    near = get_close_matches(name, every, 1)
+    hint = f"did you mean {near[0]!r}? " if near else ""
+    raise ModelError(f"torchvision has no detector or segmenter {name!r}; {hint}there are {', '.join(every)}")
+
+
+def cached_weights(name: str, weights: str) -> dict[str, Any]:
+    """Returns the state dict of torchvision's weights (`default`, or a name such as `COCO_V1`) from its cache.
+
+    Raises WeightsError that says where it looked and how to get them.
+    """
+    return _cached(name, _choice(name, weights))
+
+
+def _choice(name: str, weights: str) -> Any:
+    from torchvision.models import get_model_weights
+
+    choices = get_model_weights(name)
+    if weights != DEFAULT and weights not in choices.__members__:
+        raise WeightsError(f"{name} has no weights {weights!r}; torchvision has {', '.join(choices.__members__)}")
+    return choices.DEFAULT if weights == DEFAULT else choices[weights]
 
 
 def _module(family: Family) -> Any:

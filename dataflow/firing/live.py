@@ -7,7 +7,6 @@ messages reach which firing; the firing records say which, so a live run can be 
 
 from __future__ import annotations
 
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -15,18 +14,20 @@ from typing import Any
 
 from dataflow.firing.absent import without_absent
 from dataflow.firing.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
+from dataflow.firing.event_time import EventTime
 from dataflow.firing.failure import RAISED, OperatorFailure
 from dataflow.firing.log import FiringLog, unlisted
 from dataflow.firing.ports import Emitter
-from dataflow.firing.restarts import Restarts
+from dataflow.firing.restarts import Restarts, close_quietly
 from dataflow.firing.runner import MOST_TICKS, OperatorRunner
 from dataflow.graph.model import Node
 from dataflow.operator import Operator
 from dataflow.sync import NEVER, Drop, DropLog, Entry, Firing, StreamOrderError
 from dataflow.sync.single import make_aligner
 
-OWN_CLOCK = 1_000_000_000
-"""A device whose first stamp is farther (ns) from event time has a clock of its own, which then counts."""
+MOST_TRIED = 256
+"""Messages and waits that are over, none of which decides a firing, in one step. A timer that falls behind drops its
+ticks one by one, while new ones come due: its process would never look at anything else."""
 
 Fault = Callable[[Firing], BaseException | None]
 """A fault on purpose: is asked before each firing, may take its time, and gives an error to fail with instead."""
@@ -75,9 +76,8 @@ class LiveRunner(OperatorRunner):
         self._log = DropLog()  # of what did not reach an aligner
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
-        self._event_clock = event_clock
-        self._newest, self._shift = NEVER, 0
-        self.patience = Patience(node.live.wait, clock, self._event_time)
+        self._time = EventTime(event_clock)
+        self.patience = Patience(node.live.wait, clock, self._time.now)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
@@ -137,10 +137,7 @@ class LiveRunner(OperatorRunner):
             if incarnation > seen and stamp <= last and not self.ended:
                 self._reset(stream, entry)
             self._seen[stream] = (incarnation, stamp)
-            if self._newest == NEVER and abs(stamp - self._event_time()) > OWN_CLOCK:
-                self._shift = stamp - self._event_clock()  # a device whose clock is not this machine's
-            if stamp > self._newest:
-                self._newest = stamp
+            self._time.see(stamp)
         if self.restarts.pending:
             self.done = max(self.done, entry.stamp)  # nobody waits for an operator that is away
         if not self.awake:
@@ -166,7 +163,10 @@ class LiveRunner(OperatorRunner):
     # Work
 
     def step(self) -> bool:
-        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough."""
+        """One firing: of what is decided; else of what the queues hold; else of what has waited long enough.
+
+        True also after `MOST_TRIED` of the latter without a firing: what has arrived meanwhile is to be looked at.
+        """
         if self.restarts.pending:
             if self.restarts.due_in() > 0:
                 return False
@@ -177,7 +177,9 @@ class LiveRunner(OperatorRunner):
                 self._wake_again()
                 return True
             self._told = self.node.every is not None
-        while not self.ended:
+        for _ in range(MOST_TRIED):
+            if self.ended:
+                return False
             taken = self.queue.take()
             if taken is not None:
                 self._admit(*taken)
@@ -188,7 +190,8 @@ class LiveRunner(OperatorRunner):
                 self._wake_again()
                 return True
             self._told = self.node.every is not None
-        return False
+        self.wake()
+        return True
 
     def _wake_again(self) -> None:
         """Asks for another step, unless nothing is left that could be decided now or later."""
@@ -201,7 +204,7 @@ class LiveRunner(OperatorRunner):
         operator could make up for."""
         if self.queue.policy != "block":
             patience = max((wait for wait in self.node.live.wait.values() if wait is not None), default=0)
-            self.aligner.skip_ticks(self._event_time() - patience - self.queue.size * period)
+            self.aligner.skip_ticks(self._time.now() - patience - self.queue.size * period)
         number, _, last = self.aligner.owed_ticks()
         if number > MOST_TICKS:
             self.aligner.skip_ticks(last - (self.queue.size - 1) * period)
@@ -248,7 +251,7 @@ class LiveRunner(OperatorRunner):
         self.calls.operator = self.operator
         self._begin_incarnation()
         try:
-            _close_quietly(old)
+            close_quietly(old)
             self._change_again()
             started = time.time_ns()
             self.calls.setup()  # its static streams go on as they are
@@ -275,7 +278,7 @@ class LiveRunner(OperatorRunner):
         self._begin_alignment(stream)
         self._jumped[_producer(stream)] = entry.incarnation
         self._seen = {other: (incarnation, NEVER) for other, (incarnation, _) in self._seen.items()}
-        self._newest, self._shift = NEVER, entry.stamp - self._event_clock()
+        self._time.begin_at(entry.stamp)
         self._begin_incarnation(stamps_go_back=True)
         self.done = NEVER
         detail: dict[str, Any] = {"input": name, **unlisted(more)}
@@ -310,10 +313,6 @@ class LiveRunner(OperatorRunner):
 
     def _input_of(self, stream: str) -> str:
         return next(name for name, streams in self.node.inputs.items() if stream in streams)
-
-    def _event_time(self) -> int:
-        """Event time now: by the clock, and not before what has been seen."""
-        return max(self._event_clock() + self._shift, self._newest)
 
     def _admit(self, stream: str, arrival: Arrival) -> None:
         """Tells the aligner. What breaks a promise of its stream is refused and counted; a live run goes on."""
@@ -352,11 +351,3 @@ class LiveRunner(OperatorRunner):
 def _producer(stream: str) -> str:
     """The operator that emits a stream, by the stream's name."""
     return stream.rpartition("/")[0]
-
-
-def _close_quietly(operator: Operator) -> None:
-    """Closes an operator that has failed; what else goes wrong in it is printed, since the first failure is known."""
-    try:
-        operator.close()
-    except Exception as error:
-        print(f"{type(operator).__name__}.close() after a failure: {type(error).__name__}: {error}", file=sys.stderr)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 from dataflow.graph.model import Restart
+from dataflow.operator import Operator
 
 MOST_DOUBLINGS = 4
 LONGEST_BACKOFF = 30.0
@@ -47,3 +49,11 @@ class Restarts:
     def begun(self) -> None:
         """The attempt is made."""
         self.pending = False
+
+
+def close_quietly(operator: Operator) -> None:
+    """Closes an operator that has failed; what else goes wrong in it is printed, since the first failure is known."""
+    try:
+        operator.close()
+    except Exception as error:
+        print(f"{type(operator).__name__}.close() after a failure: {type(error).__name__}: {error}", file=sys.stderr)

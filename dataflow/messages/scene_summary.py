@@ -16,6 +16,9 @@ PEOPLE = frozenset(("person", "human", "pedestrian"))
 PLACES = frozenset(("room", "floor", "ground", "ceiling", "wall", "building", "place"))
 """Classes of nodes that the others are in; they are drawn as outlines."""
 
+TOPS = frozenset(("tabletop",))
+"""Classes of surfaces that are part of a thing, which is told in their place."""
+
 CARRYING = ("part_of", "sitting_on", "in", "on", "held_by")
 """Predicates that say what carries a node; of equal scores, the first counts."""
 
@@ -77,7 +80,8 @@ def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
         for (s, p, o), score in zip(graph.relations(), scores, strict=True)
         if s != o and p not in SURROUNDINGS
     ]
-    carriers = _carriers([r for r in every if r.predicate in CARRYING and r.score >= LEAST])
+    carrying = [r for r in every if r.predicate in CARRYING and r.score >= LEAST]
+    carriers = _carriers(carrying, [c in TOPS for c in classes])
     intentions = sorted((r for r in every if r.predicate == HEADS_FOR), key=lambda r: (r.subject, -r.score))
     rest = [r for r in every if r.predicate not in CARRYING and r.predicate != HEADS_FOR and r.score >= LEAST]
     counts = Counter(r.predicate for r in rest)
@@ -97,10 +101,12 @@ def summarize(graph: SceneGraph, most: int = 24) -> SceneSummary:
     return SceneSummary(carriers, children, tuple(told[:most]), tuple(intentions))
 
 
-def _carriers(relations: Sequence[Told]) -> dict[int, Told]:
-    """The strongest carrier of each node; a relation that would close a loop is left out."""
+def _carriers(relations: Sequence[Told], tops: Sequence[bool]) -> dict[int, Told]:
+    """The strongest carrier of each node, a thing before its top; a relation that would close a loop is left out."""
     carriers: dict[int, Told] = {}
-    for relation in sorted(relations, key=lambda r: (-r.score, CARRYING.index(r.predicate), r.subject, r.object)):
+    for relation in sorted(
+        relations, key=lambda r: (tops[r.object], -r.score, CARRYING.index(r.predicate), r.subject, r.object)
+    ):
         if relation.subject in carriers:
             continue
         node: int | None = relation.object
@@ -154,7 +160,7 @@ def carriers_in_words(graph: SceneGraph, summary: SceneSummary) -> list[Row]:
     names, classes = graph.names(), class_names(graph)
     rows, bare = [], []
     for node in range(graph.count):
-        children = [child for child in summary.carried(node) if classes[child] not in AGENTS | PLACES]
+        children = [child for child in summary.carried(node) if classes[child] not in AGENTS | PLACES | TOPS]
         if classes[node] in PLACES:
             alone = [c for c in children if not summary.carried(c)]
             bare += [Row(names[node], grouped([names[c] for c in alone], [classes[c] for c in alone]))] if alone else []

@@ -32,6 +32,7 @@ from dataflow.process.pace import Pace
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, open_box, statics_of
+from dataflow.process.standing import Standing
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import FOREVER, StreamOrderError
 from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
@@ -110,9 +111,9 @@ class OperatorProcess:
             channel,
         )
         self.orders = Orders(self)
+        self.standing = Standing(self)
         self._watch: Watchdog | None = None
         self._running = False
-        self._ended = False
 
     # Life
 
@@ -193,7 +194,7 @@ class OperatorProcess:
         worked = self._work()
         self.outlet.flush_due()
         self.progress.report(idle=self.inbox.empty())
-        self._answer_poll(idle=not worked)
+        self.standing.answer(idle=not worked)  # after the work that was there
         return True
 
     def _in_place_of_main(self, act: Callable[[Step], None], step: Step) -> bool:
@@ -240,10 +241,11 @@ class OperatorProcess:
         if self.orders.probing:
             return PROBE_EVERY
         patient = self.runners.ready.next_due()
-        due = [IDLE_WAIT, self._next_due(), self.live.next_due(), self.progress.next_due(), patient]
+        due = [IDLE_WAIT, self.next_feeding(), self.live.next_due(), self.progress.next_due(), patient]
         return max(0.0, min(seconds for seconds in due if seconds is not None))
 
-    def _next_due(self) -> float | None:
+    def next_feeding(self) -> float | None:
+        """Seconds until a feed may admit what is due by the clock; None where nothing waits for that."""
         return self.feeding.next_due() if self.orders.released else None
 
     def _take(self, timeout: float) -> None:
@@ -307,8 +309,8 @@ class OperatorProcess:
             self.progress.report(idle=False)
             if not self.inbox.empty():
                 break
-        if not self._ended and self.orders.released:
-            self._end_if_done()
+        if self.orders.released:
+            self.standing.end_if_done()
         return worked
 
     def _step_all(self) -> bool:
@@ -319,41 +321,3 @@ class OperatorProcess:
 
     def _admit(self) -> bool:
         return self.orders.released and not self.orders.stopping and self.feeding.admit()
-
-    def _end_if_done(self) -> None:
-        if self.feeding.ended and self.live.ended and all(runner.ended for runner in self.runners.operators):
-            self._ended = True
-            self.outlet.flush_all()
-            self.progress.report(idle=True)
-            self.channel.send("ended", report=self.progress.final_report(self._moved()))
-
-    def _moved(self) -> dict[str, int]:
-        """Counts what has passed between this process and others."""
-        refused = {"malformed": self.inlet.malformed, "misplaced": self.inlet.misplaced}
-        return self.outlet.counters() | self.inbox.counters() | self.bus.counters() | refused
-
-    def _answer_poll(self, *, idle: bool) -> None:
-        """Answers after the work that was there: a process is idle only when a look at everything found nothing."""
-        if self.orders.asked is None:
-            return
-        asked, self.orders.asked = self.orders.asked, None
-        self.outlet.flush_all()
-        self.channel.send(
-            "state",
-            round=asked,
-            idle=idle and self.inbox.empty() and not self._waits_for_clock() and self.live.ended,
-            sent=self.outlet.sent,
-            received=self.inlet.received,
-            full=self.feeding.full,
-            waiting=self.progress.waiting(),
-            due=self.feeding.next_due(),
-            **({"paused": self.feeding.playback.paused} if self.feeding.logs else {}),
-        )
-
-    def _waits_for_clock(self) -> bool:
-        held = self.feeding.playback.holds and not self.feeding.ended
-        return (
-            held
-            or self._next_due() is not None
-            or any(runner.next_due() is not None for runner in self.runners.operators)
-        )

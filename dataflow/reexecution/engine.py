@@ -18,6 +18,7 @@ from dataflow.recording import Recording
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog, beginning, needed_from, whole
+from dataflow.reexecution.needed import NeededStreams, first_needed
 from dataflow.reexecution.recorded_run import NotRecorded, check_type, final_stamps, seeding_of
 from dataflow.sync import Entry
 
@@ -144,13 +145,13 @@ class Recomputation:
                 consumers.setdefault(stream, []).append(runner)
         reads = sorted({*feeding.streams, *feeding.besides})
         makers = {stream: graph.streams[stream].node for stream in reads}
+        starts = None if begin is None else first_needed(log, graph, self.runners.values())
         self._feed = LogFeed(
-            recording,
+            recording if starts is None or begin is None else NeededStreams(recording, starts, begin),
             makers,
             _Outlet(consumers, self._ready, frozenset(feeding.besides), read or _nowhere, None),
             ports={name: tuple(graph.nodes[name].outputs.values()) for name in set(makers.values())},
             finals=final_stamps(recording, reads),
-            start=None if begin is None else _first_stamp(log, graph, self.runners.values()),
             end=end,
         )
         self._threads = graph.threads
@@ -251,28 +252,6 @@ def _until(records: Iterable[FiringRecord], end: int | None) -> Iterator[FiringR
         if end is not None and record.kind in CALLS and record.stamp >= end:
             return
         yield record
-
-
-def _first_stamp(log: FiringLog, graph: Graph, runners: Iterable[RecordedRunner]) -> int | None:
-    """The stamp from which the recording must be read; None where that is not known: then from its start."""
-    needed: dict[str, tuple[int, int]] = {}
-    for runner in runners:
-        for stream, place in runner.needs_from().items():
-            needed[stream] = min(place, needed.get(stream, place))
-    stamps: list[int] = []
-    for maker in {graph.streams[stream].node for stream in needed}:
-        streams = list(graph.nodes[maker].outputs.values())
-        known: set[str] = set()
-        for record in log.of(maker):
-            if record.kind == "reset":
-                return None  # stamps went back there
-            for stream, emission in zip(streams, record.outputs, strict=False):
-                if emission is not None and needed.get(stream) == (record.incarnation, emission.seq):
-                    stamps.append(emission.stamp)
-                    known.add(stream)
-        if not needed.keys() & set(streams) <= known:
-            return None
-    return min((s for s in stamps if s >= 0), default=None)
 
 
 def _nowhere(stream: str, entry: Entry) -> None:

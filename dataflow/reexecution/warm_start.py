@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,25 +102,42 @@ def held_before(path: Path, node: Node, stamp: int, static: frozenset[str]) -> t
         calls = [r for r in records if r.kind in CALLS]
         taken = _taken_from(calls, stamp)
         held: list[Entry] = []
-        last: dict[str, Entry] = {}
-        for item in recording.messages(known, end=stamp - 1):
-            message = item.message
-            entry = Entry(message.stamp, message, item.seq, item.incarnation, message.digest(), item.stream)
-            if (item.stream, item.incarnation, item.seq) in taken:
-                held.append(entry)
-            if item.stream in sampled - others:
-                last[item.stream] = entry
-        had = {entry.stream for entry in held}
+        for stream in known:
+            found = _last_taken(recording, stream, stamp, taken.get(stream, set()), or_newest=stream not in others)
+            held += reversed(found)
         began = any(r.stamp < stamp for r in calls) or any(taken_by(r) is not None for r in records)
-        return [*held, *(entry for stream, entry in last.items() if stream not in had)], began
+        return held, began
 
 
-def _taken_from(calls: Iterable[FiringRecord], stamp: int) -> set[tuple[str, int, int]]:
-    """(stream, incarnation, number) of what the recorded firings from `stamp` on took."""
-    return {
-        (message.stream, message.incarnation, message.seq)
-        for record in calls
-        if record.stamp >= stamp
-        for ref in record.inputs.values()
-        for message in messages_of(ref)
-    }
+def _last_taken(
+    recording: Recording, stream: str, stamp: int, taken: Collection[tuple[int, int]], *, or_newest: bool
+) -> list[Entry]:
+    """The messages of a stream before `stamp` that are among `taken` (incarnation, number), the newest first; of none,
+    the newest if `or_newest`. Only what lies after the first of them is read."""
+    index = recording.index(stream, end=stamp - 1)
+    found: list[Entry] = []
+    newest: Entry | None = None
+    first = min(taken, default=None)
+    if first is None and not or_newest:
+        return found
+    for at in reversed(range(len(index))):
+        item = index.read(at)
+        message, place = item.message, (item.incarnation, item.seq)
+        entry = Entry(message.stamp, message, item.seq, item.incarnation, message.digest(), stream)
+        newest = newest or entry
+        if place in taken:
+            found.append(entry)
+        if first is None or place <= first:
+            break
+    return found or ([newest] if or_newest and newest is not None else [])
+
+
+def _taken_from(calls: Iterable[FiringRecord], stamp: int) -> dict[str, set[tuple[int, int]]]:
+    """By stream, (incarnation, number) of what the recorded firings from `stamp` on took."""
+    taken: dict[str, set[tuple[int, int]]] = {}
+    for record in calls:
+        if record.stamp >= stamp:
+            for ref in record.inputs.values():
+                for message in messages_of(ref):
+                    taken.setdefault(message.stream, set()).add((message.incarnation, message.seq))
+    return taken

@@ -32,8 +32,9 @@ from typing import NamedTuple
 from dataflow.sync.context import Absent, Context
 from dataflow.sync.drops import DropLog
 from dataflow.sync.entries import Drop, Entry, Firing, FiringKind, Waiting
+from dataflow.sync.inputs import Inputs
 from dataflow.sync.join import Join
-from dataflow.sync.lanes import Lane, Role, StreamState
+from dataflow.sync.lanes import Lane
 from dataflow.sync.merge import Merge
 from dataflow.sync.spec import AlignSpec
 from dataflow.sync.stamps import FOREVER, NEVER
@@ -61,27 +62,20 @@ class Aligner:
         self.ends: dict[str, StreamEnd] = {}
         """The streams that ended, and how."""
         self._drop_log = DropLog()
-        self._streams = {name: StreamState(name, name in spec.static) for name in sorted(spec.streams)}
-        self._lanes: dict[str, tuple[Lane, ...]] = {}
-        for trigger in spec.triggers:
-            self._add_lanes(trigger.name, "trigger", trigger.streams)
-        for sampled in spec.sampled:
-            self._add_lanes(sampled.name, "sampled", sampled.streams, sampled.before or 0)
-        for batch in spec.batches:
-            self._add_lanes(batch.name, "batch", batch.streams)
-
-        triggers = [lane for trigger in spec.triggers for lane in self._lanes[trigger.name]]
+        self._inputs = Inputs(spec)
+        self._streams, lanes = self._inputs.streams, self._inputs.lanes
+        triggers = [lane for trigger in spec.triggers for lane in lanes[trigger.name]]
         self._triggers: Join | Merge
         if spec.joins:
             self._triggers = Join(triggers, spec.tolerance, self._drop_log.entry)
         else:
             self._triggers = Merge(spec.triggers, triggers, self._drop_log.entry)
-        self._context = Context(spec, self._lanes, self._drop_log)
+        self._context = Context(spec, lanes, self._drop_log)
         ticks: Ticks | None = None
         bounding: list[Lane] = []
         if spec.every is not None:
             bounds = spec.bounds_of_ticks()
-            bounding = [lane for name, stream in bounds for lane in self._lanes[name] if lane.state.name == stream]
+            bounding = [lane for name, stream in bounds for lane in lanes[name] if lane.state.name == stream]
             ticks = Ticks(spec.every, bounding)
         self._finals = {lane.state.name: lane.state for lane in (*triggers, *bounding)}
         self._undecided = Undecided(self._triggers, ticks, triggers)
@@ -102,7 +96,7 @@ class Aligner:
 
         Raises StreamOrderError if the stream had promised that there would be no such message.
         """
-        state = self._streams.get(stream) or self._stream(stream)
+        state = self._streams.get(stream) or self._inputs.stream(stream)
         if entry.incarnation > state.incarnation and entry.stamp < FOREVER:
             self.reset(stream, entry.incarnation)
         if not entry.stream:
@@ -131,7 +125,7 @@ class Aligner:
 
         Raises StreamOrderError for a frontier at the end of time, where `end` is meant.
         """
-        state = self._stream(stream)
+        state = self._inputs.stream(stream)
         if state.advance(frontier):
             self._undecided.settled = False
             for lane in state.lanes:
@@ -144,7 +138,7 @@ class Aligner:
             promised. None takes the larger of these, which is repeatable only if the promised frontiers are.
             Raises StreamOrderError for one that lies below.
         """
-        state = self._stream(stream)
+        state = self._inputs.stream(stream)
         if state.ended:
             return
         state.end(final_stamp)
@@ -160,7 +154,7 @@ class Aligner:
         stream that had ended is open again. `push` does this by itself on a message of a higher incarnation.
         Firings are repeatable across a restart if the old incarnation promised nothing above its last stamp.
         """
-        state = self._stream(stream)
+        state = self._inputs.stream(stream)
         state.reset(incarnation)
         self._undecided.settled = False
         self.ends.pop(stream, None)
@@ -172,14 +166,10 @@ class Aligner:
     def force(self, input: str, frontier: int) -> bool:
         """Pretends that the streams of `input`, but for static ones, have promised `frontier`; False when that is no
         news. Live only."""
-        if input not in self._lanes:
-            raise KeyError(f"no input {input!r}; the inputs are {', '.join(self._lanes)}")
-        frontier = min(frontier, FOREVER - 1)
-        moved = [lane for lane in self._lanes[input] if not lane.state.static and frontier > lane.frontier]
-        for lane in moved:
-            lane.frontier = frontier
+        moved = self._inputs.force(input, frontier)
+        if moved:
             self._undecided.settled = False
-        return bool(moved)
+        return moved
 
     def owed_ticks(self) -> tuple[int, int, int]:
         """The ticks that are due now, with nothing between them: how many, the first and the last."""
@@ -208,9 +198,7 @@ class Aligner:
         needs = self._undecided.needs(stamp)
         for name, frontier in self._context.needs(stamp).items():
             needs[name] = max(frontier, needs.get(name, NEVER))
-        for name, frontier in needs.items():
-            if any(lane.state.static and lane.frontier < frontier for lane in self._lanes[name]):
-                needs[name] = FOREVER
+        needs.update(dict.fromkeys(self._inputs.awaits_static(needs), FOREVER))
         return Waiting(stamp, needs)
 
     # What comes out
@@ -297,7 +285,7 @@ class Aligner:
 
     def buffered(self) -> dict[str, int]:
         """The number of messages held, by input."""
-        return {name: sum(len(lane.entries) for lane in lanes) for name, lanes in self._lanes.items()}
+        return self._inputs.buffered()
 
     # Deciding
 
@@ -308,13 +296,12 @@ class Aligner:
         if context.empty:
             inputs = self._triggers.take() if undecided.triggered else self._triggers.absent()
             return Firing(stamp, kind, undecided.ticked, inputs, _NO_NAMES, _NO_NAMES)
-        try:
-            values = context.take(stamp, self._last_firing)
-        except Absent as absent:
+        values = context.take(stamp, self._last_firing)
+        if isinstance(values, Absent):
             if undecided.triggered:
-                self._triggers.reject(absent.reason, absent.input)
+                self._triggers.reject(values.reason, values.input)
             if undecided.ticked:
-                self._drop_log.tick(stamp, absent.reason, absent.input)
+                self._drop_log.tick(stamp, values.reason, values.input)
             return None
         inputs = self._triggers.take() if undecided.triggered else self._triggers.absent()
         inputs.update(values)
@@ -336,17 +323,6 @@ class Aligner:
         return Firing(stamp, "finish")
 
     # Bookkeeping
-
-    def _add_lanes(self, name: str, role: Role, streams: tuple[str, ...], delay: int = 0) -> None:
-        self._lanes[name] = tuple(Lane(name, role, self._streams[stream], delay) for stream in sorted(streams))
-        for lane in self._lanes[name]:
-            lane.state.lanes.append(lane)
-
-    def _stream(self, name: str) -> StreamState:
-        state = self._streams.get(name)
-        if state is None:
-            raise KeyError(f"stream {name!r} feeds no input; those that do: {', '.join(self._streams)}")
-        return state
 
     def _push_forced(self, lane: Lane, entry: Entry) -> None:
         """Takes a trigger message that lies below a forced frontier."""

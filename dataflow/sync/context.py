@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 from dataflow.sync.batch import Batch
 from dataflow.sync.drops import DropLog
@@ -14,12 +15,11 @@ from dataflow.sync.spec import AlignSpec
 _NO_NAMES: frozenset[str] = frozenset()
 
 
-class Absent(Exception):
+class Absent(NamedTuple):
     """A required Sampled input has no value: there is no firing."""
 
-    def __init__(self, reason: DropReason, input: str) -> None:
-        super().__init__(f"{input}: {reason}")
-        self.reason, self.input = reason, input
+    reason: DropReason
+    input: str
 
 
 class Context:
@@ -56,15 +56,15 @@ class Context:
         inputs: tuple[Sampled | Batch, ...] = (*self._sampled.values(), *self._batches.values())
         return {each.name: need for each in inputs if (need := each.needs(stamp)) is not None}
 
-    def take(self, stamp: int, last_firing: int) -> dict[str, InputValue]:
-        """The values at `stamp`, which are known; raises `Absent` before anything is taken."""
+    def take(self, stamp: int, last_firing: int) -> dict[str, InputValue] | Absent:
+        """The values at `stamp`, which are known; `Absent`, and nothing is taken, where there is to be no firing."""
         values: dict[str, InputValue] = {}
         stale: list[str] = []
         late: list[str] = []
         for name, sampled in self._sampled.items():
             value = sampled.choose(stamp)
             if sampled.required and not value:
-                raise Absent(sampled.why_absent(), name)
+                return Absent(sampled.why_absent(), name)
             values[name] = value
             if sampled.stale:
                 stale.append(name)

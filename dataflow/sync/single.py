@@ -26,7 +26,7 @@ class SingleAligner(Aligner):
     def __init__(self, spec: AlignSpec) -> None:
         super().__init__(spec)
         (trigger,) = spec.triggers
-        (self._lane,) = self._lanes[trigger.name]
+        (self._lane,) = self._inputs.lanes[trigger.name]
         self._many = trigger.many
 
     def poll(self, most: int | None = None) -> Firing | None:

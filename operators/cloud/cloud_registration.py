@@ -24,8 +24,8 @@ class CloudRegistration(Operator):
     the other says, as far as it could, and where nothing hangs in what the other saw to be free. Clouds that share too
     little, surfaces that leave a direction free, and two motions that explain the clouds as well are failures.
 
-    Method: fast point feature histograms by Rusu, Blodow and Beetz, 2009; RANSAC on their mutual matches; refined by
-    Segal, Haehnel and Thrun, "Generalized-ICP", 2009.
+    Method: fast point feature histograms by Rusu, Blodow and Beetz, 2009; of their mutual matches those that agree, by
+    Chen, Sun, Yang and Tao, "SC2-PCR", 2022; refined by Segal, Haehnel and Thrun, "Generalized-ICP", 2009.
     """
 
     cloud: In[PointCloud] = In(doc="points in the frame of their sensor, which is the origin")
@@ -36,10 +36,10 @@ class CloudRegistration(Operator):
 
     child_frame: str = Param("", doc="name of the cloud's frame in the pose; the cloud's own where empty")
     voxel: float = Param(0.1, gt=0.005, doc="side of the voxels that the clouds are thinned to", unit="m")
-    trials: int = Param(60_000, ge=100, le=10_000_000, doc="triples of matches that are tried")
+    trials: int = Param(2_000, ge=100, le=10_000_000, doc="motions, one for each match, that are put to the vote")
     min_overlap: float = Param(0.5, gt=0, le=1, doc="least share of each cloud that the other sensor could see")
-    min_fitness: float = Param(0.85, gt=0, le=1, doc="least share of that which lies on the other cloud")
-    max_violation: float = Param(0.03, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
+    min_fitness: float = Param(0.87, gt=0, le=1, doc="least share of that which lies on the other cloud")
+    max_violation: float = Param(0.04, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
 
     def setup(self) -> None:
         self._settings = Settings(

@@ -47,6 +47,7 @@ class PlaneSegmenter(Operator):
     rest: Out[PointCloud] = Out(doc="the points on no floor, wall, table top or ceiling")
     status: Out[Diagnostics] = Out(doc="how many of each were found; a warning where the cloud is too small for any")
 
+    period: float = Param(0.0, ge=0, doc="clouds that come sooner after the last one looked at are left out", unit="s")
     up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
     voxel: float = Param(0.05, gt=0.005, doc="side of the voxels that planes are looked for in", unit="m")
     distance: float = Param(0.02, gt=0, doc="a point this near to a plane is on it", unit="m")
@@ -88,12 +89,16 @@ class PlaneSegmenter(Operator):
             floor_memory=self.floor_memory,
         )
         self._floor: float | None = None
+        self._looked: int | None = None
         self._counts: Counter[str] = Counter()
 
     def process(
         self, cloud: PointCloud, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
     ) -> dict[str, Any]:
         """Raises ValueError where no transform relates the cloud's frame to that of the pose."""
+        if self._looked is not None and cloud.stamp - self._looked < self.period * 1e9:
+            return {}
+        self._looked = cloud.stamp
         up, height = gravity(cloud, pose, extrinsics, self._up)
         usable = np.flatnonzero(finite(cloud.points))
         points = cloud.points[usable]
@@ -119,13 +124,14 @@ class PlaneSegmenter(Operator):
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew: the floor is looked for again."""
-        self._floor = None
+        self._floor = self._looked = None
 
     def snapshot(self) -> Mapping[str, Any]:
-        return {"floor": self._floor, "counts": dict(self._counts)}
+        return {"floor": self._floor, "looked": self._looked, "counts": dict(self._counts)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._floor = None if state["floor"] is None else float(state["floor"])
+        self._looked = state.get("looked")  # not in those of earlier versions
         self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
 
     def summary(self) -> Mapping[str, float | int]:

@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from dataflow.messages.geometry import transform_points
 from operators.cloud.filtering import Voxels
 from operators.cloud.fpfh import histograms
+from operators.cloud.motion_search import matches, motions
 from operators.cloud.normals import estimate_normals
 from operators.geometry import se3
 
@@ -22,10 +23,10 @@ Indices = NDArray[np.intp]
 
 
 FEWEST = 100  # voxels with a normal that a cloud must have
-_MODES = 60  # motions of RANSAC that are compared
-_SAME_TURN = 0.98  # cosine of the turn within which motions are like each other
 _TRIED = 12  # motions that are refined
 _RIVAL = 0.03  # a second motion whose score is that near to the best one's makes the result ambiguous
+_CONTRADICTS = 3.0  # times what lies on the other cloud counts what hangs in free space
+_ALIKE = 0.8  # cosine between normals of one surface
 _CORRELATED = 30.0  # voxels whose errors are alike, for the covariance
 _TELLING = 0.03  # share of the surfaces that must face along every direction
 
@@ -69,7 +70,9 @@ class Registered:
 
     All but `rmse` (metres) is the worse of both directions: `overlap` is the share of a cloud that the other sensor
     should have seen, `fitness` the share of that which lies on the other cloud, `violation` the share of it that hangs
-    in what the other sensor saw to be free. `covariance` (6, 6) is of a right perturbation (translation, rotation).
+    in what the other sensor saw to be free, `agreement` the share that lies in the other cloud's surfaces. `settled`
+    tells whether the shared surfaces leave no direction free. `covariance` (6, 6) is of a right perturbation
+    (translation, rotation).
     """
 
     T: Array
@@ -77,13 +80,25 @@ class Registered:
     fitness: float
     rmse: float
     violation: float
+    agreement: float
+    settled: bool
     covariance: Array
     reason: str
 
     @property
     def score(self) -> float:
-        """The measures by which motions are compared."""
-        return self.fitness - self.violation
+        """The measure by which motions are compared."""
+        return self.agreement - _CONTRADICTS * self.violation
+
+    def rivals(self, best: Registered, voxel: float) -> bool:
+        """Tells whether this is another motion than the best, and explains the clouds as well.
+
+        Less of the clouds is explained more easily, and most easily by surfaces that leave a direction free.
+        """
+        shared = 0.7 if self.settled else 0.9
+        return (
+            self.score > best.score - _RIVAL and self.overlap > shared * best.overlap and apart(best.T, self.T, voxel)
+        )
 
     def refused(self, reason: str) -> Registered:
         """Returns the same, not to be believed."""
@@ -91,15 +106,21 @@ class Registered:
 
 
 def register(source: Prepared, target: Prepared, settings: Settings, rng: np.random.Generator) -> Registered:
-    """Returns the motion from source to target, without a guess: FPFH matches, RANSAC, then generalised ICP.
+    """Returns the motion from source to target, without a guess: matches of FPFH that agree, then generalised ICP.
 
     Segal, Haehnel and Thrun, "Generalized-ICP", 2009, by small_gicp with one thread. Several motions are refined, and
     where two of them explain the clouds as well, neither is believed.
     """
     if min(len(source.points), len(target.points)) < FEWEST:
         return failure(f"fewer than {FEWEST} voxels with a normal")
-    pairs = _matches(source.features, target.features)
-    starts = _starts(source.points[pairs[:, 0]], target.points[pairs[:, 1]], settings, rng)
+    one, two = matches(source.features, target.features).T
+    starts = motions(
+        (source.points[one], source.normals[one]),
+        (target.points[two], target.normals[two]),
+        settings.voxel,
+        settings.trials,
+        rng,
+    )
     if not starts:
         return failure("no motion agrees with the features")
     tree = cKDTree(target.points)
@@ -108,12 +129,14 @@ def register(source: Prepared, target: Prepared, settings: Settings, rng: np.ran
     for T in starts:
         if len(tried) < _TRIED and not any(_led_by(T, found.T, settings.voxel) for found in tried):
             tried.append(refine(source, target, T, settings))
-    tried.sort(key=lambda found: (bool(found.reason), -found.score))
-    best = tried[0]
-    for other in tried[1:]:
-        near = other.score > best.score - _RIVAL and other.overlap > 0.7 * best.overlap
-        if not best.reason and near and apart(best.T, other.T, settings.voxel):
-            return best.refused("ambiguous: another motion explains the clouds as well")
+    return best_of(tried, settings.voxel)
+
+
+def best_of(tried: list[Registered], voxel: float) -> Registered:
+    """Returns the motion that explains most, refused where another one explains the clouds as well."""
+    best, *others = sorted(tried, key=lambda found: (bool(found.reason), -found.score))
+    if not best.reason and any(other.rivals(best, voxel) for other in others):
+        return best.refused("ambiguous: another motion explains the clouds as well")
     return best
 
 
@@ -127,21 +150,20 @@ def refine(source: Prepared, target: Prepared, guess: Array, settings: Settings)
             max_iterations=40,
         )  # fmt: skip
         T = np.asarray(found.T_target_source)
-    said = explained(source, target, T, settings)
-    reason = said.reason
-    if not reason and not _told(source, target, T, settings.voxel):
-        reason = "degenerate: the shared surfaces leave a direction free"
     rotation_last = [3, 4, 5, 0, 1, 2]  # small_gicp has rotation first
     information = found.H[np.ix_(rotation_last, rotation_last)] + 1e-9 * np.eye(6)
+    said = explained(source, target, T, settings)
+    reason = said.reason
+    if not reason and not said.settled:
+        reason = "degenerate: the shared surfaces leave a direction free"
     return replace(said, covariance=np.linalg.inv(information) * _CORRELATED, reason=reason)
 
 
 def explained(source: Prepared, target: Prepared, T: Array, settings: Settings) -> Registered:
     """Returns what speaks for a motion; its covariance is not known."""
-    one = _explained(transform_points(T, source.points), target.points, settings.voxel)
-    two = _explained(transform_points(np.linalg.inv(T), target.points), source.points, settings.voxel)
-    overlap, fitness = min(one[0], two[0]), min(one[1], two[1])
-    violation, rmse = max(one[2], two[2]), max(one[3], two[3])
+    one, two = _Seen.of(source, target, T), _Seen.of(target, source, np.asarray(np.linalg.inv(T), np.float64))
+    overlap, fitness = min(one.overlap, two.overlap), min(one.fitness, two.fitness)
+    violation, settled = max(one.violation, two.violation), one.settled
     reason = ""
     if overlap < settings.min_overlap:
         reason = f"the clouds share {overlap:.0%}"
@@ -149,30 +171,50 @@ def explained(source: Prepared, target: Prepared, T: Array, settings: Settings) 
         reason = f"{fitness:.0%} of what both saw agree"
     elif violation > settings.max_violation:
         reason = f"{violation:.0%} lie where the other sensor saw nothing"
-    return Registered(T, overlap, fitness, rmse, violation, np.full((6, 6), np.nan), reason)
+    agreement, rmse = min(one.agreement, two.agreement), max(one.rmse, two.rmse)
+    unknown = np.full((6, 6), np.nan)
+    return Registered(T, overlap, fitness, rmse, violation, agreement, settled, unknown, reason)
 
 
 def failure(reason: str) -> Registered:
     """Returns that there is no motion."""
-    return Registered(np.eye(4), 0.0, 0.0, float("nan"), 0.0, np.full((6, 6), np.nan), reason)
+    return Registered(np.eye(4), 0.0, 0.0, float("nan"), 0.0, 0.0, False, np.full((6, 6), np.nan), reason)
 
 
-def _explained(moved: Array, seen: Array, voxel: float) -> tuple[float, float, float, float]:
-    """Returns overlap, fitness, violation and RMSE of points in the frame of another cloud."""
-    distance, _ = cKDTree(seen).query(moved, distance_upper_bound=4 * voxel)
-    on = distance <= 1.5 * voxel
-    visible = _visible(moved, seen) | on
-    fitness = float((on & visible).sum() / max(1, visible.sum()))
-    rmse = float(np.sqrt(np.square(distance[on]).mean())) if on.any() else float("nan")
-    return float(visible.mean()), fitness, _violation(moved, seen), rmse
+@dataclass(frozen=True)
+class _Seen:
+    """A cloud as another sensor should have seen it; see `Registered`."""
+
+    overlap: float
+    fitness: float
+    rmse: float
+    violation: float
+    agreement: float
+    settled: bool
+
+    @classmethod
+    def of(cls, cloud: Prepared, other: Prepared, T: Array) -> _Seen:
+        """Compares a cloud, moved by T (4, 4), with the other one."""
+        voxel = other.voxel
+        moved = transform_points(T, cloud.points)
+        distance, index = cKDTree(other.points).query(moved, distance_upper_bound=1.5 * voxel)
+        on = np.isfinite(distance)
+        visible = _visible(moved, other.points) | on
+        surface = other.normals[index[on]]
+        off = np.abs(np.einsum("ij,ij->i", moved[on] - other.points[index[on]], surface))
+        alike = np.einsum("ij,ij->i", cloud.normals[on] @ T[:3, :3].T, surface) > _ALIKE
+        return cls(
+            overlap=float(visible.mean()),
+            fitness=float(on.sum() / max(1, visible.sum())),
+            rmse=float(np.sqrt(np.square(distance[on]).mean())) if on.any() else float("nan"),
+            violation=_violation(moved, other.points, on),
+            agreement=float((alike & (off < 0.5 * voxel)).sum() / max(1, visible.sum())),
+            settled=bool(on.any()) and _settled(moved[on], surface),
+        )
 
 
-def _told(source: Prepared, target: Prepared, T: Array, voxel: float) -> bool:
-    """Returns whether the surfaces that both clouds show face along every direction, and about every axis."""
-    moved = transform_points(T, source.points)
-    distance, index = cKDTree(target.points).query(moved, distance_upper_bound=1.5 * voxel)
-    near = np.isfinite(distance)
-    points, normals = moved[near], target.normals[index[near]]
+def _settled(points: Array, normals: Array) -> bool:
+    """Tells whether surfaces face along every direction, and about every axis."""
     centred = points - points.mean(axis=0)
     arms = np.cross(centred, normals)
     _, axes = np.linalg.eigh(arms.T @ arms)
@@ -224,10 +266,11 @@ def _visible(moved: Array, seen: Array) -> NDArray[np.bool_]:
     return np.asarray((sight > 0) & (distance <= sight + 0.3))
 
 
-def _violation(moved: Array, seen: Array) -> float:
+def _violation(moved: Array, seen: Array, on: NDArray[np.bool_]) -> float:
     """Returns the share of points that hang before what the sensor at the origin saw in and around their direction.
 
     Around, since beams pass beside what is thin and beside edges: something that hangs there stands before all of them.
+    Points `on` what it saw contradict nothing, however flat they are seen.
     """
     cell, distance = _panorama(moved)
     sight = _sight(seen)
@@ -235,7 +278,7 @@ def _violation(moved: Array, seen: Array) -> float:
     if known.sum() < 50:
         return 1.0
     free = _free(sight)[cell]
-    return float((known & (distance < 0.92 * free - 0.1)).sum() / known.sum())
+    return float((known & ~on & (distance < 0.92 * free - 0.1)).sum() / known.sum())
 
 
 def _free(sight: Array) -> Array:
@@ -247,62 +290,6 @@ def _free(sight: Array) -> Array:
     return np.asarray(free.ravel())
 
 
-def _matches(source: Array, target: Array) -> Indices:
-    """Returns pairs (M, 2) of features that are each other's nearest."""
-    forward = cKDTree(target).query(source)[1]
-    backward = cKDTree(source).query(target)[1]
-    own = np.arange(len(source))
-    mutual = backward[forward] == own
-    return np.column_stack([own[mutual], forward[mutual]])
-
-
-def _starts(source: Array, target: Array, settings: Settings, rng: np.random.Generator) -> list[Array]:
-    """Returns motions with most matches in agreement, best first: RANSAC on triples whose sides are equally long."""
-    if len(source) < 4:
-        return []
-    triples = rng.integers(0, len(source), (settings.trials, 3))
-    fits = np.ones(settings.trials, np.bool_)
-    for a, b in ((0, 1), (1, 2), (2, 0)):
-        one = np.linalg.norm(source[triples[:, a]] - source[triples[:, b]], axis=1)
-        two = np.linalg.norm(target[triples[:, a]] - target[triples[:, b]], axis=1)
-        fits &= (np.abs(one - two) <= 2 * settings.voxel) & (one > 6 * settings.voxel)
-    triples = triples[fits][:2000]
-    motions = _rigid(source[triples], target[triples])
-    votes = np.zeros(len(motions), np.int64)
-    for k, T in enumerate(motions):
-        votes[k] = (np.linalg.norm(transform_points(T, source) - target, axis=1) <= 2.5 * settings.voxel).sum()
-    order = np.argsort(-votes, kind="stable")
-    return _modes(motions[order[votes[order] >= 4]], 5 * settings.voxel)
-
-
-def _modes(motions: Array, near: float) -> list[Array]:
-    """Returns motions (4, 4) that are apart, of (K, 4, 4) in their order: each stands for all that are like it.
-
-    A room that looks alike from both ends has many triples for one of two motions, and both are to be tried.
-    """
-    found: list[Array] = []
-    while len(motions) and len(found) < _MODES:
-        best = motions[0]
-        found.append(best)
-        cosine = (np.einsum("kij,ij->k", motions[:, :3, :3], best[:3, :3]) - 1) / 2
-        away = np.linalg.norm(motions[:, :3, 3] - best[:3, 3], axis=1)
-        motions = motions[(away > near) | (cosine < _SAME_TURN)]
-    return found
-
-
-def _rigid(source: Array, target: Array) -> Array:
-    """Returns the motions (K, 4, 4) of triples (K, 3, 3). Umeyama, 1991."""
-    a, b = source.mean(axis=1, keepdims=True), target.mean(axis=1, keepdims=True)
-    u, _, vt = np.linalg.svd(np.einsum("kni,knj->kij", target - b, source - a))
-    flip = np.ones((len(source), 3))
-    flip[:, 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    R = (u * flip[:, None, :]) @ vt
-    T = np.tile(np.eye(4), (len(source), 1, 1))
-    T[:, :3, :3] = R
-    T[:, :3, 3] = b[:, 0] - np.einsum("kij,kj->ki", R, a[:, 0])
-    return T
-
-
 def _agreement(source: Prepared, target: Prepared, tree: cKDTree, T: Array, reach: float) -> float:
     """Returns the share of the source that lies on the target with the same normal, less what hangs in free space."""
     moved = transform_points(T, source.points)
@@ -310,4 +297,4 @@ def _agreement(source: Prepared, target: Prepared, tree: cKDTree, T: Array, reac
     near = np.isfinite(distance)
     normals = source.normals @ T[:3, :3].T
     same = np.einsum("ij,ij->i", normals[near], target.normals[index[near]]) > 0.7
-    return float(same.sum() / len(moved)) - _violation(moved, target.points)
+    return float(same.sum() / len(moved)) - _violation(moved, target.points, near)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
-from sys import intern
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,18 +14,8 @@ from dataflow.messages import Detections2D
 from dataflow.operator import Batch, Duration, In, Operator, Param
 from operators.association import mutually_nearest
 from operators.evaluation.detection_score import ClassScore, ScoredFrame, precision, recall, score_frames
+from operators.evaluation.object_log import ObjectLog, Objects
 from operators.evaluation.views import check_names, check_view, listed
-
-
-@dataclass(frozen=True, eq=False)
-class _Objects:
-    """Holds what scoring needs of a message: boxes (N, 4) in pixels, class names, scores, which objects are ignored."""
-
-    size: NDArray[np.float64]
-    boxes: NDArray[np.float64]
-    labels: tuple[str, ...]
-    scores: NDArray[np.float32]
-    ignored: NDArray[np.bool_]
 
 
 class DetectionMetrics(Operator):
@@ -59,8 +48,7 @@ class DetectionMetrics(Operator):
     def setup(self) -> None:
         import pycocotools.cocoeval  # noqa: F401  a missing package shows now, not at the end of the run
 
-        self._detections: dict[int, _Objects] = {}
-        self._truth: dict[int, _Objects] = {}
+        self._detections, self._truth = ObjectLog(), ObjectLog()
         self._known: set[str] = set()
         self._classes: set[str] = set()
         self._figures: dict[str, float | int | str] = {}
@@ -72,9 +60,9 @@ class DetectionMetrics(Operator):
             if detections.count and true.count:
                 check_names(detections.class_names, true.class_names)
             self._classes.update(true.class_names or true.labels())
-            self._truth[true.stamp] = _objects(true, self._ignored(true))
+            self._truth.add(true, self._ignored(true))
         self._known.update(detections.class_names)
-        self._detections[detections.stamp] = _objects(detections, np.zeros(detections.count, np.bool_))
+        self._detections.add(detections)
 
     def on_reset(self, input: str) -> None:
         """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
@@ -117,9 +105,9 @@ class DetectionMetrics(Operator):
         return ignored
 
     def _frames(self) -> list[ScoredFrame]:
-        found, truth = list(self._detections), list(self._truth)
-        pairs = mutually_nearest(found, truth, self.tolerance)
-        return [_scored(self._detections[found[i]], self._truth[truth[j]]) for i, j in pairs]
+        found, truth = self._detections, self._truth
+        pairs = mutually_nearest(found.stamps, truth.stamps, self.tolerance)
+        return [_scored(found.image(i), truth.image(j)) for i, j in pairs]
 
     def _averages(self, classes: Mapping[str, ClassScore]) -> dict[str, float | int | str]:
         ap50 = {name: score.ap50 for name, score in classes.items() if score.ap50 is not None}
@@ -163,12 +151,6 @@ def _view(message: Detections2D) -> tuple[str, int, int]:
     return message.frame, message.width, message.height
 
 
-def _objects(message: Detections2D, ignored: NDArray[np.bool_]) -> _Objects:
-    size = np.array([message.width, message.height], np.float64)
-    labels = tuple(map(intern, message.labels()))  # each message brings strings of its own, and all frames are kept
-    return _Objects(size, message.boxes.astype(np.float64), labels, message.scores.copy(), ignored)
-
-
-def _scored(found: _Objects, truth: _Objects) -> ScoredFrame:
+def _scored(found: Objects, truth: Objects) -> ScoredFrame:
     boxes = found.boxes * np.tile(truth.size / found.size, 2)
     return ScoredFrame(truth.boxes, truth.labels, truth.ignored, boxes, found.labels, found.scores)

@@ -67,7 +67,7 @@ class SceneGraphMetrics(Operator):
             i for i in self._seen.countable() if i in names and (names[i] not in MOVERS or self._seen.last[i] >= since)
         }
         self._last = score_nodes(mine, truth, must, self.iou)
-        self._relations.add(mine, truth, self._last.match, must)
+        self._relations.add(mine, truth, self._last.match, must, self._last.ignored)
         self._graphs += 1
 
     def on_reset(self, input: str) -> None:

@@ -5,6 +5,7 @@ The tests hold them equal to those of evo (Grupp 2017).
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
@@ -33,17 +34,8 @@ class Trajectory:
     positions: list[NDArray[np.float64]]
     orientations: list[NDArray[np.float64]]
 
-    @classmethod
-    def empty(cls) -> Trajectory:
-        return cls([], [], [])
-
     def __len__(self) -> int:
         return len(self.stamps)
-
-    def append(self, stamp: int, position: NDArray[np.float64], orientation: NDArray[np.float64]) -> None:
-        self.stamps.append(stamp)
-        self.positions.append(position)
-        self.orientations.append(orientation)
 
     def select(self, indices: Sequence[int]) -> Trajectory:
         return Trajectory(
@@ -59,6 +51,22 @@ class Trajectory:
             seconds, rest = divmod(stamp, 10**9)
             lines.append(f"{seconds}.{rest:09d} " + " ".join(repr(float(x)) for x in (*p, *q)))
         return "\n".join(lines) + "\n"
+
+
+class PoseLog:
+    """Collects poses in the order of their stamps, at 64 bytes each, so that a score may last for hours."""
+
+    def __init__(self) -> None:
+        self._stamps, self._values = array("q"), array("d")
+
+    def append(self, stamp: int, position: NDArray[np.float64], orientation: NDArray[np.float64]) -> None:
+        self._stamps.append(stamp)
+        self._values.extend((*position, *orientation))
+
+    def trajectory(self) -> Trajectory:
+        """All poses so far."""
+        values = np.array(self._values, np.float64).reshape(-1, 7)
+        return Trajectory(self._stamps.tolist(), list(values[:, :3]), list(values[:, 3:]))
 
 
 @dataclass(frozen=True)

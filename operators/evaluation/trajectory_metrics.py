@@ -12,6 +12,7 @@ import numpy as np
 from dataflow.messages import Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param
 from operators.evaluation.trajectory import (
+    PoseLog,
     Trajectory,
     absolute_error,
     match,
@@ -45,7 +46,7 @@ class TrajectoryMetrics(Operator):
     out: str | None = Param(None, doc="folder for estimate.tum, ground_truth.tum and metrics.json; made if missing")
 
     def setup(self) -> None:
-        self._estimate, self._truth = Trajectory.empty(), Trajectory.empty()
+        self._estimate, self._truth = PoseLog(), PoseLog()
         self._not_finite = 0
         self._figures: dict[str, float | int | str] = {}
 
@@ -69,7 +70,8 @@ class TrajectoryMetrics(Operator):
 
     def finish(self) -> None:
         """Computes the figures and writes the files."""
-        matches = match(self._estimate, self._truth, self.tolerance)
+        estimate, truth = self._estimate.trajectory(), self._truth.trajectory()
+        matches = match(estimate, truth, self.tolerance)
         self._figures = {
             "matched": len(matches.estimate),
             "unmatched_estimates": matches.unmatched_estimates,
@@ -85,13 +87,13 @@ class TrajectoryMetrics(Operator):
         self._figures |= relative_errors(matches, self.rpe_seconds, self.rpe_metres)
         self._figures |= segment_drift(matches, self.drift_metres)
         if self.out is not None:
-            self._write(Path(self.out).expanduser())
+            self._write(Path(self.out).expanduser(), estimate, truth)
 
     def summary(self) -> Mapping[str, float | int | str]:
         return dict(self._figures)
 
-    def _write(self, folder: Path) -> None:
+    def _write(self, folder: Path, estimate: Trajectory, truth: Trajectory) -> None:
         folder.mkdir(parents=True, exist_ok=True)
-        (folder / "estimate.tum").write_text(self._estimate.tum())
-        (folder / "ground_truth.tum").write_text(self._truth.tum())
+        (folder / "estimate.tum").write_text(estimate.tum())
+        (folder / "ground_truth.tum").write_text(truth.tum())
         (folder / "metrics.json").write_text(json.dumps(self._figures, indent=2) + "\n")

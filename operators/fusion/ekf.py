@@ -23,7 +23,6 @@ from dataflow.messages import (
     Transforms,
     Twist,
 )
-from dataflow.messages.geometry import invert
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
 from operators.fusion.beginning import Prior, coasting_node
 from operators.fusion.control import Command
@@ -33,9 +32,10 @@ from operators.fusion.gate import GateConfig
 from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.nodes import Measurement
-from operators.fusion.output import diagnostics, odometry_of
-from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, unheard, use_of
-from operators.geometry.extrinsics import transform_between
+from operators.fusion.output import diagnostics, figures, odometry_of
+from operators.fusion.places import Places
+from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, turning, unheard, use_of
+from operators.fusion.silence import Silence
 
 Array = NDArray[np.float64]
 _NEVER_AGREE = 1_000_000
@@ -120,6 +120,7 @@ class EkfFusion(Operator):
         self._inertial = InertialSensor(
             InertialConfig(self.gyro_noise, self.accel_noise, self.gyro_walk, self.accel_walk, self.rest, self.patience)
         )
+        self._silence = Silence(self.max_gap, self.gravity, self._unknown())
         self._reported = -1
         self._stamps: dict[str, int] = {}
         self._before: dict[str, Message] = {}
@@ -130,8 +131,7 @@ class EkfFusion(Operator):
             name: GateConfig(share=s.share, agreeing=_NEVER_AGREE if s.use in _WITHOUT_PATIENCE else s.agreeing)
             for name, s in self.sensors.items()
         }
-        self._body = "" if self.motion == "inertial" else self.base_frame
-        self._extrinsics: Transforms | None = None
+        self._places = Places(self.base_frame, "" if self.motion == "inertial" else self.base_frame)
 
     def process(
         self,
@@ -141,7 +141,7 @@ class EkfFusion(Operator):
         landmark_map: LandmarkSightings | None = None,
     ) -> dict[str, Any] | None:
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
-        self._extrinsics = extrinsics
+        self._places.given(extrinsics)
         self._heard |= {stream.partition("/")[2] for stream in measurements}
         named = {name: m for stream, m in measurements.items() if self._follows(name := self._name(stream), m.stamp)}
         felt = False
@@ -149,12 +149,12 @@ class EkfFusion(Operator):
             settings = self._settings(name)
             if isinstance(message, Imu) and use_of(name, message, settings) == "inertial":
                 felt = self._feel(name, message, settings)
-        around = Surroundings(self._place, self.world_frame, self._origin, landmark_map, self._ignored)
+        around = Surroundings(self._places.of, self.world_frame, self._origin, landmark_map, self._ignored)
         for name, message in named.items():
             if not (isinstance(message, Imu) and use_of(name, message, self._settings(name)) == "inertial"):
                 self._measure(name, message, around)
         self._origin = around.origin
-        if self._filter is None or not (felt or self.motion == "constant_velocity"):
+        if self._filter is None or not (felt or self.motion == "constant_velocity" or self._bridge(context.stamp)):
             return None
         return {"odometry": self._odometry(context.stamp), "status": self._status(context.stamp)}
 
@@ -166,6 +166,7 @@ class EkfFusion(Operator):
         return {
             "filter": None if self._filter is None else self._filter.snapshot(),
             "inertial": self._inertial.snapshot(),
+            "silence": self._silence.snapshot(),
             "reported": self._reported,
             "stamps": dict(self._stamps),
             "before": {
@@ -174,7 +175,7 @@ class EkfFusion(Operator):
                 if isinstance(m, Odometry)
             },
             "origin": None if self._origin is None else list(self._origin),
-            "body": self._body,
+            "body": self._places.body,
             "sure": int(self._sure),
             "ignored": dict(self._ignored),
             "heard": sorted(self._heard),
@@ -195,26 +196,20 @@ class EkfFusion(Operator):
         else:  # as snapshots were before the sensor kept its own part
             *stamps, self._reported = (int(stamp) for stamp in state["stamps"])
             self._inertial.restore({"samples": state["samples"], "stamps": stamps})
+        if "silence" in state:
+            self._silence.restore(state["silence"])
         self._before = {
             name: Odometry(stamp=int(stamp), frame=frame, child_frame=child, position=p, orientation=q)
             for name, (stamp, frame, child, p, q) in state["before"].items()
         }
         self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
-        self._body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
+        self._places.body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
 
     def summary(self) -> Mapping[str, float | int | str]:
-        figures: dict[str, float | int | str] = {}
-        if self._filter is not None:
-            for name, health in sorted(self._filter.health.items()):
-                figures[f"{name}, used"] = health.used + health.widened
-                figures[f"{name}, used after making room"] = health.widened
-                figures[f"{name}, refused"] = health.refused
-                figures[f"{name}, unconfirmed"] = health.unconfirmed
-            for name, (offset, sigma) in self._offsets().items():
-                figures |= {f"{name}, offset (s)": offset, f"{name}, sigma of the offset (s)": sigma}
-        ignored = self._ignored + (self._filter.ignored if self._filter is not None else Counter())
-        figures |= {f"settings of {name}": f"of no stream{near}" for name, near in self._unheard()}
-        return figures | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}
+        fused = self._filter
+        health = {} if fused is None else fused.health
+        ignored = self._ignored + (Counter() if fused is None else fused.ignored)
+        return figures(health, self._offsets(), dict(self._unheard()), ignored)
 
     def _follows(self, name: str, stamp: int) -> bool:
         """Tells whether a message comes after the sensor's last; one that does not is counted."""
@@ -239,15 +234,6 @@ class EkfFusion(Operator):
     def _settings(self, name: str) -> SensorSettings:
         return self.sensors.get(name) or SensorSettings()
 
-    def _place(self, frame: str) -> Array:
-        """`T_body_sensor` (4, 4) of a sensor's frame."""
-        if frame == self._body or self._extrinsics is None:
-            return np.eye(4)
-        T_base_sensor = transform_between(self._extrinsics, frame, self.base_frame)
-        return (
-            invert(transform_between(self._extrinsics, self._body or self.base_frame, self.base_frame)) @ T_base_sensor
-        )
-
     def _config(self) -> FilterConfig:
         inertial = self.motion == "inertial"
         return FilterConfig(
@@ -255,12 +241,24 @@ class EkfFusion(Operator):
             gravity=self.gravity,
             max_gap=self.max_gap,
             inertial=inertial,
-            unknown=Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
-            if inertial
-            else Noise(0.0, self.free_acceleration, self.free_turning, 0.0),
+            unknown=self._unknown(),
             gates=self._gates,
             errors=errors_of(self.sensors),
         )
+
+    def _unknown(self) -> Noise:
+        """The noise of a motion that no inertial sensor tells of."""
+        if self.motion == "inertial":
+            return Noise(self.free_turning, self.free_acceleration, self.gyro_walk, self.accel_walk)
+        return Noise(0.0, self.free_acceleration, self.free_turning, 0.0)
+
+    def _bridge(self, stamp: int) -> bool:
+        """Takes the inertial sensor's place where it is silent; False where it is not."""
+        assert self._filter is not None
+        if not self._silence.lasts(stamp):
+            return False
+        self._filter.feel(self._silence.sample(stamp, self._filter.estimate(stamp)[0]))
+        return True
 
     def _prior(self) -> Prior:
         prior = Prior(
@@ -278,9 +276,9 @@ class EkfFusion(Operator):
         if self.motion == "constant_velocity":
             self._ignored[f"{name}: motion is constant_velocity"] += 1
             return False
-        if self._body not in ("", imu.frame):
+        if self._places.body not in ("", imu.frame):
             raise ValueError(
-                f"{name}: a second inertial sensor, {imu.frame!r} beside {self._body!r}: only one can move"
+                f"{name}: a second inertial sensor, {imu.frame!r} beside {self._places.body!r}: only one can move"
             )
         if settings.offset_sigma:
             raise ValueError(f"{name}: its clock is the one that offsets are related to: it has no offset_sigma")
@@ -289,11 +287,12 @@ class EkfFusion(Operator):
         except Unusable as reason:
             self._ignored[f"{name}: {reason}"] += 1
             return False
-        self._body = imu.frame
+        self._places.body = imu.frame
+        self._silence.felt(sample.time)
         if self._filter is not None:
             self._filter.feel(sample)
             return True
-        begun = self._inertial.begun(sample, self._prior(), self.gravity, self._place(self.base_frame))
+        begun = self._inertial.begun(sample, self._prior(), self.gravity, self._places.of(self.base_frame))
         if begun is None:
             return False
         self._filter = LateFilter(self._config(), begun[0])
@@ -316,6 +315,8 @@ class EkfFusion(Operator):
             self._command(name, message, settings, around)
             return
         clock, assumed = self._clock(name)
+        if (seen := turning(message, before, around)) is not None:
+            self._silence.saw(message.stamp, seen)
         try:
             for time, sensor, model, noise in measurements(name, message, before, settings, around):
                 self._filter.measure(Measurement(time - assumed, sensor, model, noise, clock, assumed * 1e-9))
@@ -346,7 +347,7 @@ class EkfFusion(Operator):
         self._sure = self._sure or float(np.diag(state.covariance)[POSITION].max()) < self.sure**2
         if not self._sure:
             return None
-        T_body_base = self._place(self.base_frame)
+        T_body_base = self._places.of(self.base_frame)
         return odometry_of(state, rate, T_body_base, stamp, self.world_frame, self.base_frame)
 
     def _status(self, stamp: int) -> Diagnostics | None:
@@ -356,6 +357,8 @@ class EkfFusion(Operator):
         self._reported = stamp
         ignored = self._ignored + self._filter.ignored
         unused = {f"settings of {name}": f"no stream so far has this name{near}" for name, near in self._unheard()}
+        if self._silence.lasts(stamp):
+            unused["inertial sensor"] = "silent: the motion is bridged by what others see"
         return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)
 
     def _unheard(self) -> list[tuple[str, str]]:

@@ -48,11 +48,14 @@ class InertialSensor:
     def sample(self, name: str, imu: Imu, time: int) -> Sample:
         """Returns the sample of a message that was measured at a time (ns).
 
-        Raises Unusable for readings that are not finite and for a sample not later than the last, ValueError where
+        Raises Unusable for readings that are not finite or all zero (a sensor that is off: at rest there is gravity, in
+        free fall there is noise), and for a sample not later than the last, ValueError where
         nothing says how good the samples are.
         """
         if not (np.isfinite(imu.angular_velocity).all() and np.isfinite(imu.linear_acceleration).all()):
             raise Unusable("not finite")
+        if not (imu.angular_velocity.any() or imu.linear_acceleration.any()):
+            raise Unusable("all zero")
         if time <= self._last:
             raise Unusable("stamp not later than the last")
         noise = self._noise_of(name, imu, time)

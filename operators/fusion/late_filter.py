@@ -85,15 +85,17 @@ class LateFilter:
     @property
     def time(self) -> int:
         """The time of the newest estimate, ns."""
-        return self._nodes[-1].time
+        if self._config.inertial:
+            return self._newest_sample()
+        return self._entries[-1].time if self._entries else self._nodes[0].time
 
     @property
     def health(self) -> Mapping[str, Health]:
-        return self._nodes[-1].health
+        return self._newest().health
 
     @property
     def hypotheses(self) -> int:
-        return len(self._nodes[-1].hypotheses)
+        return len(self._newest().hypotheses)
 
     def feel(self, sample: Sample) -> None:
         """Takes an inertial sample, later than the last one."""
@@ -127,19 +129,20 @@ class LateFilter:
         names = [name for name, _ in self._config.errors.clocks]
         if not names:
             return {}
-        state = combined(self._nodes[-1].hypotheses)
+        state = combined(self._newest().hypotheses)
         sigmas = np.sqrt(np.diag(state.covariance)[SIZE:]).tolist()
         return {name: (float(state.errors[k]), sigmas[k]) for k, name in enumerate(names)}
 
     def estimate(self, time: int) -> tuple[State, Array]:
         """Returns the state at a time, not before the newest entry, and the gyroscope's reading."""
-        node = self._nodes[-1]
+        node = self._newest()
         if time > node.time:
             node = self._moved(node, time, node.gyro, node.accel, self._noise())
         return combined(node.hypotheses), node.gyro
 
     def snapshot(self) -> dict[str, Any]:
         """The oldest estimate of the window and what was given since: the rest follows from them."""
+        self._newest()
         first = max(0, bisect_right(self._sample_times, self._nodes[0].time))
         return {
             "base": plain_node(self._nodes[0]),
@@ -186,8 +189,12 @@ class LateFilter:
         self._keys.insert(place, key)
         self._entries.insert(place, entry)
         del self._nodes[place + 1 :]
+
+    def _newest(self) -> Node:
+        """The newest estimate: what came in since the last is done at once, so that none of it is done again."""
         self._advance()
         self._trim()
+        return self._nodes[-1]
 
     def _advance(self) -> None:
         while len(self._nodes) <= len(self._entries):

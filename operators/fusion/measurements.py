@@ -13,7 +13,17 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.fusion.error_state import ACCEL_BIAS, GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, log_rotation
+from operators.fusion.error_state import (
+    ACCEL_BIAS,
+    GYRO_BIAS,
+    POSITION,
+    ROTATION,
+    SIZE,
+    VELOCITY,
+    State,
+    cross,
+    log_rotation,
+)
 from operators.geometry.se3 import skew
 
 Array = NDArray[np.float64]
@@ -98,7 +108,7 @@ class Velocity:
         H[:, VELOCITY] = self.axes @ state.rotation.T
         H[:, ROTATION] = self.axes @ skew(own)
         H[:, GYRO_BIAS] = self.axes @ skew(self.lever)
-        return self.value - self.axes @ (own + np.cross(turning, self.lever)), H
+        return self.value - self.axes @ (own + cross(turning, self.lever)), H
 
     def widening(self, residual: Array, seconds: float) -> Array:
         return _wide(residual, (VELOCITY, 1.0))

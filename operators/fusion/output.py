@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Diagnostics, Odometry
 from dataflow.messages.diagnostics import Level
-from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State
+from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
 from operators.fusion.gate import Health
 from operators.geometry.se3 import skew
 
@@ -33,7 +33,7 @@ def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame
         stamp=stamp,
         frame=frame,
         child_frame=child_frame,
-        linear=turn.T @ (own + np.cross(angular, lever)),
+        linear=turn.T @ (own + cross(angular, lever)),
         angular=turn.T @ angular,
         pose_covariance=pose @ P @ pose.T,
         twist_covariance=twist @ P @ twist.T,
@@ -69,10 +69,10 @@ def diagnostics(
         else:
             level, text = Level.OK, "used"
         counts = {"used": h.used, "made room for": h.widened, "refused": h.refused, "unconfirmed": h.unconfirmed}
-        figures: dict[str, int | str] = {**counts, "nis": f"{h.nis_sum:.3f}", "freedom": h.freedom}
+        values: dict[str, int | str] = {**counts, "nis": f"{h.nis_sum:.3f}", "freedom": h.freedom}
         if (found := offsets.get(name.partition(" ")[0])) is not None:
-            figures |= {"offset, s": f"{found[0]:.4f}", "offset sigma, s": f"{found[1]:.4f}"}
-        rows.append((name, text, level, figures))
+            values |= {"offset, s": f"{found[0]:.4f}", "offset sigma, s": f"{found[1]:.4f}"}
+        rows.append((name, text, level, values))
     rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items())]
     pairs = [(key, str(value), k) for k, row in enumerate(rows) for key, value in row[3].items()]
     return Diagnostics(
@@ -84,3 +84,25 @@ def diagnostics(
         values=tuple(value for _, value, _ in pairs),
         owners=np.array([owner for _, _, owner in pairs], np.int32) if pairs else None,
     )
+
+
+def figures(
+    health: Mapping[str, Health],
+    offsets: Mapping[str, tuple[float, float]],
+    unheard: Mapping[str, str],
+    ignored: Mapping[str, int],
+) -> Mapping[str, float | int | str]:
+    """Sums up the filter's time: what was made of the measurements of each sensor, and what was ignored, by reason.
+
+    `unheard`: settings that fit no stream, each with the stream that may have been meant.
+    """
+    found: dict[str, float | int | str] = {}
+    for name, sensor in sorted(health.items()):
+        found[f"{name}, used"] = sensor.used + sensor.widened
+        found[f"{name}, used after making room"] = sensor.widened
+        found[f"{name}, refused"] = sensor.refused
+        found[f"{name}, unconfirmed"] = sensor.unconfirmed
+    for name, (offset, sigma) in offsets.items():
+        found |= {f"{name}, offset (s)": offset, f"{name}, sigma of the offset (s)": sigma}
+    found |= {f"settings of {name}": f"of no stream{near}" for name, near in unheard.items()}
+    return found | {f"ignored, {reason}": count for reason, count in sorted(ignored.items())}

@@ -262,6 +262,18 @@ def _twist(message: Message, before: Message | None) -> tuple[int, Array, Array,
     return span // 2, step[:3], step[3:], None
 
 
+def turning(message: Message, before: Message | None, around: Surroundings) -> Array | None:
+    """Returns how fast the body turns (3,) in its own axes, rad/s, by an odometry or a twist, if they tell."""
+    if not isinstance(message, Odometry | Twist):
+        return None
+    try:
+        _, _, angular, _ = _twist(message, before)
+    except Unusable:
+        return None
+    frame = message.child_frame if isinstance(message, Odometry) else message.frame
+    return np.asarray(around.place(frame)[:3, :3] @ angular)
+
+
 def _velocity(
     time: int, name: str, message: Message, before: Message | None, settings: SensorSettings, around: Surroundings
 ) -> Iterator[Found]:

@@ -50,6 +50,8 @@ FUSION: dict[str, tuple[str, dict[str, Any]]] = {
     "command": (f"{SENSORS_NODE}/command", {"use": "control"}),
 }
 """Sensor → the stream that stands for it in the fusion, and how far it is believed unless the caller says otherwise."""
+CHECKED_WHEELS = "motion_check/checked"
+"""The stream that stands for wheels where something is there to check them against."""
 Array = NDArray[Any]
 
 
@@ -224,6 +226,8 @@ def _believed(sensors: Sequence[str], given: Mapping[str, Mapping[str, Any]]) ->
     found = {
         name: FUSION[name] for name in sensors if name in FUSION and not (name == "depth" and "image" not in sensors)
     }
+    if "wheels" in found and ({"image", "depth"} <= set(sensors) or "points" in sensors):
+        found["wheels"] = (CHECKED_WHEELS, found["wheels"][1])
     return {stream: {**usual, **given.get(name, {})} for name, (stream, usual) in found.items()}
 
 

@@ -15,6 +15,8 @@ from operators.recognition.learned_object import LEAST, PROPOSALS, LearnedObject
 from operators.recognition.proposals import F32, Glance, Trunk
 from operators.weights import shipped
 
+_MAYBE, _STEPS = 0.2, 2  # resemblance from which a box is drawn to the outline, and how often that is repeated
+
 
 class LearnedDetector(Operator):
     """Finds what CustomDetector finds, and objects that were learned from a few images by `dataflow learn object`.
@@ -23,7 +25,8 @@ class LearnedDetector(Operator):
     against each learned prototype. Where a learned object is surer than a known class at the same place, it takes it;
     all other boxes stay as they are. One run of the network serves both, on one CPU thread.
 
-    Method: Snell et al., "Prototypical networks for few-shot learning", 2017, on the features of a trained detector.
+    Methods: Snell et al., "Prototypical networks for few-shot learning", 2017, on the features of a trained detector;
+    outlines by linear regression as in Girshick et al., "Rich feature hierarchies for accurate object detection", 2014.
     """
 
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
@@ -93,13 +96,22 @@ class LearnedDetector(Operator):
         described = self._trunk.describe(glance, proposed)
         boxes, scores, classes = [proposed[:0]], [np.zeros(0, np.float32)], [np.zeros(0, np.int32)]
         for each in self._learned:
-            sure = each.probability(described)
+            drawn, sure = self._drawn(glance, each, proposed, described)
             rows = np.flatnonzero(sure >= self.learned_threshold)
-            kept = rows[class_wise_nms(proposed[rows], sure[rows], np.zeros(len(rows), np.int32), 0.3)]
-            boxes.append(np.array([_settled(proposed[k], proposed, sure) for k in kept], np.float32).reshape(-1, 4))
+            kept = rows[class_wise_nms(drawn[rows], sure[rows], np.zeros(len(rows), np.int32), 0.3)]
+            boxes.append(np.array([_settled(drawn[k], drawn, sure) for k in kept], np.float32).reshape(-1, 4))
             scores.append(sure[kept])
             classes.append(np.full(len(kept), self._names.index(each.name), np.int32))
         return Candidates(np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes))
+
+    def _drawn(self, glance: Glance, each: LearnedObject, boxes: F32, described: F32) -> tuple[F32, F32]:
+        """Moves the boxes that may show a learned object to its outline, and tells how surely they show it there."""
+        rows = np.flatnonzero(each.probability(described) >= _MAYBE)
+        boxes, described = boxes[rows], described[rows]
+        for _ in range(_STEPS):
+            boxes = each.drawn(boxes, described)
+            described = self._trunk.describe(glance, boxes)
+        return boxes, each.probability(described)
 
     def _staying(self, known: Candidates, learned: Candidates) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
         """Returns the boxes of known classes at whose place no learned object is surer."""

@@ -20,6 +20,9 @@ PROPOSALS, LEAST = 120, 0.004
 _ALIKE, _APART = 0.65, 0.3  # overlap from which a box shows the object, and up to which it shows something else
 _SHRINKAGE = 0.3
 _WIDTH = 0.08  # of the score, over which a resemblance becomes sure
+_TOUCHING = 0.3  # overlap of boxes from which the outline is learned
+_RIDGE = 1.0
+_FARTHEST = 0.5  # share of a box's size by which one step moves a side at most
 
 
 class LearnedObjectError(ModelError):
@@ -31,7 +34,9 @@ class LearnedObject:
     """A class by what sets it apart: `direction` (D,) from the `background` (D,) mean towards the prototype.
 
     A vector's resemblance is 0 at the background's mean and 1 at the prototype; `threshold` lies between objects and
-    background. `detector` is the SHA-256 of the network that the features come from, `inner` the maps of it.
+    background. `outline` (D + 1, 4) tells from the vector of a box how to change its middle and size to those of the
+    object: shares of its size, and logarithms. `detector` is the SHA-256 of the network that the features come from,
+    `inner` the maps of it.
     """
 
     name: str
@@ -41,6 +46,15 @@ class LearnedObject:
     direction: F32
     threshold: float
     images: int
+    outline: F32
+
+    def drawn(self, boxes: F32, described: F32) -> F32:
+        """Returns boxes (N, 4) with vectors (N, D) moved to the outline of the object that they show."""
+        change = np.clip(described @ self.outline[:-1] + self.outline[-1], -_FARTHEST, _FARTHEST)
+        size = boxes[:, 2:] - boxes[:, :2]
+        middle = boxes[:, :2] + size * (0.5 + change[:, :2])
+        half = 0.5 * size * np.exp(change[:, 2:])
+        return np.concatenate([middle - half, middle + half], axis=1).astype(np.float32)
 
     def probability(self, described: F32) -> NDArray[np.float32]:
         """Returns how surely each vector (N, D) shows the object, [0, 1]."""
@@ -56,6 +70,7 @@ class LearnedObject:
                 background=self.background,
                 direction=self.direction,
                 threshold=np.float64(self.threshold),
+                outline=self.outline,
             )
 
     @classmethod
@@ -68,6 +83,8 @@ class LearnedObject:
                 facts = json.loads(str(kept["facts"]))
                 background, direction = kept["background"], kept["direction"]
                 threshold = float(kept["threshold"])
+                still = np.zeros((len(direction) + 1, 4), np.float32)  # files of the first format have no outline
+                outline = kept["outline"].astype(np.float32) if "outline" in kept else still
             return cls(
                 str(facts["name"]),
                 str(facts["detector"]),
@@ -76,6 +93,7 @@ class LearnedObject:
                 direction.astype(np.float32),
                 threshold,
                 int(facts["images"]),
+                outline,
             )
         except (ValueError, KeyError, OSError, TypeError) as error:
             raise LearnedObjectError(
@@ -85,10 +103,13 @@ class LearnedObject:
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Holds what one image gives: vectors of the object (P, D) and of everything else (Q, D)."""
+    """Holds what one image gives: vectors of the object (P, D) and of everything else (Q, D); and those of boxes that
+    touch the object (R, D), with the changes (R, 4) that would make them its own."""
 
     object: F32
     others: F32
+    touching: F32
+    changes: F32
 
 
 def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random.Generator) -> Shown:
@@ -96,7 +117,7 @@ def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random
 
     It is looked at as it is, mirrored, from farther and from nearer, so that few images show many sides and sizes.
     """
-    objects, others = [], []
+    objects, others, touching, changes = [], [], [], []
     for view, known in _variants(pixels, boxes):
         glance = trunk.look(view)
         within = _fitted(known, glance.fit.apply(np.zeros(view.shape, np.uint8)).shape, view.shape)
@@ -106,7 +127,18 @@ def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random
         near = np.concatenate([proposed[best >= _ALIKE], *(_jittered(box, rng) for box in within)])
         objects.append(trunk.describe(glance, near.astype(np.float32)))
         others.append(trunk.describe(glance, proposed[best <= _APART]))
-    return Shown(np.concatenate(objects), np.concatenate(others))
+        for box in within:
+            loose = np.concatenate([proposed, _jittered(box, rng, 0.4, 40)])
+            loose = loose[intersection_over_union(box, loose) >= _TOUCHING]
+            touching.append(trunk.describe(glance, loose))
+            changes.append(_changes(loose, box))
+    nothing = np.zeros((0, objects[0].shape[1]), np.float32)
+    return Shown(
+        np.concatenate(objects),
+        np.concatenate(others),
+        np.concatenate([nothing, *touching]),
+        np.concatenate([np.zeros((0, 4), np.float32), *changes]),
+    )
 
 
 def learn(name: str, shown: Sequence[Shown], detector: str, inner: tuple[str, ...]) -> LearnedObject:
@@ -132,7 +164,21 @@ def learn(name: str, shown: Sequence[Shown], detector: str, inner: tuple[str, ..
         other.append((left_out.others - mean) @ across)
     alike = float(np.quantile(np.concatenate(own), 0.2))
     strange = float(np.quantile(np.concatenate(other), 0.998)) if sum(map(len, other)) else 0.0
-    return LearnedObject(name, detector, inner, background, direction, (alike + strange) / 2, len(there))
+    return LearnedObject(
+        name, detector, inner, background, direction, (alike + strange) / 2, len(there), _outline(there)
+    )
+
+
+def _outline(shown: Sequence[Shown]) -> F32:
+    """Returns (D + 1, 4): the change of a box by its vector, least squares with a penalty on the square of weights."""
+    vectors = np.concatenate([each.touching for each in shown]).astype(np.float64)
+    changes = np.concatenate([each.changes for each in shown]).astype(np.float64)
+    if not len(vectors):
+        return np.zeros((vectors.shape[1] + 1, 4), np.float32)
+    mean, usual = vectors.mean(axis=0), changes.mean(axis=0)
+    apart = vectors - mean
+    weights = apart.T @ np.linalg.solve(apart @ apart.T + _RIDGE * np.eye(len(apart)), changes - usual)
+    return np.concatenate([weights, (usual - mean @ weights)[None]]).astype(np.float32)
 
 
 def _discriminant(shown: Sequence[Shown]) -> tuple[F32, F32]:
@@ -179,8 +225,15 @@ def _fitted(boxes: F32, target: tuple[int, ...], source: tuple[int, ...]) -> F32
     return np.asarray(boxes * scale + off, np.float32)
 
 
-def _jittered(box: F32, rng: np.random.Generator, count: int = 6) -> F32:
-    """Returns a box and some that differ from it a little, as a detector's would."""
+def _changes(boxes: F32, wanted: F32) -> F32:
+    """Returns (N, 4) what makes boxes (N, 4) the wanted one: shift of the middle by their size, logarithm of sizes."""
+    size, other = boxes[:, 2:] - boxes[:, :2], wanted[2:] - wanted[:2]
+    shift = ((wanted[:2] + wanted[2:]) / 2 - (boxes[:, :2] + boxes[:, 2:]) / 2) / size
+    return np.concatenate([shift, np.log(other / size)], axis=1).astype(np.float32)
+
+
+def _jittered(box: F32, rng: np.random.Generator, most: float = 0.07, count: int = 6) -> F32:
+    """Returns a box and some whose sides differ from it by up to a share of its size, as a detector's would."""
     width, height = box[2] - box[0], box[3] - box[1]
-    shifts = rng.uniform(-0.07, 0.07, (count, 4)) * np.array([width, height, width, height])
+    shifts = rng.uniform(-most, most, (count, 4)) * np.array([width, height, width, height])
     return np.concatenate([box[None], box + shifts]).astype(np.float32)

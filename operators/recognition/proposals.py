@@ -109,4 +109,4 @@ def _pooled(map: F32, boxes: F32, size: tuple[int, int]) -> F32:
     lower = (1 - u) * cells[rows + 1, columns] + u * cells[rows + 1, columns + 1]
     sampled = (1 - v) * upper + v * lower
     quarters = sampled.reshape(len(boxes), _GRID, _SAMPLES, _GRID, _SAMPLES, channels).mean(axis=(2, 4))
-    return np.asarray(quarters.reshape(len(boxes), -1), np.float32)
+    return np.asarray(quarters.reshape(len(boxes), _GRID * _GRID * channels), np.float32)

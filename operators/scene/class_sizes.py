@@ -1,4 +1,7 @@
-"""Usual sizes of the simulated world's classes: what tells how deep an object is of which only one side was seen."""
+"""Knowledge about the simulated world's classes: usual sizes, and what a label of a detector tells.
+
+Sizes tell how deep an object is of which only one side was seen.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +13,18 @@ class Usual:
     """Usual size: shorter and longer side on the ground and height, metres, and spreads of their logs.
 
     What is `round` has the outline of an ellipse, as seen from above. What is leafy shows points that are inside its
-    box, by the share `inset` of half its side.
+    box, by the share `inset` of half its side. What is `on_floor` stands there, though its foot may be hidden.
     """
 
     size: tuple[float, float, float]
     spread: tuple[float, float, float]
     round: bool = False
     inset: float = 0.0
+    on_floor: bool = False
 
 
 CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
-    "person": (Usual((0.50, 0.59, 1.61), (0.25, 0.20, 0.15), True),),
+    "person": (Usual((0.50, 0.59, 1.61), (0.25, 0.20, 0.15), True, on_floor=True),),
     "chair": (Usual((0.47, 0.50, 0.96), (0.16, 0.13, 0.12)),),
     "table": (Usual((0.60, 1.50, 0.75), (0.40, 0.40, 0.16)),),
     "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25)),),
@@ -41,3 +45,10 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
 }
 """By class, each way in which such things stand: medians over the objects of 36 training worlds (seeds 10000 to 10011
 of office, corridor and table_top)."""
+
+TELLING: dict[str, float] = {"ball": 2.0}
+"""Labels of another class that one of this class outweighs, where that is not one.
+
+Far balls are often called mugs, mugs seldom balls: of the labels of balls in five worlds (seeds 501, 502, 601,
+603 and 604) 13 % are `mug`, below 16 pixels 62 %; of those of mugs 2 % are `ball`.
+"""

@@ -19,8 +19,18 @@ _SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
 class Kinds:
     """Tells of objects and classes what follows from which classes move and which sizes are usual."""
 
-    def __init__(self, movers: Iterable[int], usual: Mapping[int, Sequence[Usual]]) -> None:
-        self.movers, self.usual = frozenset(movers), dict(usual)
+    def __init__(
+        self,
+        movers: Iterable[int],
+        usual: Mapping[int, Sequence[Usual]],
+        telling: Mapping[int, float] | None = None,
+    ) -> None:
+        """`telling` says how much a label counts, where that is not 1."""
+        self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
+
+    def vote(self, class_id: int, score: float) -> float:
+        """Returns how much a label with a score counts for its class."""
+        return score * self._telling.get(class_id, 1.0)
 
     def is_mover(self, object: MapObject) -> bool:
         """Tells whether an object is of a class that moves by itself; small ones do only while they are moved."""
@@ -40,6 +50,10 @@ class Kinds:
 
     def is_round(self, object: MapObject) -> bool:
         return any(u.round for u in self.usual.get(object.class_id, ()))
+
+    def is_on_floor(self, object: MapObject) -> bool:
+        """Tells whether an object is of a class that stands on the floor."""
+        return any(u.on_floor for u in self.usual.get(object.class_id, ()))
 
     def near_side(self, points: Array, class_id: int, eye: Array, noise: float) -> Array:
         """Returns one view's points (N, 3) without those that are farther behind most than such a thing is deep.

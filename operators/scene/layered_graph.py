@@ -63,7 +63,7 @@ class Snapshot:
 
 
 class LayeredGraph:
-    """Builds the graph of a room: room, floor, objects, agents, the robot.
+    """Builds the graph of a room: room, surfaces, objects, agents, the robot.
 
     Relations follow from the boxes of the moment and begin and end with hysteresis. Agents have motions, from which
     activities and goals are inferred; `heads_for` is a relation of an agent to each likely goal, with its probability.
@@ -79,7 +79,7 @@ class LayeredGraph:
         self._pairs = BoxPairs()
 
     def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
-        """Takes the objects of one time, which may have the floor among them, and the robot's pose."""
+        """Takes the objects of one time, which may have surfaces among them, and the robot's pose."""
         s, time = self._settings, stamp * 1e-9
         bodies = [replace(b, agent=b.label in s.agents) for b in things]
         for k, body in enumerate(bodies):

@@ -23,6 +23,7 @@ _KEPT = 10  # views of an object
 _APART = 0.05  # angle, rad, and a third of the change of the distance, from which two views tell different things
 _SETTLED = 5  # views after which the way in which it stands is settled
 _POINTS = 45  # points of an object that a fit uses
+_FOOT = 1.0  # metres above the floor up to which what stands on it may be hidden
 _PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most", "form")
 _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 
@@ -103,6 +104,13 @@ class MapObject:
         elif known:
             box = completed(box, self.view / max(self.views, 1), known[0])
         self.center, self.size, self.yaw = box
+
+    def stand_on(self, floor: float) -> None:
+        """Lets the box reach down to a floor that is not far below it."""
+        bottom, top = float(self.center[2] - self.size[2] / 2), float(self.center[2] + self.size[2] / 2)
+        if bottom - floor <= _FOOT and top > floor + _FOOT / 2:
+            self.center, self.size = self.center.copy(), self.size.copy()
+            self.center[2], self.size[2] = (top + floor) / 2, top - floor
 
     def snapshot(self) -> dict[str, Any]:
         rows = self.images

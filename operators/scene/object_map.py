@@ -56,9 +56,10 @@ class ObjectMap:
         movers: Iterable[int],
         settings: MapSettings,
         usual: Mapping[int, Sequence[Usual]] | None = None,
+        telling: Mapping[int, float] | None = None,
     ) -> None:
-        """`usual` are the sizes of classes whose size is known."""
-        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {})
+        """`usual` are the sizes of classes whose size is known, `telling` how much their labels count, where not 1."""
+        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {}, telling)
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -66,6 +67,8 @@ class ObjectMap:
         self._stamp: int | None = None
         self._room, self._updates = RoomHeading(), 0
         self._heading: float | None = None
+        self.floor: float | None = None
+        """Height of the floor, where it is known: what stands on it reaches down to it."""
 
     def update(self, stamp: int, seen: Sequence[Observation], view: RangeView) -> None:
         """Takes the observations of one time and the view that they come from."""
@@ -91,6 +94,11 @@ class ObjectMap:
         self._look_around(view, [o for o in self.objects.values() if o.born != stamp], shown, seconds)
         self._join_doubles([i for i in self.objects if self.objects[i].seen == stamp])
         self._drop(stamp)
+
+    @property
+    def heading(self) -> float | None:
+        """Heading of most things around, in [0, pi / 2); None where none stands out."""
+        return self._heading
 
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that are surely there, by rising id."""
@@ -139,7 +147,7 @@ class ObjectMap:
         object.view = direction * object.views if mover else object.view + direction
         before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
         voted = object.class_id
-        object.votes[each.class_id] += each.score
+        object.votes[each.class_id] += self._kinds.vote(each.class_id, each.score)
         object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
@@ -147,7 +155,7 @@ class ObjectMap:
             object.color = 0.8 * object.color + 0.2 * each.color if known else each.color
         if mover:
             object.cells, object.most = cells, len(cells)
-            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+            self._fit(object)
             speed = (object.center - before) / since
             share = min(1.0, since / 0.5)
             object.velocity = (1 - share) * object.velocity + share * speed if since < 2 else np.zeros(3)
@@ -158,7 +166,12 @@ class ObjectMap:
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
-            object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+            self._fit(object)
+
+    def _fit(self, object: MapObject) -> None:
+        object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+        if self.floor is not None and self._kinds.is_on_floor(object):
+            object.stand_on(self.floor)
 
     def _has_left(self, object: MapObject, view: RangeView) -> bool:
         """Tells whether a view looks through the place of an object."""
@@ -168,7 +181,7 @@ class ObjectMap:
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
-        votes[each.class_id] = each.score
+        votes[each.class_id] = self._kinds.vote(each.class_id, each.score)
         made = MapObject(self._next, cells, votes, _log_odds(each.score, self._settings.gain), stamp, stamp)
         if each.color is not None:
             made.color = each.color
@@ -176,7 +189,7 @@ class ObjectMap:
         made.center = cells.middle
         if each.image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
             made.look(each.image)
-        made.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+        self._fit(made)
         self.objects[made.id] = made
         self._next += 1
 
@@ -256,7 +269,7 @@ class ObjectMap:
                 if are_one(a, b, self._kinds, self._settings.voxel):
                     del self.objects[i], self.objects[j]
                     one = merge(a, b, self._kinds)
-                    one.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+                    self._fit(one)
                     self.objects[one.id] = one
 
     def _drop(self, stamp: int) -> None:

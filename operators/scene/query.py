@@ -9,11 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from dataflow.messages import SceneGraph
+from operators.scene.map_surface import SURFACES
 from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM
 
 _ANY = ("anything", "something", "thing", "*")
 _LAYERS = {ROOM: "room", FLOOR: "surface", ROBOT: "robot"}
-_SURFACES, _AGENTS = ("floor", "wall", "ceiling"), ("person", "robot", "ball")
+_AGENTS = ("person", "robot", "ball")
 
 
 class QueryError(ValueError):
@@ -136,7 +137,7 @@ def _named(graph: SceneGraph, node: int, name: str) -> bool:
     label = graph.class_names[graph.class_ids[node]] if graph.class_names else str(graph.class_ids[node])
     if name == "*":
         return int(graph.ids[node]) not in (ROOM, ROBOT)
-    return name in (label, f"{label} {int(graph.ids[node])}")
+    return name in (label, f"{label} {int(graph.ids[node])}", *graph.labels[node : node + 1])
 
 
 def as_json(graph: SceneGraph) -> dict[str, Any]:
@@ -145,7 +146,7 @@ def as_json(graph: SceneGraph) -> dict[str, Any]:
     nodes = []
     for k in range(graph.count):
         id, label = int(graph.ids[k]), graph.class_names[graph.class_ids[k]] if graph.class_names else ""
-        layer = _LAYERS.get(id) or ("surface" if label in _SURFACES else "agent" if label in _AGENTS else "object")
+        layer = _LAYERS.get(id) or ("surface" if label in SURFACES else "agent" if label in _AGENTS else "object")
         nodes.append(
             {
                 "id": id,

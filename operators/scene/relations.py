@@ -37,6 +37,9 @@ PREDICATES = (
 FLOOR, ROBOT, ROOM = 0, -1, -2
 """Ids of nodes that are not objects."""
 
+SURFACE = -10
+"""Ids below this are surfaces other than the floor: walls, table tops, ceilings."""
+
 
 @dataclass(frozen=True)
 class RelationRules:
@@ -50,20 +53,23 @@ class RelationRules:
     small: float = 0.4
     closing: float = 0.2
     containers: tuple[str, ...] = ("shelf", "bin", "box")
+    tops: tuple[str, ...] = ("tabletop",)
     seats: tuple[str, ...] = ("chair",)
 
 
 def relations_of(
     bodies: Sequence[Body], T_world_robot: Array | None, rules: RelationRules, known: BoxPairs | None = None
 ) -> dict[Relation, float]:
-    """Returns the relations that hold now between nodes, floor and robot among them, with their scores.
+    """Returns the relations that hold now between nodes, surfaces and robot among them, with their scores.
 
+    A thing may stand on a table and on that table's top, which is part of it.
     `known` spares what was worked out before for pairs of bodies that are where they were.
     """
     boxes = BoxPairs() if known is None else known
     boxes.update(bodies)
     found: dict[Relation, float] = {}
-    things = [b for b in bodies if b.id not in (FLOOR, ROOM, ROBOT)]
+    things = [b for b in bodies if b.id > FLOOR]
+    tops = [b for b in bodies if b.id < SURFACE and b.label in rules.tops]
     floor = next((b for b in bodies if b.id == FLOOR), None)
     held: set[int] = set()
     around = _pairs(things, [b for b in things if b.agent], 1.5 + rules.above, flat=False)
@@ -76,6 +82,8 @@ def relations_of(
     for body in things:
         if body.id not in held and body.id not in sitting:
             _placed(found, body, stacks[body.id], floor, boxes, rules)
+            if body.label != "person":
+                _on_top(found, body, tops, boxes, rules)
     seen: dict[int, list[float]] = {}
     if T_world_robot is not None:
         seen = {b.id: (T_world_robot[:3, :2].T @ b.center).tolist() for b in things}
@@ -88,8 +96,11 @@ def relations_of(
         if first.agent:
             for second in around[first.id]:
                 _moving(found, first, second, rules)
+    for top in tops:
+        _part(found, top, things, boxes, rules)
     if any(b.id == ROOM for b in bodies):
-        found |= {(b.id, "part_of", ROOM): 1.0 for b in bodies if b.id == FLOOR}
+        building = [b for b in bodies if b.id == FLOOR or (b.id < SURFACE and b not in tops)]
+        found |= {(b.id, "part_of", ROOM): 1.0 for b in building}
     return found
 
 
@@ -139,6 +150,32 @@ def _placed(
         best = max(best, (1 - max(0.0, height) / 0.6, "on", FLOOR))
     if best[0] > 0:
         found[body.id, best[1], best[2]] = best[0]
+
+
+def _on_top(
+    found: dict[Relation, float], body: Body, tops: Sequence[Body], boxes: BoxPairs, rules: RelationRules
+) -> None:
+    """Finds the surface above the floor that a thing stands or lies on."""
+    best: tuple[float, int] = (0.0, 0)
+    for top in tops:
+        off = abs(body.bottom - top.top)
+        if off <= 2 * rules.touch and body.center[2] > top.top and (share := boxes.share(body, top)) > 0.3:
+            best = max(best, (min(1.0, share / 0.6) * (1 - 0.5 * off / (2 * rules.touch)), top.id))
+    if best[0] > 0:
+        found[body.id, "on", best[1]] = best[0]
+
+
+def _part(
+    found: dict[Relation, float], top: Body, things: Sequence[Body], boxes: BoxPairs, rules: RelationRules
+) -> None:
+    """Finds the thing that a surface above the floor is the top of."""
+    best: tuple[float, int] = (0.0, 0)
+    for body in things:
+        off = abs(body.top - top.top)
+        if not body.agent and off <= 3 * rules.touch and (share := boxes.share(top, body)) > 0.5:
+            best = max(best, (share * (1 - 0.5 * off / (3 * rules.touch)), body.id))
+    if best[0] > 0:
+        found[top.id, "part_of", best[1]] = best[0]
 
 
 def _stacked(found: dict[Relation, float], first: Body, second: Body, boxes: BoxPairs, rules: RelationRules) -> None:

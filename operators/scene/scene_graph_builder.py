@@ -16,7 +16,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES, UNKNOWN
 from operators.scene.bodies import Body
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
-from operators.scene.relations import FLOOR, ROBOT, ROOM, RelationRules
+from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""
@@ -25,11 +25,13 @@ EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 class SceneGraphBuilder(Operator):
     """Relates the objects of a map: what is on, in, under, near, left of what, who does what, and where they are going.
 
-    Nodes are the room (id -2), the robot (-1), the floor (0), objects and agents. Relations are worked out from upright
-    boxes, scored, and begin and end with hysteresis: on, in, under, above, near, left_of and in_front_of (of things
-    near each other, as the robot sees them), part_of, sitting_on, holding, facing, approaching, and heads_for, whose
-    score is the probability that the agent is going there. supports, right_of and behind are inverses and asked for as
-    such. Activities come from a recogniser, or where there is none or it does not know, from motion and contact.
+    Nodes are the room (id -2), the robot (-1), surfaces (the floor is 0, walls and table tops count from -11 down),
+    objects and agents. The map's floor says how high things stand; without one it is made up from them. Relations are
+    worked out from upright boxes, scored, and begin and end with hysteresis: on, in, under, above, near, left_of and
+    in_front_of (of things near each other, as the robot sees them), part_of, sitting_on, holding, facing, approaching,
+    and heads_for, whose score is the probability that the agent is going there. supports, right_of and behind are
+    inverses and asked for as such. Activities come from a recogniser, or where there is none or it does not know, from
+    motion and contact.
 
     Method: layers after Armeni et al., "3D scene graph", 2019, and Hughes et al., "Hydra", 2022; goals after Ramirez
     and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010.
@@ -100,7 +102,7 @@ class SceneGraphBuilder(Operator):
                 T = T @ transform_between(extrinsics, self.robot_frame, robot.child_frame)
         bodies, unusable = _bodies(nodes)
         now = self._graph.update(nodes.stamp, bodies, T)
-        self._names |= {b.id: EXTRA.get(b.id, f"{b.label} {b.id}") for b in now.bodies}
+        self._names |= {b.id: _name(b) for b in now.bodies}
         self._counts.update({"graphs": 1, "unusable nodes": unusable, "relations begun": len(now.began)})
         self._counts["nodes"], self._counts["relations"] = len(now.bodies), len(now.relations)
         out: dict[str, Any] = {
@@ -202,10 +204,14 @@ def _recognized(act: Act, recognized: Activity) -> Act:
     return Act(act.agent, name, float(recognized.scores[k]), object, since, act.goals)
 
 
+def _name(body: Body) -> str:
+    return EXTRA.get(body.id, f"{body.label} {SURFACE - body.id if body.id < SURFACE else body.id}")
+
+
 def _bodies(nodes: SceneGraph) -> tuple[list[Body], int]:
     """Returns the usable nodes as upright bodies, and how many are not."""
     usable = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
-    usable &= (nodes.sizes >= 0).all(axis=1) & (nodes.ids >= FLOOR)
+    usable &= (nodes.sizes >= 0).all(axis=1) & ((nodes.ids >= FLOOR) | (nodes.ids < SURFACE))
     yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
     names = nodes.class_names
     bodies = [

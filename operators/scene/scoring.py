@@ -49,8 +49,8 @@ class NodeScore:
     """A map's nodes against the truth. Lists name classes and ids; overlaps are IoUs.
 
     `match` gives the true id of each node that is an object of its class; `doubles` are nodes beside such a one of the
-    same thing, `wrong` the other false ones with their greatest overlap and least distance (m), `ignored` those of
-    things that do not count.
+    same thing, `wrong` the other false ones with their greatest overlap and least distance (m), `ignored` the ids of
+    those of things that do not count.
     """
 
     must: int
@@ -60,7 +60,7 @@ class NodeScore:
     missed: list[tuple[str, int]]
     doubles: list[tuple[str, int]] = field(default_factory=list)
     wrong: list[tuple[str, int, float, float]] = field(default_factory=list)
-    ignored: int = 0
+    ignored: frozenset[int] = frozenset()
 
     @property
     def recall(self) -> float:
@@ -81,7 +81,7 @@ def score_nodes(nodes: SceneGraph, truth: SceneGraph, must: Collection[int], iou
     true, names = boxes_of(truth)
     match = match_nodes(nodes, truth, iou)
     taken = set(match.values())
-    doubles, wrong, ignored = [], [], 0
+    doubles, wrong, ignored = [], [], set()
     for i, box in mine.items():
         if i in match or i <= FLOOR:
             continue
@@ -89,7 +89,7 @@ def score_nodes(nodes: SceneGraph, truth: SceneGraph, must: Collection[int], iou
         best = max((upright_iou(true[t], box) for t in same), default=0.0)
         gap, nearest = min(((float(np.linalg.norm(true[t][0] - box[0])), t) for t in same), default=(9.0, 0))
         if gap < 0.5 * float(box[1].max()) + 0.2 and nearest > FLOOR and nearest not in must and nearest not in taken:
-            ignored += 1
+            ignored.add(i)
         elif gap < 0.5 and nearest in taken:
             doubles.append((labels[i], i))
         else:
@@ -102,7 +102,7 @@ def score_nodes(nodes: SceneGraph, truth: SceneGraph, must: Collection[int], iou
         missed=[(names[t], t) for t in sorted(must) if t not in taken],
         doubles=doubles,
         wrong=wrong,
-        ignored=ignored,
+        ignored=frozenset(ignored),
     )
 
 
@@ -140,14 +140,25 @@ class RelationScore:
     """Counts relations that are right, false and missed, by predicate, over several times.
 
     *mapped*: of pairs whose nodes are both matched; *all*: every relation of ours, and every true one between objects
-    that must be mapped. The floor counts as matched.
+    that must be mapped. Relations with a thing that does not count as a node do not count in *all* either, right or
+    wrong: no true relation with it could be missed, so a false one would be held against what cannot be found. The
+    floor counts as matched; other surfaces, which the truth does not have, are left out.
     """
 
     def __init__(self) -> None:
         self.counts: Counter[str] = Counter()
 
-    def add(self, graph: SceneGraph, truth: SceneGraph, match: dict[int, int], must: Iterable[int]) -> None:
-        """Takes the relations of one time; `match` is the true id of our nodes."""
+    def add(
+        self,
+        graph: SceneGraph,
+        truth: SceneGraph,
+        match: dict[int, int],
+        must: Iterable[int],
+        ignored: Collection[int] = frozenset(),
+    ) -> None:
+        """Takes the relations of one time; `match` is the true id of our nodes, `ignored` are those of things that do
+        not count though no true one matches them.
+        """
         of, wanted = match | {FLOOR: FLOOR}, {*must, FLOOR}
         known, ours = set(of.values()), _triples(graph)
         true = {_ordered(t) for t in _triples(truth)}
@@ -155,8 +166,11 @@ class RelationScore:
         for triple in mine | {t for t in true if t[0] in known and t[2] in known}:
             kind = "hit" if triple in mine and triple in true else "false" if triple in mine else "miss"
             self.counts[f"mapped {kind} {triple[1]}"] += 1
-        self.counts["all hit"] += len(mine & true)
-        self.counts["all false"] += len([t for t in ours if not (t[0] in of and t[2] in of)]) + len(mine - true)
+        counted = {t for t in mine if {t[0], t[2]} <= wanted}
+        strange = [t for t in ours if not (t[0] in of and t[2] in of)]
+        beside = {*ignored, *(node for node, thing in of.items() if thing not in wanted)}
+        self.counts["all hit"] += len(counted & true)
+        self.counts["all false"] += len([t for t in strange if not {t[0], t[2]} & beside]) + len(counted - true)
         self.counts["all miss"] += len([t for t in true - mine if {t[0], t[2]} <= wanted])
 
     def f1(self, scope: str, predicate: str = "") -> float:
@@ -170,7 +184,8 @@ class RelationScore:
 
 def _triples(graph: SceneGraph) -> set[Triple]:
     ids = graph.ids.tolist()
-    return {(ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES}
+    rows = ((ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES)
+    return {row for row in rows if min(row[0], row[2]) >= FLOOR}
 
 
 def _ordered(triple: Triple) -> Triple:

@@ -1,4 +1,4 @@
-"""The map of objects as an operator."""
+"""The map of objects and surfaces as an operator."""
 
 from __future__ import annotations
 
@@ -26,25 +26,28 @@ from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_po
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
-from operators.scene.class_sizes import CLASS_SIZES
+from operators.scene.class_sizes import CLASS_SIZES, TELLING
 from operators.scene.cuboid import ImageView
+from operators.scene.map_nodes import nodes_of, seen_surfaces
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings, Observation
 from operators.scene.object_map import ObjectMap
 from operators.scene.range_view import RangeView
+from operators.scene.surface_map import SurfaceMap
 from operators.status import counted_status
 
 _BORDER = 3.0  # pixels; boxes that end nearer to the image's edge may go on beyond it
 
 
 class SemanticMap(Operator):
-    """Accumulates objects in the world over time, each with class, oriented box, existence and when it was last seen.
+    """Accumulates objects and surfaces in the world, each with class, box, existence and when it was last seen.
 
     What a view shows is joined to the map by place, class and colour; two entries that come to share their place and
     are not seen beside each other are one. Each view also says where nothing is: an object whose place is empty goes,
     and one of its class, size and colour that appears elsewhere takes its id, moved and not doubled. Classes that move
     by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
-    out of sight.
+    out of sight. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand
+    on it.
 
     Method: after Hughes et al., "Hydra: a real-time spatial perception system", 2022, and Gu et al., "ConceptGraphs",
     2024, with free space from the views themselves.
@@ -64,8 +67,14 @@ class SemanticMap(Operator):
         doc="the image's boxes of the same objects, in their order; not used where of another stamp",
     )
     image_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of that image")
+    surfaces: Sampled[Boxes3D] = Sampled(
+        required=False, doc="the cloud's surfaces, as PlaneSegmenter finds them; not used where of another stamp"
+    )
     objects: Out[Boxes3D] = Out(doc="the objects that are surely there, in the map's frame; scores are probabilities")
-    nodes: Out[SceneGraph] = Out(doc="the same objects as nodes without relations, with when each was last seen")
+    nodes: Out[SceneGraph] = Out(
+        doc="the same objects as nodes without relations, with when each was last seen; and the surfaces, whose ids "
+        "are 0 (the floor) and from -11 down"
+    )
     status: Out[Diagnostics] = Out(doc="objects by what became of them; a warning for a view without points")
 
     voxel: float = Param(0.03, gt=0.005, le=0.2, doc="side of the voxels that objects consist of", unit="m")
@@ -80,6 +89,7 @@ class SemanticMap(Operator):
     movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
     mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
+    surface_views: int = Param(2, ge=1, doc="views of a surface from which it is given")
     max_range: float = Param(6.0, gt=0, doc="farther points are not used", unit="m")
 
     def setup(self) -> None:
@@ -88,6 +98,7 @@ class SemanticMap(Operator):
 
     def _begin(self) -> None:
         self._map: ObjectMap | None = None
+        self._surfaces = SurfaceMap(self.surface_views)
         self._classes: tuple[str, ...] = ()
         self._frame = ""
 
@@ -100,6 +111,7 @@ class SemanticMap(Operator):
         extrinsics: Transforms | None = None,
         images: Detections2D | None = None,
         image_info: CameraInfo | None = None,
+        surfaces: Boxes3D | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError where boxes, clusters and cloud do not belong together or the pose's frame changes."""
         if clusters.count != boxes.count or len(clusters.labels) != cloud.count:
@@ -118,25 +130,28 @@ class SemanticMap(Operator):
             self._observation(boxes, cloud, rows, usable, world, k, shown[k])
             for k, rows in enumerate(_rows_of(labels, boxes.count))
         ]
-        known.update(
-            cloud.stamp,
-            [each for each in seen if each is not None],
-            RangeView(points[:: 1 + len(points) // 20_000], T, 0.012),
-        )
-        objects = known.confirmed()
+        known.floor = self._surfaces.floor
+        view = RangeView(points[:: 1 + len(points) // 20_000], T, 0.012)
+        known.update(cloud.stamp, [each for each in seen if each is not None], view)
+        if surfaces is not None and surfaces.stamp == cloud.stamp:
+            parts = seen_surfaces(surfaces, cloud, T, self.max_range)
+            self._surfaces.update(cloud.stamp, parts, view, known.heading)
+        objects, planes = known.confirmed(), self._surfaces.confirmed
         counts = {
             "objects": len(objects),
             "tentative": len(known.objects) - len(objects),
             "seen now": sum(o.seen == cloud.stamp for o in objects),
             "moved": known.moved,
+            "surfaces": len(planes),
             "points": len(points),
         }
         self._counts["views"] += 1
         self._counts["views without points"] += not len(points)
         self._counts["objects"], self._counts["moved"] = len(objects), known.moved
+        self._counts["surfaces"] = len(planes)
         return {
             "objects": self._boxes(cloud.stamp, objects),
-            "nodes": self._nodes(cloud.stamp, objects),
+            "nodes": nodes_of(cloud.stamp, self._frame, self._classes, objects, planes),
             "status": _status(cloud.stamp, counts),
         }
 
@@ -158,6 +173,7 @@ class SemanticMap(Operator):
             "map": None if self._map is None else self._map.snapshot(),
             "classes": list(self._classes),
             "frame": self._frame,
+            "surfaces": self._surfaces.snapshot(),
             "counts": dict(self._counts),
         }
 
@@ -167,6 +183,8 @@ class SemanticMap(Operator):
         if state["map"] is not None:
             self._map = self._made()
             self._map.restore(state["map"])
+        if "surfaces" in state:  # not in those of earlier versions
+            self._surfaces.restore(state["surfaces"])
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
 
     def summary(self) -> Mapping[str, float | int]:
@@ -196,7 +214,8 @@ class SemanticMap(Operator):
         )
         movers = [k for k, name in enumerate(self._classes) if name in self.movers]
         usual = {k: CLASS_SIZES[name] for k, name in enumerate(self._classes) if name in CLASS_SIZES}
-        return ObjectMap(max(len(self._classes), 1), movers, settings, usual)
+        telling = {k: TELLING[name] for k, name in enumerate(self._classes) if name in TELLING}
+        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, telling)
 
     def _observation(
         self,
@@ -227,22 +246,6 @@ class SemanticMap(Operator):
             ids=np.array([o.id for o in objects], np.int64),
             velocities=np.array([o.velocity for o in objects]).reshape(-1, 3),
             point_counts=np.array([len(o.cells) for o in objects], np.int64),
-        )
-
-    def _nodes(self, stamp: int, objects: list[MapObject]) -> SceneGraph:
-        return SceneGraph(
-            stamp=stamp,
-            frame=self._frame,
-            class_names=self._classes,
-            ids=np.array([o.id for o in objects], np.int64),
-            class_ids=np.array([o.class_id for o in objects], np.int32),
-            positions=np.array([o.center for o in objects]).reshape(-1, 3),
-            sizes=np.array([o.size for o in objects]).reshape(-1, 3),
-            orientations=quaternion_from_yaw(np.array([o.yaw for o in objects])).reshape(-1, 4),
-            scores=np.array([o.score for o in objects], np.float32),
-            last_seen=np.array([o.seen for o in objects], np.int64),
-            subjects=np.zeros(0, np.int32),
-            objects=np.zeros(0, np.int32),
         )
 
 
@@ -279,5 +282,6 @@ def _images(
 
 def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
     text = f"{counts['objects']} objects, {counts['seen now']} in view, {counts['moved']} moved so far"
+    text += f", {counts['surfaces']} surfaces" if counts["surfaces"] else ""
     level = Level.OK if counts["points"] else Level.WARN
     return counted_status("semantic_map", stamp, text if counts["points"] else "the view has no points", level, counts)

@@ -10,23 +10,24 @@ from typing import Any
 import numpy as np
 
 from dataflow.messages import SceneGraph
-from operators.scene.relations import ROBOT, ROOM
+from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE
 
 _HEADER = {"project_name": "main", "version": {"major": 1, "minor": 1, "patch": 3}}
-_OBJECTS, _ROOMS = 2, 4
-_LAYERS = {"OBJECTS": 2, "AGENTS": 2, "PLACES": 3, "ROOMS": 4, "BUILDINGS": 5}
+_OBJECTS, _SURFACES, _ROOMS = 2, 3, 4
+_LAYERS = {"OBJECTS": 2, "AGENTS": 2, "SURFACES": 3, "ROOMS": 4, "BUILDINGS": 5}
 
 
 def as_spark_dsg(graph: SceneGraph) -> dict[str, Any]:
     """Returns a graph as the content of a file that `spark_dsg.DynamicSceneGraph.load` opens.
 
-    The room is in layer ROOMS and the parent of everything; objects, agents, floor and robot are in layer OBJECTS, with
-    upright boxes, labels by the graph's classes, and score and id as metadata. There is one edge for two nodes: its
-    weight is the greatest score of their relations, which its metadata name.
+    The room is in layer ROOMS and the parent of everything; floor, walls and table tops are in layer SURFACES; objects,
+    agents and robot in layer OBJECTS. All have upright boxes, labels by the graph's classes, and score and id as
+    metadata. There is one edge for two nodes: its weight is the greatest score of their relations, which its metadata
+    name.
     """
     names = graph.names()
     yaws = graph.orientations if graph.orientations is not None else np.tile([0.0, 0, 0, 1], (graph.count, 1))
-    symbols = [_symbol("R" if i == ROOM else "a" if i == ROBOT else "O", max(i, 0)) for i in graph.ids.tolist()]
+    symbols = [_symbol(i) for i in graph.ids.tolist()]
     nodes = [_node(graph, k, names[k], symbols[k], yaws[k]) for k in range(graph.count)]
     edges: dict[tuple[int, int], dict[str, float]] = {}
     scores = graph.relation_scores
@@ -48,7 +49,7 @@ def as_spark_dsg(graph: SceneGraph) -> dict[str, Any]:
         "metadata": {
             "frame": graph.frame,
             "stamp": graph.stamp,
-            "labelspaces": {f"_l{layer}p0": labels for layer in (_OBJECTS, _ROOMS)},
+            "labelspaces": {f"_l{layer}p0": labels for layer in (_OBJECTS, _SURFACES, _ROOMS)},
         },
         "nodes": nodes,
         "edges": [
@@ -67,9 +68,15 @@ def as_spark_dsg(graph: SceneGraph) -> dict[str, Any]:
     }
 
 
-def _symbol(category: str, index: int) -> int:
+def _is_surface(id: int) -> bool:
+    return id == FLOOR or id < SURFACE
+
+
+def _symbol(id: int) -> int:
     """Returns the id that Spark-DSG writes as a letter and a number."""
-    return (ord(category) << 56) | index
+    if _is_surface(id):
+        return (ord("s") << 56) | (0 if id == FLOOR else SURFACE - id)
+    return (ord("R" if id == ROOM else "a" if id == ROBOT else "O") << 56) | max(id, 0)
 
 
 def _node(graph: SceneGraph, k: int, name: str, symbol: int, orientation: Any) -> dict[str, Any]:
@@ -97,4 +104,5 @@ def _node(graph: SceneGraph, k: int, name: str, symbol: int, orientation: Any) -
         if room
         else {"mesh_connections": [], "registered": False, "world_R_object": turn}
     )
-    return {"id": symbol, "layer": _ROOMS if room else _OBJECTS, "partition": 0, "attributes": attributes | own}
+    layer = _ROOMS if room else _SURFACES if _is_surface(int(graph.ids[k])) else _OBJECTS
+    return {"id": symbol, "layer": layer, "partition": 0, "attributes": attributes | own}

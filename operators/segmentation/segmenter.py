@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.fit import Fit
+from operators.segmentation.scores import best_classes, probability
 from operators.weights import NetworkFileError, open_network, shipped
 
 VOID = 255
@@ -36,9 +38,12 @@ class Segmenter(Operator):
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""
         file = self.use_file(self.weights if self.weights is not None else shipped("segmenter.onnx"))
         self._network = open_network(file, "segmenter")
-        names = [output.name for output in self._network.session.get_outputs()]
-        if names != ["classes", "confidence"]:
-            raise NetworkFileError(f"{file} must have the outputs classes and confidence, has {', '.join(names)}")
+        outputs = self._network.session.get_outputs()
+        names = [output.name for output in outputs]
+        self._scored = names == ["scores"] and outputs[0].type == "tensor(uint8)"
+        if names != ["classes", "confidence"] and not self._scored:
+            told = ", ".join(f"{output.name} {output.type}" for output in outputs)
+            raise NetworkFileError(f"{file} must have the outputs classes and confidence, or 8-bit scores; has {told}")
         if len(self._network.classes) > VOID:
             raise NetworkFileError(f"{file} has {len(self._network.classes)} classes; at most {VOID} are possible")
 
@@ -46,10 +51,10 @@ class Segmenter(Operator):
         network = self._network
         pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
         fit = Fit.plan("letterbox", (image.width, image.height), network.size)
-        classes, confidence = network.run(fit.apply(pixels))
-        labels = np.asarray(_enlarged(classes[0].astype(np.uint8), fit, cv2.INTER_NEAREST), np.uint8)
         wanted = self.with_confidence or self.confidence_threshold > 0
-        sure = np.asarray(_enlarged(confidence[0], fit, cv2.INTER_LINEAR), np.float32) if wanted else None
+        classes, confidence = self._answered(network.run(fit.apply(pixels)), wanted)
+        labels = np.asarray(_enlarged(classes, fit, cv2.INTER_NEAREST), np.uint8)
+        sure = None if confidence is None else np.asarray(_enlarged(confidence, fit, cv2.INTER_LINEAR), np.float32)
         if sure is not None and self.confidence_threshold > 0:
             labels = np.where(sure < self.confidence_threshold, np.uint8(VOID), labels)
         return SegmentationMap(
@@ -60,6 +65,16 @@ class Segmenter(Operator):
             classes=labels,
             confidence=np.clip(sure, 0, 1) if sure is not None and self.with_confidence else None,
         )
+
+    def _answered(
+        self, found: Sequence[NDArray[Any]], wanted: bool
+    ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
+        """Classes (H, W) and, where wanted, their probability (H, W), of what the network gave."""
+        if self._scored:
+            step = float(self._network.facts["score_step"])
+            return best_classes(found[0][0]), probability(found[0][0], step) if wanted else None
+        classes, confidence = found
+        return classes[0].astype(np.uint8), confidence[0] if wanted else None
 
 
 def _enlarged(values: NDArray[Any], fit: Fit, interpolation: int) -> NDArray[Any]:

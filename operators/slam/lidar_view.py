@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
-from operators.cloud.registration import FEWEST, Prepared, Registered, Settings, apart, explained, failure, refine
+from operators.cloud.registration import FEWEST, Prepared, Registered, Settings, best_of, explained, failure, refine
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.lidar_fit import Fit, Prior, fit
@@ -28,7 +28,6 @@ _ABOUT, _MOST = 2.5, 6  # metres around a view, and views there, that another is
 _SEARCH = 3.0  # metres to each side of a view that looks alike
 _STARTS = 5  # poses found there that are refined
 _WORTH = 0.7  # share of the best pose's agreement from which another is worth a look
-_RIVAL = 0.03  # a second pose whose score is that near to the best one's makes a place ambiguous
 _OFF = (0.15, 0.05)  # metres and radians by which the planes may correct the registration
 _GUESS = np.diag([0.3**-2.0] * 3 + [0.1**-2.0] * 3)  # information of where a scan is expected, which hardly counts
 
@@ -113,14 +112,7 @@ class LidarEyes:
                 break
         if not starts:
             return failure("nothing of the scan lies on surfaces that were seen there")
-        tried = [refine(other.prepared, one.prepared, T, self.judge) for T in starts]
-        tried.sort(key=lambda found: (bool(found.reason), -found.score))
-        best = tried[0]
-        for rival in tried[1:]:
-            near = rival.score > best.score - _RIVAL and rival.overlap > 0.7 * best.overlap
-            if not best.reason and near and apart(best.T, rival.T, self.judge.voxel):
-                return best.refused("ambiguous: another pose explains the scans as well")
-        return best
+        return best_of([refine(other.prepared, one.prepared, T, self.judge) for T in starts], self.judge.voxel)
 
     def _fitted(self, view: LidarView, planes: PlaneMap, guess: Matrix) -> Fit:
         points = view.points.astype(np.float64)

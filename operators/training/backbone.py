@@ -173,7 +173,7 @@ def load_backbone(network: Backbone, file: Path) -> None:
     if not isinstance(found, Mapping):
         raise TrainingFileError(f"{file} holds no state dict; give torchvision's MobileNetV2 weights or a checkpoint")
     wanted = network.state_dict()
-    given = _current_names({name.removeprefix("backbone."): value for name, value in found.items()})
+    given = current_names({name.removeprefix("backbone."): value for name, value in found.items()})
     lost = [n for n, v in wanted.items() if n not in given or tuple(given[n].shape) != tuple(v.shape)]
     lost = [n for n in lost if not n.endswith("num_batches_tracked")]
     if lost:
@@ -201,7 +201,7 @@ def start_from(network: nn.Module, file: Path) -> int:
     return len(fits)
 
 
-def _current_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def current_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The weights by torchvision's names of today; its first releases numbered a block's layers without nesting."""
     if "features.1.conv.0.weight" not in state:
         return dict(state)

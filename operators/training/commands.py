@@ -40,6 +40,7 @@ from operators.training.options import (
 )
 from operators.training.people_commands import train_activity
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data
+from operators.training.torchvision_command import train_torchvision
 
 __all__ = ["evaluate", "train"]
 
@@ -47,6 +48,7 @@ train = typer.Typer(
     name="train", help="Train the project's networks on your own data.", no_args_is_help=True, rich_markup_mode="rich"
 )
 train.command("activity")(train_activity)
+train.command("torchvision")(train_torchvision)
 
 
 @train.command("detector")

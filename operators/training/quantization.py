@@ -24,6 +24,8 @@ from operators.detection.custom.dataset import read_detection_data
 from operators.detection.custom.training import KIND as DETECTOR
 from operators.segmentation.assessment import assess as assess_segmenter
 from operators.segmentation.dataset import read_segmentation_data
+from operators.segmentation.scores import MOST_CLASSES
+from operators.segmentation.training import KIND as SEGMENTER
 from operators.training.augmentation import fitted, tensor_of, warp
 from operators.training.files import whole
 from operators.weights.network_file import KEY, NetworkFileError, read_facts, training_seed
@@ -37,9 +39,9 @@ Pixels = NDArray[np.uint8]
 def quantize_network(file: Path, images: Iterable[Pixels], out: Path) -> None:
     """Writes `file` in 8 bits to `out`, with ranges measured on `images` ((H, W, 3) RGB of any size).
 
-    Its metadata gain `arithmetic` and `calibration_images`. The file appears whole or not at all. The same images give
-    the same bytes. Raises FileNotFoundError, or NetworkFileError where the file is not a network of ours or is in 8
-    bits already, and ValueError without an image.
+    Its metadata gain `arithmetic` and `calibration_images`; a segmenter ends with its scores, and gains `score_step`.
+    The file appears whole or not at all. The same images give the same bytes. Raises FileNotFoundError, or
+    NetworkFileError where the file is not a network of ours or is in 8 bits already, and ValueError without an image.
     """
     import onnx
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
@@ -66,6 +68,8 @@ def quantize_network(file: Path, images: Iterable[Pixels], out: Path) -> None:
                 calibrate_method=CalibrationMethod.MinMax,
             )
         model = onnx.load(quantized)
+    if facts["kind"] == SEGMENTER and len(facts["classes"]) <= MOST_CLASSES:
+        model, facts["score_step"] = of_scores(model)
     model.producer_name = "dataflow"
     facts |= {"arithmetic": INT8, "calibration_images": reader.count}
     onnx.helper.set_model_props(model, {KEY: json.dumps(facts, sort_keys=True)})
@@ -124,6 +128,32 @@ def _fold(file: Path, out: Path) -> None:
     options.optimized_model_filepath = str(out)
     options.log_severity_level = 3
     onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
+
+
+def of_scores(model: Any) -> tuple[Any, float]:
+    """Returns a segmenter's model in 8 bits that ends with its scores, and what a step of them is.
+
+    What came after enlarges the scores of every class in float, and takes as long as all the rest: `best_classes` does
+    without.
+    """
+    import onnx
+    from onnx.utils import Extractor
+
+    made = {name: node for node in model.graph.node for name in node.output}
+    node = next(each for each in model.graph.node if each.op_type == "ArgMax")
+    while node.op_type != "DequantizeLinear":
+        node = made[node.input[0]]
+    scores, step = node.input[0], node.input[1]
+    last = made[scores]
+    constants = {each.name: onnx.numpy_helper.to_array(each) for each in model.graph.initializer}
+    shaped = onnx.shape_inference.infer_shapes(model)
+    found = next(each for each in shaped.graph.value_info if each.name == last.input[0])
+    shape = [each.dim_value for each in found.type.tensor_type.shape.dim]
+    last.output[0] = "scores"
+    del model.graph.output[:]
+    model.graph.output.append(onnx.helper.make_tensor_value_info("scores", onnx.TensorProto.UINT8, shape))
+    cut = Extractor(model).extract_model([model.graph.input[0].name], ["scores"])
+    return cut, float(constants[step])
 
 
 def _answering(model: Any) -> list[str]:

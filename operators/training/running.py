@@ -68,8 +68,8 @@ def tell_data(
     err_console.print(told, highlight=False, markup=False, soft_wrap=True)
 
 
-def report(outcome: Outcome, operator: str, json: bool) -> None:
-    """Prints the score, the file and the operator that takes it; or one JSON object."""
+def report(outcome: Outcome, operator: str, json: bool, params: str = "weights: {file}") -> None:
+    """Prints the score, the file and the operator that takes it, with these parameters; or one JSON object."""
     if json:
         typer.echo(
             jsonlib.dumps(
@@ -88,7 +88,8 @@ def report(outcome: Outcome, operator: str, json: bool) -> None:
     scores = score_words(outcome.best, [name for name in outcome.best if name != "score"])
     file = escape(str(outcome.file))
     out_console.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
-    out_console.print(f"use it: `use: {operator}` with `params: {{weights: {file}}}`", highlight=False, soft_wrap=True)
+    given = params.format(file=file)
+    out_console.print(f"use it: `use: {operator}` with `params: {{{given}}}`", highlight=False, soft_wrap=True)
 
 
 def input_size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
@@ -108,10 +109,10 @@ def input_size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:
     return width, height
 
 
-def keep_earlier(out: Path, resume: bool, overwrite: bool) -> None:
+def keep_earlier(out: Path, resume: bool, overwrite: bool, suffix: str = ".onnx") -> None:
     """Keeps an earlier training from being lost."""
-    if out.suffix != ".onnx":
-        raise ValueError(f"--out {str(out)!r} should end in .onnx")
+    if out.suffix != suffix:
+        raise ValueError(f"--out {str(out)!r} should end in {suffix}")
     checkpoint = out.with_suffix(".pt")
     there = [str(file) for file in (out, checkpoint) if file.exists()]
     if there and not (resume or overwrite):

@@ -65,3 +65,26 @@ def test_many_ticks_that_are_dropped_do_not_keep_the_process_from_its_other_work
 
     assert sum(runner.drops.values()) > 49_000
     assert most <= MOST_DROPPED
+
+
+def test_a_timer_that_cannot_keep_up_does_not_keep_the_process_from_its_other_work() -> None:
+    asked = 0
+
+    def clock() -> int:  # a tick and a half go by whenever somebody looks
+        nonlocal asked
+        asked += 1
+        assert asked < 100_000, "one step went on without end"
+        return BOOT + asked * 20 * MS
+
+    runner = LiveRunner(
+        node(Timer, {"x": ["t/s/x"]}, Live("newest", 1, {"x": 0})), Collector(), static=frozenset(), event_clock=clock
+    )
+    runner.setup()
+    runner.push("t/s/x", entry("t/s/x", BOOT, 0))
+    for _ in range(5):
+        assert runner.step()
+
+    runner.end("t/s/x", BOOT, "")
+    run_all(runner)
+
+    assert runner.ended

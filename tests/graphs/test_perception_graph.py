@@ -44,6 +44,13 @@ def test_the_recording_becomes_a_scene_graph_that_verifies_and_answers(tmp_path:
     assert "on floor" in asked.output
 
 
+@pytest.mark.parametrize(("adapt", "source"), [(False, "image_watch/checked"), (True, "adapter/adapted")])
+def test_the_networks_see_adapted_images_where_that_is_asked_for(adapt: bool, source: str) -> None:
+    graph = load_graph(REPOSITORY / "graphs" / "perception.yaml", settings=[f"perception.adapt={adapt}"])
+    for network in ("detector", "segmenter"):
+        assert graph.nodes[f"perception/{network}"].inputs["image"] == (f"robot1/perception/{source}",)
+
+
 @pytest.mark.parametrize(
     ("name", "folder", "cut", "left_out", "must"),
     [

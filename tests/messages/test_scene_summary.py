@@ -45,6 +45,15 @@ def test_a_thing_is_carried_by_the_likeliest_alone() -> None:
     assert told.carried(2) == (0,)
 
 
+def test_a_thing_is_told_in_place_of_its_top() -> None:
+    made = graph("mug table tabletop", (0, "on", 1, 0.7), (0, "on", 2, 0.9), (2, "part_of", 1, 0.9))
+    told = summarize(made)
+    assert {child: r.object for child, r in told.carriers.items()} == {0: 1, 2: 1}
+    assert [(row.name, row.text) for row in carriers_in_words(made, told)] == [("table 2", "on it mug 1")]
+    alone = graph("mug tabletop", (0, "on", 1, 0.9))
+    assert [row.text for row in carriers_in_words(alone, summarize(alone))] == ["on it mug 1"]
+
+
 @given(
     st.lists(st.tuples(st.integers(0, 5), st.sampled_from(CARRYING), st.integers(0, 5), st.floats(0, 1)), max_size=30)
 )

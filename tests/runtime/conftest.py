@@ -6,8 +6,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import psutil
 import pytest
+from orphans import end_orphans
 
 from dataflow.graph import Graph, load_graph
 
@@ -19,10 +19,7 @@ sys.path.append(str(HERE))
 def _no_orphans() -> Iterator[None]:
     """Fails a test after which a child process is left."""
     yield
-    left = [p for p in psutil.Process().children(recursive=True) if "-m dataflow." in " ".join(p.cmdline())]
-    for process in left:
-        process.kill()
-    assert not left
+    assert not end_orphans()
 
 
 @pytest.fixture

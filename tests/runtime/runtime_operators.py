@@ -142,14 +142,17 @@ class Merge(Operator, merge=True):
 
 
 class Sum(Operator):
-    """A sink that reports what it saw."""
+    """A sink that reports what it saw; the first message makes the file `seen`."""
 
     x: In[FeatureVector]
+    seen: str | None = Param(None, doc="none: no file")
 
     def setup(self) -> None:
         self.count, self.total = 0, 0.0
 
     def process(self, x: FeatureVector) -> None:
+        if not self.count and self.seen is not None:
+            Path(self.seen).touch()
         self.count += 1
         self.total += number(x)
 
@@ -247,6 +250,16 @@ class Tuned(Operator):
 
     def restore(self, state: Mapping[str, float]) -> None:
         self.total = state["total"]
+
+
+class TunedByConstant(Tuned):
+    """Weighs by a static message, too."""
+
+    constant: Sampled[FeatureVector]
+
+    def process(self, x: FeatureVector, constant: FeatureVector) -> FeatureVector:  # type: ignore[override]
+        made = super().process(x)
+        return value(made.stamp, number(made) * number(constant))
 
 
 class TunedAtStart(Tuned):

@@ -207,15 +207,15 @@ class Running:
         self.family: list[psutil.Process] = []
 
     def until_running(self, processes: int) -> None:
-        """Waits until all processes exist and sources are released."""
+        """Waits until all processes exist and the sink has had its first message."""
         deadline = time.monotonic() + 30
         me = psutil.Process(self.process.pid)
         while time.monotonic() < deadline:
             self.family = me.children(recursive=True)
-            if len(self.family) >= processes + 1 and any((self.folder / "dataflow").glob("*.json")):
+            if len(self.family) >= processes + 1 and (self.folder / "seen").exists():
                 return
             time.sleep(0.05)
-        raise AssertionError("the graph did not start")
+        raise AssertionError(f"no message within 30 s; processes: {self.family}")
 
     def end(self, timeout: float = 30) -> tuple[int, str, str]:
         out, err = self.process.communicate(timeout=timeout)
@@ -232,7 +232,7 @@ namespace: test
 operators:
   left: {use: runtime_operators:Counter, params: {count: 1000000}}
   smooth: {use: runtime_operators:Smooth, inputs: {x: left/fast}, params: {sleep: 0.002}}
-  sum: {use: runtime_operators:Sum, inputs: {x: smooth/mean}}
+  sum: {use: runtime_operators:Sum, inputs: {x: smooth/mean}, params: {seen: seen}}
 """
 
 
@@ -259,7 +259,6 @@ def test_ctrl_c_drains_and_completes_the_recording(long_run: Running, tmp_path: 
 
 
 def test_killing_the_supervisor_leaves_no_process_and_a_readable_recording(long_run: Running, tmp_path: Path) -> None:
-    time.sleep(0.5)
     long_run.process.kill()
     long_run.end()
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from dataflow.chaos.plan import plan_of
 from dataflow.graph import load_graph
-from dataflow.recording import Recording
-from dataflow.records.reading import recorded_firings
+from dataflow.recording import Recording, reader
+from dataflow.records.reading import FiringLog, recorded_firings
+from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError
+from dataflow.reexecution.warm_start import held_before
 from dataflow.supervision.run import replay, run
 from dataflow.verification.verify import verify
 
@@ -20,7 +23,8 @@ HERE = Path(__file__).resolve().parent
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("middle") / "run.mcap"
-    run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_process", record=path)
+    report = run(load_graph(HERE / "chaos.yaml", settings=["count=120"]), placement="one_process", record=path)
+    assert not report.interrupted  # a signal that ends tests is taken by the run, whose recording is then a part
     return path
 
 
@@ -118,3 +122,64 @@ def test_a_replay_that_begins_where_a_state_was_recorded_gives_nothing_twice(rec
 
     whole, part = messages(recorded), messages(tmp_path / "again.mcap")
     assert part["test/tuned/y"].items() <= whole["test/tuned/y"].items()
+
+
+def test_a_re_execution_from_the_middle_reads_only_what_it_needs(tmp_path: Path) -> None:
+    text = (
+        (HERE / "chaos.yaml")
+        .read_text()
+        .replace(
+            "use: runtime_operators:Tuned, inputs: {x: merge/seen}",
+            "use: runtime_operators:TunedByConstant, inputs: {x: merge/seen, constant: left/constant}",
+        )
+    )
+    file, path = tmp_path / "chaos.yaml", tmp_path / "run.mcap"
+    file.write_text(text)
+    graph = load_graph(file, settings=["count=120"])
+    run(graph, placement="one_process", record=path)
+    read: dict[str, list[int]] = {}
+
+    with Recording(path) as recording:
+        begin = sorted(item.message.stamp for item in recording.messages(["test/left/fast"]))[90]
+        feeding = plan_feeding(recording, graph, ["tuned"]).reading(["test/right/fast"])
+        work = Recomputation(
+            recording,
+            graph,
+            feeding,
+            FiringLog.read(recording),
+            made=lambda stream, entry: None,
+            read=lambda stream, entry: read.setdefault(stream, []).append(entry.stamp),
+            begin=begin,
+        )
+        state = max(r.stamp for r in recorded_firings(recording, "tuned") if r.kind == "snapshot" and r.stamp <= begin)
+        result = work.run()["tuned"]
+
+    assert result.whole
+    assert result.first is None
+    assert len(read["test/left/constant"]) == 1
+    assert state < min(read["test/merge/seen"]) <= begin
+    assert min(read["test/right/fast"]) >= begin
+
+
+def test_what_an_operator_held_is_found_without_reading_the_whole_recording(
+    recorded: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=120"])
+    static = frozenset(name for name, stream in graph.streams.items() if stream.static)
+    with Recording(recorded) as recording:
+        messages = list(recording.messages(["test/left/fast"]))
+    decoded: list[str] = []
+    decode = reader.decoded
+
+    def counted(path: Path, stream: str, *rest: Any) -> Any:
+        decoded.append(stream)
+        return decode(path, stream, *rest)
+
+    monkeypatch.setattr(reader, "decoded", counted)
+
+    held, began = held_before(recorded, graph.nodes["mix"], messages[90].message.stamp, static)
+
+    assert began
+    assert held
+    assert all(entry.stamp < messages[90].message.stamp for entry in held)
+    assert len(decoded) <= len(held) + len(graph.nodes["mix"].inputs)

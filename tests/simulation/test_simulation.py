@@ -17,7 +17,7 @@ from simulation import bindings
 from simulation.check import check
 from simulation.mutants import MUTANTS, Mutant
 from simulation.run import Happening, Machine, simulate
-from simulation.scenario import Scenario, scenario_of
+from simulation.scenario import TICKING, Scenario, scenario_of
 from simulation.shrink import shrink
 from simulation.world import Process, Violation, World
 
@@ -186,6 +186,16 @@ FOUND_BY = {
             Happening(0.01, "freeze", "right", {"span": 1e6}),
             Happening(0.1, "freeze", "smooth", {"span": 0.05}),
         ),
+    ),
+    "gap": replace(
+        PLAIN,
+        graph=TICKING,
+        live=True,
+        policy="queue: newest, size: 1",
+        period=20_000_000,
+        window=2,
+        machine=Machine(1, ring_bytes=4096),
+        happenings=(Happening(0.01, "freeze", "sum", {"span": 1.0}), Happening(0.02, "freeze", "left", {"span": 0.05})),
     ),
 }
 """Scenarios that find a planted fault; how many seeds each needs: benchmarks/simulation.md."""

@@ -37,8 +37,9 @@ def depth_image(stamp: int, side: int = 256) -> DepthImage:
 
 
 def shared_files() -> set[str]:
+    """Files in shared memory that could hold a block; other programs' semaphores come and go meanwhile."""
     folder = Path("/dev/shm")
-    return set(os.listdir(folder)) if folder.is_dir() else set()
+    return {f.name for f in folder.iterdir() if not f.name.startswith("sem.")} if folder.is_dir() else set()
 
 
 class Shared:

@@ -8,8 +8,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
+from orphans import end_orphans
 
 HERE = Path(__file__).resolve().parent
 KEPT = HERE.parent / "recordings_of"
@@ -20,10 +20,7 @@ sys.path += [str(HERE), str(KEPT), str(HERE.parent / "runtime")]
 def _no_orphans() -> Iterator[None]:
     """Fails a test after which a child process is left."""
     yield
-    left = [p for p in psutil.Process().children(recursive=True) if "-m dataflow." in " ".join(p.cmdline())]
-    for process in left:
-        process.kill()
-    assert not left
+    assert not end_orphans()
 
 
 @pytest.fixture

@@ -72,6 +72,15 @@ def test_rooms_and_floors_are_outlines_on_the_ground_and_hide_nothing(tmp_path: 
     assert np.allclose(np.array(boxes.values), [(0.5, 0.5, 0.4), (0.25, 0.25, 0.5)]), "table and chair alone"
 
 
+def test_walls_are_upright_outlines(tmp_path: Path) -> None:
+    made = scene().replace(class_names=("wall", *CLASSES[1:]))
+    sizes, turned = made.sizes.copy(), np.tile([0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)], (made.count, 1))
+    sizes[0] = (4, 0.02, 2)
+    found = draw(tmp_path, ("s/graph", made.replace(sizes=sizes, orientations=turned)))
+    (outlines,) = at(found, "/s/graph/space/places", "LineStrips3D:strips")
+    assert np.allclose(np.ptp(np.array(outlines.values[0]), axis=0), [0, 4, 2], atol=1e-6)
+
+
 def test_things_that_are_carried_are_drawn_without_labels(tmp_path: Path) -> None:
     found = draw(tmp_path, ("s/graph", scene()))
     (parts,) = at(found, "/s/graph/space/parts", "Boxes3D:show_labels")
@@ -120,14 +129,14 @@ def test_the_list_says_who_does_what_and_what_carries_what(tmp_path: Path) -> No
     assert "near" not in text.values[0]
 
 
-def test_an_empty_list_has_no_bare_headings(tmp_path: Path) -> None:
+def test_a_list_without_rows_has_no_heading(tmp_path: Path) -> None:
     empty = SceneGraph(
-        stamp=0, frame="map", class_names=CLASSES, predicates=(), ids=[], class_ids=np.zeros(0, np.int32),
-        positions=np.zeros((0, 3)), sizes=np.zeros((0, 3)), subjects=np.zeros(0, np.int32),
-        objects=np.zeros(0, np.int32),
+        stamp=0, frame="map", class_names=CLASSES, predicates=(), ids=np.zeros(0, np.int64),
+        class_ids=np.zeros(0, np.int32), positions=np.zeros((0, 3)), sizes=np.zeros((0, 3)),
+        subjects=np.zeros(0, np.int32), objects=np.zeros(0, np.int32),
     )  # fmt: skip
     (text,) = at(draw(tmp_path, ("s/graph", empty)), "/s/graph/text", "TextDocument:text")
-    assert text.values == ["Nothing is mapped yet."]
+    assert text.values == ["0 nodes, 0 relations"]
 
 
 @given(st.integers(0, 12), st.integers(0, 40), st.integers(0, 15))

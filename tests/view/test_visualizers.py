@@ -276,6 +276,16 @@ def test_ended_tracks_disappear_and_paths_are_bounded_in_time(tmp_path: Path) ->
     assert at(found, "/t/t/space", "Points3D:positions")[9].values == []
 
 
+def test_a_track_that_was_not_matched_for_a_while_leaves_the_image(tmp_path: Path) -> None:
+    message = Tracks(
+        stamp=STAMP, frame="camera", width=64, height=48, ids=[7, 8], states=[2, 2], scores=[1.0, 1.0],
+        class_ids=[0, 0], ages=[1.0, 1.0], unseen=[0.1, 0.8], boxes=[[1, 2, 11, 22], [30, 2, 41, 22]],
+    )  # fmt: skip
+    found = draw(tmp_path, ("t/t", message))
+    (boxes,) = at(found, "/t/t/overlay", "Boxes2D:half_sizes")
+    assert np.allclose(np.array(boxes.values), [(5.0, 10.0)])
+
+
 def test_segmentation_names_its_classes_and_hides_void(tmp_path: Path) -> None:
     message = SegmentationMap(
         stamp=STAMP, frame="c", class_names=("road", "tree"), void=255, classes=np.array([[0, 1, 255]], np.uint8)

@@ -22,6 +22,7 @@ _BACKDROP_ALPHA = 60  # of 255: the image stays readable
 _RAY = 10.0  # metres: how far a bearing without a range is drawn
 _PATH_VERTICES = 200
 _STILL = 0.05  # m/s
+_UNSEEN = 0.3  # seconds: a track that was not matched for longer leaves the image; where it is has become a guess
 
 
 @visualizer(Detections2D, "overlay")
@@ -77,14 +78,17 @@ def boxes_3d(canvas: Canvas, message: Boxes3D) -> None:
 
 @visualizer(Tracks, "overlay", "space")
 def tracks(canvas: Canvas, message: Tracks) -> None:
-    """Boxes over the image and in space, coloured by identity and darker while coasting, with their recent paths."""
+    """Boxes over the image and in space, coloured by identity and darker while coasting, with their recent paths.
+
+    Boxes over the image go when their track has not been matched for a while.
+    """
     alive = np.flatnonzero(message.states != TrackState.ENDED)
     names = message.labels()
     labels = [_label(names[i], int(message.ids[i]), None) for i in range(message.count)]
     paint = colors.of_identities(message.ids.tolist())
     paint[message.states == TrackState.COASTING] //= 2
     if message.boxes is not None:
-        shown = alive[np.isin(alive, finite_rows(message.boxes))]
+        shown = alive[np.isin(alive, finite_rows(message.boxes)) & (message.unseen[alive] <= _UNSEEN)]
         _boxes_2d(canvas, message.boxes[shown], paint[shown], [labels[i] for i in shown])
     if message.positions is None:
         return

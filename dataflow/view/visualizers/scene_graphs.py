@@ -14,6 +14,7 @@ from dataflow.messages.scene_summary import (
     AGENTS,
     PEOPLE,
     PLACES,
+    Row,
     SceneSummary,
     Told,
     agents_in_words,
@@ -36,6 +37,7 @@ _RELATION = (235, 235, 235)
 _STILL = 0.02  # metres: a box that moved by less is not drawn again
 _GOALS = 3  # of an agent, the likeliest
 _LIKELY = 0.1  # goals that are less probable are not drawn
+_SHEET = 0.05  # metres: half the thickness up to which a place is a wall
 _THIN = 0.05  # metres: least radius of a capsule
 
 
@@ -82,25 +84,30 @@ def _operator(stream: str) -> str:
 
 def _words(canvas: Canvas, message: SceneGraph, told: SceneSummary, activities: Activity | None) -> None:
     """The graph as a list in Markdown, sent where it differs from the last."""
-    agents = agents_in_words(message, told, activities)
-    rows = carriers_in_words(message, told)
     tables = (
-        "\n".join((f"| {heading} |\n|---|---|", *(f"| **{row.name}** | {row.text} |" for row in found)))
-        for heading, found in (("who | does", agents), ("what | carries", rows))
-        if found
+        _table("who", "does", agents_in_words(message, told, activities)),
+        _table("what", "carries", carriers_in_words(message, told)),
     )
-    seen = f"{message.count} nodes, {len(message.subjects)} relations" if message.count else "Nothing is mapped yet."
-    text = "\n\n".join((*tables, seen))
+    counted = f"{message.count} nodes, {len(message.subjects)} relations"
+    text = "\n\n".join((*filter(None, tables), counted))
     if canvas.scene.changed(canvas.entity, "words", text):
         canvas.log("text", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
+def _table(first: str, second: str, rows: Sequence[Row]) -> str:
+    """A table in Markdown; nothing without rows."""
+    lines = (f"| **{row.name}** | {row.text} |" for row in rows)
+    return "\n".join((f"| {first} | {second} |\n|---|---|", *lines)) if rows else ""
+
+
 def _places(canvas: Canvas, message: SceneGraph, places: Sequence[int]) -> None:
-    """The outline of each room or floor, on its ground."""
+    """The outline of each place: of a room or floor on its ground, of a wall upright."""
     outlines = []
     for i in places:
         half = message.sizes[i] / 2
-        corners = np.array([(x, y, -1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))]) * half
+        around = np.array([(x, y, -1.0) for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1), (-1, -1))])
+        thin = int(np.argmin(half))
+        corners = (around if thin == 2 or half[thin] > _SHEET else np.roll(around, thin + 1, axis=1)) * half
         outlines.append(corners @ _axes_of(message, i).T + message.positions[i])
     if not _moved(canvas, "places", outlines):
         return

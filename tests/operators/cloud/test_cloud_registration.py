@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from dataflow.messages import Diagnostics, Message, PointCloud, Pose
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import play
 from operators.cloud import CloudRegistration
-from operators.cloud.registration import Prepared, Registered, Settings, refine
+from operators.cloud.registration import Prepared, Registered, Settings, best_of, explained, failure, refine
 from operators.geometry import se3
 
 BOXES = np.array(  # centre and half extents of what stands in a room of 6 x 4 x 2.4 m
@@ -104,6 +106,45 @@ def test_a_long_room_is_told_about_its_length() -> None:
     niches = np.array([[x, y, 1.0, 0.3, 0.2, 1.0] for x, y in ((-6, 0.8), (-3, -0.8), (1, 0.8), (4, -0.8), (7, 0.8))])
     A, B = at(0.0, 0.0, 0.0), at(0.8, 0.1, 0.1)
     assert explained_at_the_truth(scan(A, 1, niches, long), scan(B, 2, niches, long), A, B).reason == ""
+
+
+def tried(x: float, agreement: float, violation: float = 0.0, overlap: float = 0.8, settled: bool = True) -> Registered:
+    """A motion by x metres, with what speaks for it."""
+    T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
+    return replace(
+        failure(""), T=T, agreement=agreement, violation=violation, overlap=overlap, settled=settled, fitness=0.9
+    )
+
+
+@pytest.mark.parametrize(
+    ("other", "ambiguous"),
+    [
+        (tried(3.0, 0.79), True),
+        (tried(0.1, 0.79), False),  # the same motion
+        (tried(3.0, 0.70), False),  # explains less
+        (tried(3.0, 0.83, violation=0.03), False),  # hangs in free space
+        (tried(3.0, 0.83, overlap=0.5), False),  # explains less of the clouds
+        (tried(3.0, 0.79, overlap=0.6, settled=False), False),  # slides, and shares less
+        (tried(3.0, 0.79, settled=False), True),
+    ],
+)
+def test_a_motion_is_believed_where_no_other_one_explains_as_much(other: Registered, ambiguous: bool) -> None:
+    best = tried(0.0, 0.8)
+    found = best_of([replace(other, reason="stands no check"), best], 0.1)
+    np.testing.assert_array_equal(found.T, best.T)
+    assert found.reason.startswith("ambiguous" if ambiguous else "") is True
+    assert bool(found.reason) is ambiguous
+
+
+def test_what_lies_on_a_surface_does_not_hang_in_free_space() -> None:
+    """Coarse voxels of a wide floor, seen at a low angle, lie before what is seen in directions beside theirs."""
+    boxes = np.array([[x, y, 0.6, 0.4, 0.4, 0.6] for x in (-6, -2, 3, 7) for y in (-3, 3.5)])
+    A, B = at(0.2, 0.1, 0.0), at(2.5, 0.1, 0.3)
+    one, other = (
+        Prepared.of_cloud(scan(T, k, boxes, np.array([15.0, 15.0, 1.2])).astype(np.float32), 0.5)
+        for k, T in ((1, A), (2, B))
+    )
+    assert explained(other, one, invert(A) @ B, Settings(0.5, 1, 0.5, 0.85, 0.04)).violation == 0
 
 
 def test_scans_of_different_rooms_fail() -> None:

@@ -168,3 +168,16 @@ def test_two_plays_are_equal_and_a_restored_operator_goes_on_alike() -> None:
     later = cloud(room(floor=False), T, 3)
     one, other = (operator.process(later, pose(T, 3))["surfaces"] for operator in (first, restored))
     assert sorted(one.labels()) == sorted(other.labels()) == ["table", "wall", "wall"]
+
+
+def test_clouds_within_the_period_are_left_out_and_a_restored_operator_knows_the_last() -> None:
+    T, second = optical(), 1_000_000_000
+    stamps = [1, second // 2, second + 1, second + 2]
+    operator, restored = PlaneSegmenter(period=1.0), PlaneSegmenter(period=1.0)
+    for each in (operator, restored):
+        each.setup()
+    given = [(cloud(room(seed=k), T, stamp), pose(T, stamp)) for k, stamp in enumerate(stamps)]
+    assert [bool(operator.process(*each)) for each in given[:3]] == [True, False, True]
+    restored.restore(operator.snapshot())
+    assert not operator.process(*given[3])
+    assert not restored.process(*given[3])

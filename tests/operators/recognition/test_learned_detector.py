@@ -21,6 +21,7 @@ from operators.training.learning import learn as command
 pytest.importorskip("onnx", reason="learning needs the extra [train]")
 
 WIDTH, HEIGHT = 320, 240
+NO_OUTLINE = np.zeros((0, 2), np.float32), np.zeros((0, 4), np.float32)
 
 
 def scenery(seed: int, *, sign: bool) -> tuple[np.ndarray, tuple[int, int, int, int]]:
@@ -133,7 +134,7 @@ def test_what_varies_everywhere_does_not_tell_an_object() -> None:
     def vectors(count: int, second: float) -> np.ndarray:
         return np.stack([rng.normal(0, 1, count), rng.normal(second, 0.1, count)], axis=1).astype(np.float32)
 
-    shown = [Shown(vectors(8, 1.0), vectors(60, 0.0)) for _ in range(5)]
+    shown = [Shown(vectors(8, 1.0), vectors(60, 0.0), *NO_OUTLINE) for _ in range(5)]
     found = learn("thing", shown, "", ())
     assert abs(found.direction[1]) > 3 * abs(found.direction[0])
     assert (found.probability(vectors(50, 1.0)) > 0.5).mean() > 0.9
@@ -142,4 +143,27 @@ def test_what_varies_everywhere_does_not_tell_an_object() -> None:
 
 def test_no_example_is_an_error() -> None:
     with pytest.raises(LearnedObjectError, match="no image shows mug"):
-        learn("mug", [Shown(np.zeros((0, 3), np.float32), np.ones((4, 3), np.float32))], "", ())
+        learn("mug", [Shown(np.zeros((0, 3), np.float32), np.ones((4, 3), np.float32), *NO_OUTLINE)], "", ())
+
+
+def test_boxes_are_drawn_to_the_outline_that_their_vectors_tell() -> None:
+    """A vector that tells how far the box is off teaches how to mend it; one step cannot go farther than half a box."""
+    rng = np.random.default_rng(1)
+    changes = rng.uniform(-0.3, 0.3, (200, 4)).astype(np.float32)
+    told = (10 * changes + rng.normal(0, 0.05, changes.shape)).astype(np.float32)
+    found = learn("thing", [Shown(told[:20], -told[20:60] + 9, told, changes)], "", ())
+    size, change = np.array([40.0, 20.0], np.float32), np.array([0.2, -0.1, 0.15, -0.2], np.float32)
+    (drawn,) = found.drawn(np.array([[0, 0, *size]], np.float32), 10 * change[None])
+    np.testing.assert_allclose((drawn[:2] + drawn[2:]) / 2, size * (0.5 + change[:2]), atol=0.5)
+    np.testing.assert_allclose(drawn[2:] - drawn[:2], size * np.exp(change[2:]), rtol=0.02)
+    (far,) = found.drawn(np.array([[0, 0, *size]], np.float32), np.full((1, 4), 100, np.float32))
+    np.testing.assert_allclose((far[:2] + far[2:]) / 2, size, atol=1e-3)
+
+
+def test_a_file_without_an_outline_leaves_boxes_where_they_are(learned: Path, tmp_path: Path) -> None:
+    with np.load(learned) as kept:
+        first = {name: kept[name] for name in kept.files if name != "outline"}
+    np.savez(tmp_path / "first.npz", **first)
+    boxes = np.array([[3, 4, 30, 50]], np.float32)
+    described = np.ones((1, len(first["direction"])), np.float32)
+    np.testing.assert_allclose(LearnedObject.read(tmp_path / "first.npz").drawn(boxes, described), boxes)

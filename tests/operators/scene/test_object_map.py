@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pytest
@@ -45,9 +45,9 @@ def observation(solid: Solid, class_id: int, T: NDArray[np.float64]) -> Observat
     return Observation(surface(solid), class_id, 0.8, None, ImageView(P, box, np.ones(4, np.bool_), T[:3, 3]))
 
 
-def after(scenes: Sequence[Sequence[tuple[Solid, int]]]) -> ObjectMap:
+def after(scenes: Sequence[Sequence[tuple[Solid, int]]], telling: Mapping[int, float] | None = None) -> ObjectMap:
     """The map after views of things, each said to be of a class, a quarter of a second apart."""
-    known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE)
+    known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE, telling)
     for k, scene in enumerate(scenes):
         T = looking(0.4 * np.sin(k))
         wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
@@ -77,6 +77,28 @@ def test_a_thing_that_is_called_by_turns_a_mover_and_not_is_one_object() -> None
     object = only(after(scenes))
     assert object.class_id == MUG
     assert object.views == 12
+
+
+@pytest.mark.parametrize(("mugs", "balls", "class_id"), [(6, 4, BALL), (8, 2, MUG)])
+def test_a_label_that_is_seldom_said_of_other_things_counts_more(mugs: int, balls: int, class_id: int) -> None:
+    said = [MUG] * (mugs - balls) + [MUG, BALL] * balls
+    assert only(after([[(THING, label)] for label in said], {BALL: 2.0})).class_id == class_id
+    assert only(after([[(THING, label)] for label in said])).class_id == MUG
+
+
+@pytest.mark.parametrize(("bottom", "reaches_down"), [(0.7, True), (1.6, False)])
+def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reaches_down: bool) -> None:
+    size = {BOX: (Usual((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), on_floor=True),)}
+    known = ObjectMap(3, [BOX], MapSettings(), size)
+    known.floor = -0.4
+    T = looking(0.0)
+    half: Solid = ((2.0, 0.0, bottom - 0.4 + 0.4), (0.5, 0.5, 0.8))
+    for k in range(4):
+        known.update((k + 1) * SECOND // 4, [observation(half, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
+    center, box, _ = only(known).box
+    top = float(center[2] + box[2] / 2)
+    assert abs(top - (bottom + 0.4)) < 0.1
+    assert (abs(float(center[2] - box[2] / 2) + 0.4) < 1e-9) == reaches_down
 
 
 def test_a_part_that_is_never_seen_beside_its_whole_is_no_object_of_its_own() -> None:

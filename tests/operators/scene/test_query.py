@@ -139,6 +139,24 @@ def test_the_command_says_what_is_wrong(recording: Path, tmp_path: Path) -> None
     assert (code, "robot1/scene/graph" in " ".join(out.split())) == (2, True)
 
 
+def test_a_surface_is_asked_for_by_its_name_and_has_its_layer() -> None:
+    made = graph()
+    names = ["room", "floor", "table 1", "mug 2", "mug 3", "person 4", "wall 1"]
+    made = made.replace(
+        class_names=(*NAMES, "wall"),
+        ids=np.array([*made.ids[:-1], -11]),
+        class_ids=np.array([*made.class_ids[:-1], len(NAMES)], np.int32),
+        labels=tuple(names),
+    )
+    assert [int(made.ids[m.node]) for m in ask(made, "wall 1")] == [-11]
+    assert [int(made.ids[m.node]) for m in ask(made, "table left of wall 1")] == [1]
+    layers = {node["name"]: node["layer"] for node in as_json(made)["nodes"]}
+    assert (layers["wall 1"], layers["floor"], layers["room"]) == ("surface", "surface", "room")
+    exported = {node["attributes"]["name"]: node for node in as_spark_dsg(made)["nodes"]}
+    assert {name for name, node in exported.items() if node["layer"] == 3} == {"wall 1", "floor"}
+    assert len({node["id"] for node in exported.values()}) == len(names)
+
+
 def test_the_export_has_every_node_its_layer_and_one_edge_for_two_nodes(tmp_path: Path) -> None:
     exported = as_spark_dsg(graph())
     names = {node["id"]: node["attributes"]["name"] for node in exported["nodes"]}

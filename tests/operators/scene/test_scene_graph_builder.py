@@ -88,6 +88,47 @@ def test_a_room_has_the_relations_that_a_person_would_name() -> None:
     assert (1, "left_of", 3) in found
 
 
+TOP: Thing = (-11, "tabletop", (2, 0, 0.74), (1.4, 0.7, 0.02))
+WALL: Thing = (-12, "wall", (2, 3, 1.2), (4, 0.02, 2.4))
+GROUND: Thing = (0, "floor", (2, 0, -0.31), (6, 6, 0.02))
+
+
+def test_things_stand_on_surfaces_by_their_height_and_extent() -> None:
+    beside: Thing = (8, "mug", (2, 1.2, 0.8), (0.1, 0.08, 0.1))
+    above: Thing = (9, "mug", (2.1, 0, 1.1), (0.1, 0.08, 0.1))
+    found = relations(built([[TABLE, MUG, TOP, WALL, beside, above]])["graph"][0])
+    assert found[2, "on", -11] > 0.6
+    assert found[2, "on", 1] > 0.6
+    assert found[-11, "part_of", 1] > 0.6
+    assert found[-12, "part_of", -2] == 1
+    assert not any({s, o} & {-11, -12} for s, p, o in found if p not in ("on", "part_of"))
+    assert [s for s, p, o in found if p == "on" and o == -11] == [2]
+
+
+def test_a_table_top_without_a_table_carries_what_stands_on_it() -> None:
+    found = relations(built([[MUG, TOP]])["graph"][0])
+    assert found[2, "on", -11] > 0.6
+    assert not any(s == -11 for s, _, _ in found)
+
+
+def test_the_floor_of_the_map_says_how_high_things_stand() -> None:
+    low: Thing = (6, "box", (2.2, 0.1, -0.15), (0.3, 0.3, 0.3))
+    message = built([[GROUND, low, SHELF]])["graph"][0]
+    found = relations(message)
+    assert found[6, "on", 0] > 0.9
+    assert (4, "on", 0) not in found or found[4, "on", 0] < 0.6
+    assert isinstance(message, SceneGraph)
+    row = message.ids.tolist().index(0)
+    assert message.sizes[row].tolist() == [6, 6, 0.02]
+    assert message.names()[row] == "floor"
+
+
+def test_surfaces_are_named_by_their_own_numbers() -> None:
+    message = built([[TABLE, TOP, WALL]])["graph"][0]
+    assert isinstance(message, SceneGraph)
+    assert {"tabletop 1", "wall 2", "table 1"} <= set(message.names())
+
+
 def test_one_box_that_reaches_through_the_floor_does_not_take_it_from_the_others() -> None:
     plant: Thing = (8, "plant", (3, -2, 0.1), (0.6, 0.5, 1.2))  # to half a metre below the floor
     found = relations(built([[TABLE, CHAIR, SHELF, CRATE, plant]])["graph"][0])

@@ -136,7 +136,7 @@ def test_a_network_with_other_outputs_is_refused(tmp_path: Path) -> None:
     facts = {"kind": "segmenter", "classes": list("abc"), "width": 64, "height": 48}
     file = tmp_path / "n.onnx"
     export_network(SegmentationNetwork(3, width=0.25), (64, 48), ["scores"], facts, file)
-    with pytest.raises(NetworkFileError, match="must have the outputs classes and confidence, has scores"):
+    with pytest.raises(NetworkFileError, match="or 8-bit scores; has scores tensor"):
         Segmenter(weights=str(file)).setup()
     with pytest.raises(FileNotFoundError, match="looked for"):
         Segmenter(weights=str(tmp_path / "none.onnx")).setup()

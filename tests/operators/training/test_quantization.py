@@ -13,7 +13,9 @@ from typer.testing import CliRunner
 pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from dataflow.cli.main import app
+from dataflow.messages import Image
 from operators.detection.custom.dataset import read_detection_data
+from operators.segmentation import Segmenter
 from operators.segmentation.dataset import read_segmentation_data
 from operators.training.loop import Settings, train
 from operators.training.pair import PairTask
@@ -36,10 +38,29 @@ def views(worlds: Path) -> list[NDArray[np.uint8]]:
     return [image.read() for image in read_detection_data(worlds).training]
 
 
-@pytest.mark.parametrize("kind", ["detector", "segmenter"])
-def test_the_answers_differ_little_and_keep_their_precision(
-    trained: Path, worlds: Path, tmp_path: Path, kind: str
+def test_a_segmenter_in_8_bits_ends_with_its_scores_and_answers_as_before(
+    trained: Path, worlds: Path, tmp_path: Path
 ) -> None:
+    file, out = trained / "segmenter.onnx", tmp_path / "small.onnx"
+    quantize_network(file, views(worlds), out)
+    facts = read_facts(out)
+    assert facts.pop("score_step") > 0
+    assert facts == read_facts(file) | {"arithmetic": "int8", "calibration_images": 4}
+    assert [each.name for each in open_network(out, "segmenter").session.get_outputs()] == ["scores"]
+    data = np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3)).astype(np.uint8)
+    before, after = (Segmenter(weights=str(each), with_confidence=True) for each in (file, out))
+    found = []
+    for segmenter in (before, after):
+        segmenter.setup()
+        found.append(segmenter.process(Image(stamp=0, frame="camera", data=data)))
+    assert (found[0].classes == found[1].classes).mean() > 0.9
+    assert found[0].confidence is not None
+    assert found[1].confidence is not None
+    assert np.abs(found[0].confidence - found[1].confidence).mean() < 0.05
+
+
+def test_the_answers_differ_little_and_keep_their_precision(trained: Path, worlds: Path, tmp_path: Path) -> None:
+    kind = "detector"
     file, out = trained / f"{kind}.onnx", tmp_path / "small.onnx"
     quantize_network(file, views(worlds), out)
     assert out.stat().st_size < file.stat().st_size

@@ -2,7 +2,8 @@
 
 No hang: it is over in bounded simulated time. No loss without a count: what was made was taken, or dropped with a
 reason, or is counted as missed. The recording verifies as identical, or, where the run was cut short, as far as it
-goes. A replay, placed otherwise and on another machine, has the same digests.
+goes; one with recorded states also from its middle. A replay, placed otherwise and on another machine, has the same
+digests.
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
     try:
         verdict = _verify(path, outcome, scenario)
         report = outcome.report
+        if scenario.snapshots and verdict == "identical":
+            _verify_from_middle(path)
         drops = 0
         if report is not None:
             drops = _check_losses(path, graph, report)
@@ -128,7 +131,21 @@ def _explained(report: VerifyReport) -> str:
     return "\n".join(lines)
 
 
-def verified(path: Path) -> VerifyReport:
+def _verify_from_middle(path: Path) -> None:
+    """What verifies as a whole verifies from the states that operators had in the middle, too."""
+    with Recording(path) as recording:
+        source = recording.streams.get("sim/left/fast")
+        begins = [
+            s.first for s in recording.streams.values() if s.first is not None and not (s.static or "/@/" in s.name)
+        ]
+    first, last = min(begins, default=0), 0 if source is None or source.last is None else source.last
+    if last > first:
+        report = verified(path, start=(last - first) * 0.5e-9, jobs=2)
+        if not report.identical:
+            raise Violation(f"verified as different from the middle:\n{_explained(report)}")
+
+
+def verified(path: Path, *, start: float | None = None, jobs: int = 1) -> VerifyReport:
     """Verifies in this process: the workers' functions are called, one after the other."""
     bindings = {
         ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
@@ -136,7 +153,7 @@ def verified(path: Path) -> VerifyReport:
     }
     importlib.import_module("dataflow.verification.verify")
     with bound(bindings):
-        return verify(path, jobs=1, workers=_call_here)
+        return verify(path, start=start, jobs=jobs, workers=_call_here)
 
 
 _load_bundle = functools.lru_cache(maxsize=1024)(load_bundle)

@@ -92,6 +92,16 @@ class Relay(Operator):
         return value(x.stamp, number(x) + self.rng.normal())
 
 
+class Timer(Operator, every="250us"):
+    """Says what it last got, many times between two messages."""
+
+    x: Sampled[FeatureVector]
+    y: Out[FeatureVector]
+
+    def process(self, x: FeatureVector, context: Any) -> FeatureVector:
+        return value(context.stamp, number(x))
+
+
 class Mix(Operator, tolerance="3ms"):
     """Joins two streams by nearest stamp, samples a static stream and its own past, batches the first."""
 

@@ -39,6 +39,14 @@ GRAPHS: Mapping[str, str] = {
   merge: {{{_USE}:Merge, inputs: {{all: [one/y, two/y, left/slow]}}, {_WORK}LIVE}}
 """,
 }
+TICKS = f"""
+  left: {{SOURCE}}
+  timer: {{{_USE}:Timer, inputs: {{x: left/fast}}LIVE}}
+  sum: {{{_USE}:Sum, inputs: {{x: timer/y}}, {_WORK}LIVE}}
+"""
+"""A graph of which every step makes many messages, more than what keeps its source from running ahead knows of: those
+between two processes can become too many."""
+TICKING = "ticks"
 _RESTART = "restart: {max: 5, backoff: 10ms}"
 POLICIES = (
     "",
@@ -116,7 +124,7 @@ def load(
 ) -> Graph:
     """Loads one of the graphs; loading takes longer than some runs, so each is loaded once."""
     record = "record: {snapshots: 60ms}\n" if snapshots else ""
-    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{GRAPHS[graph]}"
+    text = f"graph: {graph}\nnamespace: sim\n{record}operators:{TICKS if graph == TICKING else GRAPHS[graph]}"
     words = {
         "SOURCE": _DEVICE if live else _SOURCE,
         "LIVE": f", live: {{{policy}}}" if policy else "",
@@ -160,6 +168,8 @@ def scenario_of(seed: int) -> Scenario:
         snapshots=r.random() < 0.3,
         machine=machine,
     )
+    if live and random.Random(f"ticks {seed}").random() < 0.05:
+        plain = replace(plain, graph=TICKING)
     return _with_events(plain, r)
 
 

@@ -1,0 +1,263 @@
+"""Recognition networks trained here beside the same data given to torchvision's, and to baselines that learn nothing.
+
+    python benchmarks/recognition.py objects WORLDS           classes of objects; WORLDS: a folder of simulated_worlds
+    python benchmarks/recognition.py streets CAMVID [--backbone FILE]    classes of pixels of photographs of streets
+
+`objects`: the objects of simulated worlds (`python -m operators.training.simulated_worlds WORLDS`) cut out by their
+true boxes; trained in some worlds, scored in others. `streets`: every second image of CamVid to train on, the others
+scored; `--backbone` is a state dict of torchvision's mobilenet_v2. All networks get the same images, variations, steps
+and optimiser; the last epoch is scored, not the best. Nothing that is trained is kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+REPOSITORY = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(REPOSITORY))
+
+import cv2  # noqa: E402
+import numpy as np  # noqa: E402
+import torch  # noqa: E402
+import torchvision  # noqa: E402
+from numpy.typing import NDArray  # noqa: E402
+from torch import Tensor, nn  # noqa: E402
+
+from operators.detection.custom.dataset import read_detection_data  # noqa: E402
+from operators.recognition.dataset import ClassificationData, LabelledImage  # noqa: E402
+from operators.recognition.training import ClassifierTask  # noqa: E402
+from operators.segmentation.dataset import MaskedImage, SegmentationData  # noqa: E402
+from operators.segmentation.score import confusion, mean_iou  # noqa: E402
+from operators.segmentation.training import SegmenterTask  # noqa: E402
+from operators.training.backbone import current_names  # noqa: E402
+from operators.training.loop import Settings, train  # noqa: E402
+from operators.training.running import prepare  # noqa: E402
+
+CAMVID = ("sky", "building", "pole", "road", "pavement", "tree", "sign", "fence", "car", "pedestrian", "bicyclist")
+SIDE = (64, 64)
+MOST, LEAST = 150, 24
+"""Cut-outs of a class at most to train on; width and height in pixels at least."""
+
+
+class Torchvision(ClassifierTask):
+    """torchvision's ResNet-18 in the place of our classifier, from random weights as it is."""
+
+    def __init__(self, data: ClassificationData, size: tuple[int, int]) -> None:
+        super().__init__(data, size)
+        self.resnet = torchvision.models.resnet18(weights=None, num_classes=len(data.classes))
+
+    @property
+    def network(self) -> nn.Module:
+        return self.resnet
+
+    def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
+        images, labels = batch
+        scores = self.resnet(images.to(device)).float()
+        return {"entropy": nn.functional.cross_entropy(scores, labels, self.class_weights, label_smoothing=0.05)}
+
+    def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
+        """Nothing is kept."""
+
+
+class Fcn(nn.Module):
+    """torchvision's mobilenet_v2 as far as stride 16, with torchvision's FCN head; scores at half the resolution."""
+
+    def __init__(self, classes: int, weights: Path | None) -> None:
+        super().__init__()
+        whole = torchvision.models.mobilenet_v2(weights=None)
+        if weights is not None:
+            given = current_names(torch.load(weights, map_location="cpu", weights_only=True))
+            whole.load_state_dict(given, strict=False)
+        self.features = whole.features[:14]
+        self.head = torchvision.models.segmentation.fcn.FCNHead(96, classes)
+        self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1))
+        self.register_buffer("deviation", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1))
+
+    def forward(self, images: Tensor) -> Tensor:
+        scores = self.head(self.features((images - self.mean) / self.deviation))
+        size = (images.shape[2] // 2, images.shape[3] // 2)
+        return nn.functional.interpolate(scores, size=size, mode="bilinear", align_corners=False)
+
+
+class FcnTask(SegmenterTask):
+    """`Fcn` in the place of our segmenter."""
+
+    def __init__(self, data: SegmentationData, size: tuple[int, int], weights: Path | None) -> None:
+        super().__init__(data, size)
+        self.fcn = Fcn(len(data.classes), weights)
+
+    @property
+    def network(self) -> nn.Module:
+        return self.fcn
+
+    def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
+        images, masks = batch
+        return self.loss_of(self.fcn(images.to(device)), masks)
+
+    def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
+        """Nothing is kept."""
+
+
+def trained(task: Any, epochs: int, batch: int) -> dict[str, float]:
+    """The scores after the last epoch."""
+    settings = Settings(epochs, batch, seed=0, evaluate_every=epochs, workers=1, threads=1, bfloat16=True)
+    with tempfile.TemporaryDirectory() as folder:
+        return train(task, settings, Path(folder) / "network.onnx").history[-1]
+
+
+def cut_out(worlds: Path, folder: Path) -> ClassificationData:
+    """Writes the objects of a folder of detection data as images; those that are to be ignored are left out."""
+    read = read_detection_data(worlds, 0)
+    parts: dict[str, list[LabelledImage]] = {"training": [], "validation": []}
+    for part, images in (("training", read.training), ("validation", read.validation)):
+        count = np.zeros(len(read.classes), np.int64)
+        for k in np.random.default_rng(0).permutation(len(images)).tolist():
+            image = images[k]
+            pixels = None
+            for i, (box, label) in enumerate(zip(image.boxes, image.classes, strict=True)):
+                if image.ignored[i] or (part == "training" and count[label] >= MOST):
+                    continue
+                pixels = image.read()[..., ::-1] if pixels is None else pixels
+                height, width = pixels.shape[:2]
+                x1, y1, x2, y2 = (
+                    np.clip(box * (width, height, width, height), 0, (width, height) * 2).round().astype(int)
+                )
+                if min(x2 - x1, y2 - y1) < LEAST:
+                    continue
+                file = folder / part / f"{image.file.stem}_{i}.jpg"
+                file.parent.mkdir(parents=True, exist_ok=True)
+                cv2.imwrite(str(file), pixels[y1:y2, x1:x2])
+                parts[part].append(LabelledImage(file, int(label)))
+                count[label] += 1
+    return ClassificationData(tuple(read.classes), tuple(parts["training"]), tuple(parts["validation"]))
+
+
+def histogram(image: LabelledImage) -> NDArray[np.float64]:
+    """The root of the shares of 8 levels of each colour (the product of two is Bhattacharyya's coefficient)."""
+    counts = np.bincount((image.read() // 32).reshape(-1, 3).astype(np.int64) @ (64, 8, 1), minlength=512)
+    return np.asarray(np.sqrt(counts / counts.sum()))
+
+
+def objects(worlds: Path, epochs: int) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as folder:
+        data = cut_out(worlds, Path(folder))
+        labels = np.array([image.label for image in data.training])
+        truth = np.array([image.label for image in data.validation])
+        print(f"{len(labels)} cut-outs to train on, {len(truth)} to score, {len(data.classes)} classes")
+        rows = {"the most frequent class": scored(np.full(len(truth), np.bincount(labels).argmax()), truth)}
+        known, asked = (np.array([histogram(i) for i in part]) for part in (data.training, data.validation))
+        rows["the nearest colour histogram"] = scored(labels[(asked @ known.T).argmax(axis=1)], truth)
+        for name, task in (
+            ("plain", ClassifierTask(data, SIDE)),
+            ("residual", ClassifierTask(data, SIDE, architecture="residual")),
+            ("torchvision's resnet18", Torchvision(data, SIDE)),
+        ):
+            rows[name] = trained(task, epochs, 32)
+    for name, row in rows.items():
+        print(f"| {name} | {row['accuracy']:.3f} | {row['mean_accuracy']:.3f} |")
+    return rows
+
+
+def scored(found: NDArray[np.int64], truth: NDArray[np.int64]) -> dict[str, float]:
+    right = found == truth
+    each = [float(right[truth == c].mean()) for c in np.unique(truth)]
+    return {"accuracy": float(right.mean()), "mean_accuracy": float(np.mean(each))}
+
+
+def camvid(folder: Path) -> SegmentationData:
+    """Every second image to train on. Its void class becomes 255: masks are read where they lie."""
+    files = sorted((folder / "images").glob("*.png"))
+    if not files:
+        raise SystemExit(f"no PNGs in {folder / 'images'}: give a folder with CamVid's images/ and annotations/")
+    pairs = [MaskedImage(f, folder / "annotations" / f.name) for f in files]
+    return SegmentationData((*CAMVID, "void"), tuple(pairs[::2]), tuple(pairs[1::2]))
+
+
+def streets(folder: Path, backbone: Path | None, epochs: int) -> dict[str, Any]:
+    with tempfile.TemporaryDirectory() as place:
+        data = without_void(camvid(folder), Path(place))
+        rows: dict[str, Any] = baselines(data)
+        size = (384, 288)
+        tasks: dict[str, Any] = {
+            "segmenter": SegmenterTask(data, size),
+            "torchvision's mobilenet_v2 + FCN head": FcnTask(data, size, None),
+        }
+        prepare(tasks["segmenter"], None, None, None)
+        if backbone is not None:
+            ours = SegmenterTask(data, size, backbone=backbone)
+            prepare(ours, backbone, None, None)
+            tasks["segmenter, ImageNet backbone"] = ours
+            tasks["torchvision's, ImageNet backbone"] = FcnTask(data, size, backbone)
+        for name, task in tasks.items():
+            rows[name] = trained(task, epochs, 8)["miou"]
+    for name, value in rows.items():
+        print(f"| {name} | {value:.3f} |")
+    return rows
+
+
+def without_void(data: SegmentationData, folder: Path) -> SegmentationData:
+    """The same masks with 255 where the class is void, the last one."""
+    void = len(data.classes) - 1
+
+    def written(image: MaskedImage) -> MaskedImage:
+        mask = image.read(void + 1)[1]
+        file = folder / image.mask.name
+        cv2.imwrite(str(file), np.where(mask == void, 255, mask).astype(np.uint8))
+        return MaskedImage(image.image, file)
+
+    return SegmentationData(data.classes[:-1], tuple(map(written, data.training)), tuple(map(written, data.validation)))
+
+
+def baselines(data: SegmentationData) -> dict[str, float]:
+    """mIoU of the most frequent class, at each pixel, and of each colour (32 levels)."""
+    classes = len(data.classes)
+    shape = data.training[0].read(classes)[1].shape
+    places, shades = np.zeros((*shape, classes), np.int64), np.zeros((32**3, classes), np.int64)
+    for image in data.training:
+        pixels, mask = image.read(classes)
+        for c in range(classes):
+            places[..., c] += mask == c
+            shades[:, c] += np.bincount(shade(pixels)[mask == c], minlength=32**3)
+    tables = {name: np.zeros((classes, classes + 1), np.int64) for name in ("class", "place", "colour")}
+    most = int(places.sum(axis=(0, 1)).argmax())
+    for image in data.validation:
+        pixels, mask = image.read(classes)
+        by_shade = np.where(shades.any(axis=1), shades.argmax(axis=1), most)
+        guesses = {"class": np.full(shape, most), "place": places.argmax(axis=2), "colour": by_shade[shade(pixels)]}
+        for name, guess in guesses.items():
+            tables[name] += confusion(mask, guess.astype(np.uint8), classes)
+    return {f"the most frequent {name if name == 'class' else f'class of the {name}'}": mean_iou(t)
+            for name, t in tables.items()}  # fmt: skip
+
+
+def shade(pixels: NDArray[np.uint8]) -> NDArray[np.int64]:
+    return np.asarray((pixels // 8).astype(np.int64) @ np.array((1024, 32, 1)))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["objects", "streets"])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--backbone", type=Path, help="state dict of torchvision's mobilenet_v2")
+    parser.add_argument("--epochs", type=int, help="8 for objects, 60 for streets")
+    parser.add_argument("--json", type=Path, help="file for all figures")
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    if arguments.what == "objects":
+        rows = objects(arguments.folder, arguments.epochs or 8)
+    else:
+        rows = streets(arguments.folder, arguments.backbone, arguments.epochs or 60)
+    if arguments.json:
+        arguments.json.write_text(json.dumps(rows, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,117 @@
+"""Edges of colour images against edges of depth: the shift that makes one lie on the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Surface = NDArray[np.float32]
+
+_JUMP = 0.08  # share of the depth by which neighbours on an edge differ
+_STEEPEST = 100.0  # grey levels: steeper edges count no more than such
+_HALVES = ("left half", "right half")
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Says where the edges of the depth fit those of the colour image best.
+
+    `x` and `y` in working pixels; `here` is how well they fit unmoved, as a share of that; `peak` how far the best fit
+    stands out, in standard deviations of all; `edges` the pixels that it rests on; `part` names that of the image.
+    """
+
+    part: str
+    x: int
+    y: int
+    here: float
+    peak: float
+    edges: float
+
+    def off(self, least: int) -> bool:
+        """Tells whether the edges plainly lie `least` pixels or more from where they should."""
+        return max(abs(self.x), abs(self.y)) >= least and self.here < 0.7 and self.peak >= 4.5 and self.edges >= 500
+
+
+class EdgeAlignment:
+    """Adds up, image by image and forgetting by `keep`, how well the edges fit at every shift up to `reach` pixels.
+
+    The two halves of the image are kept apart: a turn about the optical axis moves them against each other. Working
+    pixels are of half the resolution. A depth edge is the rim of what stands in front of something, which nearly
+    always shows in the colour image; what else shows there is even over many images.
+    """
+
+    def __init__(self, reach: int = 16, keep: float = 0.9) -> None:
+        self._reach, self._keep = reach, keep
+        side = 2 * reach + 1
+        self._sums = np.zeros((2, side, side), np.float64)
+        self._edges = np.zeros(2)
+
+    def add(self, image: NDArray[np.uint8], K: Array, rims: Array) -> None:
+        """Takes an image (H, W[, 3]) with its K, and points (N, 3) of the same time on rims, in its camera's frame."""
+        gray = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+        half = cv2.resize(gray, (gray.shape[1] // 2, gray.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        half = half.astype(np.float32)
+        slope = cv2.magnitude(cv2.Sobel(half, cv2.CV_32F, 1, 0), cv2.Sobel(half, cv2.CV_32F, 0, 1))
+        slope = np.minimum(slope, np.float32(_STEEPEST))
+        drawn = _drawn(rims, K, half.shape)
+        height, width = half.shape
+        r, middle = self._reach, width // 2
+        self._sums *= self._keep
+        self._edges *= self._keep
+        for k, (left, right) in enumerate(((r, middle), (middle, width - r))):
+            template = drawn[r : height - r, left:right]
+            fit = cv2.matchTemplate(slope[:, left - r : right + r], template, cv2.TM_CCORR).astype(np.float64)
+            self._sums[k] += fit - fit.mean()
+            self._edges[k] += float(template.sum())
+
+    def shifts(self) -> list[Shift]:
+        """Returns the shift of the whole image and of its halves, of those that have edges."""
+        parts = [("image", self._sums.sum(axis=0), float(self._edges.sum()))]
+        parts += [(name, s, float(n)) for name, s, n in zip(_HALVES, self._sums, self._edges.tolist(), strict=True)]
+        return [_best(name, surface, edges, self._reach) for name, surface, edges in parts if surface.max() > 0]
+
+    def snapshot(self) -> dict[str, Any]:
+        return {"sums": self._sums, "edges": self._edges}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._sums, self._edges = np.array(state["sums"], np.float64), np.array(state["edges"], np.float64)
+
+
+def rims(depth: NDArray[np.float32], K: Array) -> Array:
+    """Returns points (N, 3), metres, in the frame of a depth camera (K) on rims: every second pixel beside one much
+    farther."""
+    z = depth[::2, ::2]
+    rim = np.zeros(z.shape, np.bool_)
+    for here, there in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        a, b = z[here], z[there]
+        jump = (a > 0) & (b > 0) & (np.abs(a - b) > np.float32(_JUMP) * np.minimum(a, b))
+        rim[here] |= jump & (a < b)
+        rim[there] |= jump & (b < a)
+    v, u = np.nonzero(rim)
+    d = z[v, u].astype(np.float64)
+    return np.column_stack([(2 * u - K[0, 2]) / K[0, 0] * d, (2 * v - K[1, 2]) / K[1, 1] * d, d])
+
+
+def _drawn(points: Array, K: Array, shape: tuple[int, ...]) -> Surface:
+    """An image of half the resolution with ones where points are seen."""
+    drawn = np.zeros(shape, np.float32)
+    ahead = points[points[:, 2] > 0.1]
+    u = np.rint((ahead[:, 0] / ahead[:, 2] * K[0, 0] + K[0, 2]) / 2).astype(np.intp)
+    v = np.rint((ahead[:, 1] / ahead[:, 2] * K[1, 1] + K[1, 2]) / 2).astype(np.intp)
+    inside = (u >= 0) & (u < shape[1]) & (v >= 0) & (v < shape[0])
+    drawn[v[inside], u[inside]] = 1.0
+    return drawn
+
+
+def _best(part: str, surface: Array, edges: float, reach: int) -> Shift:
+    row, column = divmod(int(np.argmax(surface)), surface.shape[1])
+    top = float(surface[row, column])
+    return Shift(
+        part, column - reach, row - reach, float(surface[reach, reach]) / top, top / float(surface.std()), edges
+    )

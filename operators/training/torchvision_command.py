@@ -1,0 +1,119 @@
+"""`dataflow train torchvision`: a network of torchvision's zoo learns one's own classes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from operators.training.console import Data, Json, friendly, print_notes
+from operators.training.options import (
+    Batch,
+    Bfloat16,
+    Device,
+    Every,
+    Overwrite,
+    Rate,
+    Resume,
+    Seed,
+    Strength,
+    Threads,
+    Workers,
+)
+from operators.training.running import input_size, keep_earlier, report, run_task, tell_data
+
+if TYPE_CHECKING:
+    from operators.training.augmentation import Variation
+    from operators.training.torchvision_tasks import TorchvisionDetectorTask, TorchvisionSegmenterTask
+
+
+def train_torchvision(
+    name: Annotated[str, typer.Argument(help="A detector or segmenter of torchvision.", show_default=False)],
+    data: Data,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes through the training images.")] = 20,
+    out: Annotated[Path | None, typer.Option(help="The file to write (.pth). Default: NAME.pth.")] = None,
+    resume: Resume = False,
+    overwrite: Overwrite = False,
+    weights: Annotated[
+        str | None,
+        typer.Option(help="Begin with torchvision's weights of this name (default, COCO_V1, ...) from its cache."),
+    ] = None,
+    initial: Annotated[
+        Path | None, typer.Option("--from", help="Begin with the weights of this file (.pth, .pt) that fit.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Size of training images. Default: theirs, longest side 384.")
+    ] = None,
+    batch: Batch = 16,
+    learning_rate: Rate = 1e-3,
+    seed: Seed = 0,
+    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    variation: Strength = 1.0,
+    evaluate_every: Every = 1,
+    workers: Workers = 2,
+    threads: Threads = None,
+    device: Device = None,
+    bfloat16: Bfloat16 = False,
+    json: Json = False,
+) -> None:
+    """Fine-tune a torchvision detector or segmenter on your own classes.
+
+    A detector takes a folder in COCO or YOLO format, a segmenter one with images/, masks/ and classes.txt. The last
+    layers are made for your classes; without --weights or --from all others begin at random too, which takes many
+    epochs. Writes the best epoch's weights with the class names (.pth), which `TorchvisionDetector` and
+    `TorchvisionSegmenter` take as `checkpoint`, and a checkpoint (.pt) to resume from. Examples:
+
+      dataflow train torchvision ssdlite320_mobilenet_v3_large out/worlds --weights COCO_V1 --epochs 10
+
+      dataflow train torchvision lraspp_mobilenet_v3_large out/worlds --out out/masks.pth --size 384x288 --json
+    """
+    with friendly():
+        out = Path(f"{name}.pth") if out is None else out
+        keep_earlier(out, resume, overwrite, ".pth")
+        if weights is not None and initial is not None:
+            raise ValueError("give either --weights or --from: both are what to begin with")
+        from operators.torch_models import cached_weights, family_of
+        from operators.training.augmentation import Variation
+        from operators.training.loop import Settings
+        from operators.training.torchvision_tasks import weights_in
+
+        changes = Variation(flip=0.5 if flip else 0.0).times(variation)
+        detects = family_of(name) == "detection"
+        task = (_detector if detects else _segmenter)(name, data, size, seed, changes, json)
+        if weights is not None or initial is not None:
+            state = cached_weights(name, weights) if weights is not None else weights_in(initial or out)
+            taken, known = task.begin_with(state)
+            print_notes([f"{taken} of {known} arrays begin as given, the others at random"], json)
+        settings = Settings(
+            epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=workers, threads=threads,
+            device=device, bfloat16=bfloat16,
+        )  # fmt: skip
+        outcome = run_task(task, settings, out, resume, json)
+    params = f"model: {name}, checkpoint: {{file}}" + ("" if detects else f", side: {min(task.size)}")
+    operator = "operators.detection:TorchvisionDetector" if detects else "operators.segmentation:TorchvisionSegmenter"
+    report(outcome, operator, json, params)
+
+
+def _detector(
+    name: str, data: Path, size: str | None, seed: int, variation: Variation, quiet: bool
+) -> TorchvisionDetectorTask:
+    from operators.detection.custom.dataset import read_detection_data
+    from operators.training.torchvision_tasks import TorchvisionDetectorTask
+
+    read = read_detection_data(data, seed)
+    shown = input_size(size, [image.file for image in read.training[:20]])
+    tell_data(read.notes, len(read.training), len(read.validation), read.classes, shown, quiet)
+    return TorchvisionDetectorTask(read, name, shown, seed=seed, variation=variation)
+
+
+def _segmenter(
+    name: str, data: Path, size: str | None, seed: int, variation: Variation, quiet: bool
+) -> TorchvisionSegmenterTask:
+    from operators.segmentation.dataset import read_segmentation_data
+    from operators.training.torchvision_tasks import TorchvisionSegmenterTask
+
+    read = read_segmentation_data(data, seed)
+    shown = input_size(size, [image.image for image in read.training[:20]])
+    tell_data(read.notes, len(read.training), len(read.validation), read.classes, shown, quiet)
+    return TorchvisionSegmenterTask(read, name, shown, seed=seed, variation=variation)

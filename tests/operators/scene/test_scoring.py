@@ -1,0 +1,77 @@
+"""Nodes and relations are counted against the truth; what does not count is neither right nor wrong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from dataflow.messages import SceneGraph
+from operators.scene.relations import FLOOR
+from operators.scene.scoring import RelationScore, score_nodes
+
+CLASSES = ("floor", "mug", "table", "ball")
+
+
+def graph(nodes: dict[int, tuple[str, float]], relations: list[tuple[int, str, int]]) -> SceneGraph:
+    """Boxes of half a metre, by id: class and x."""
+    rows = [FLOOR, *nodes]
+    return SceneGraph(
+        stamp=0,
+        frame="world",
+        class_names=CLASSES,
+        predicates=tuple(p for _, p, _ in relations),
+        ids=np.array(rows),
+        class_ids=np.array([0, *(CLASSES.index(name) for name, _ in nodes.values())]),
+        scores=np.ones(len(nodes) + 1, np.float32),
+        positions=np.array([[0, 0, -0.1], *([x, 0, 1.0] for _, x in nodes.values())]),
+        sizes=np.array([[20, 20, 0.1], *([0.5, 0.5, 0.5] for _ in nodes)]),
+        subjects=np.array([rows.index(s) for s, _, _ in relations]),
+        objects=np.array([rows.index(o) for _, _, o in relations]),
+        relation_scores=np.ones(len(relations), np.float32),
+    )
+
+
+TRUTH = graph(
+    {11: ("mug", 1.0), 12: ("table", 2.0), 13: ("ball", 3.0)},
+    [(11, "near", 12), (12, "near", 13), (12, "on", FLOOR)],
+)
+
+
+def f1(mine: SceneGraph, must: set[int]) -> float:
+    score, relations = score_nodes(mine, TRUTH, must), RelationScore()
+    relations.add(mine, TRUTH, score.match, must, score.ignored)
+    return relations.f1("all")
+
+
+def test_all_that_is_true_and_nothing_else_scores_one() -> None:
+    mine = graph(
+        {21: ("mug", 1.0), 22: ("table", 2.0), 23: ("ball", 3.0)},
+        [(21, "near", 22), (22, "near", 23), (22, "on", FLOOR)],
+    )
+    assert f1(mine, {11, 12, 13}) == 1.0
+
+
+@pytest.mark.parametrize("relation", [(22, "near", 23), (22, "left_of", 23)], ids=["true", "false"])
+@pytest.mark.parametrize("place", [3.0, 3.35], ids=["matched", "beside its thing"])
+def test_relations_with_a_thing_that_does_not_count_are_neither_right_nor_wrong(
+    relation: tuple[int, str, int], place: float
+) -> None:
+    nodes = {21: ("mug", 1.0), 22: ("table", 2.0)}
+    told = [(21, "near", 22)]
+    without = f1(graph(nodes, told), {11, 12})
+    assert f1(graph({**nodes, 23: ("ball", place)}, [*told, relation]), {11, 12}) == without == pytest.approx(2 / 3)
+
+
+def test_relations_with_a_node_of_nothing_are_false() -> None:
+    nodes = {21: ("mug", 1.0), 22: ("table", 2.0), 24: ("mug", 9.0)}
+    mine = graph(nodes, [(21, "near", 22), (22, "on", FLOOR), (24, "near", 22)])
+    assert score_nodes(mine, TRUTH, {11, 12}).wrong == [("mug", 24, 0.0, 8.0)]
+    assert f1(mine, {11, 12}) == pytest.approx(0.8)
+
+
+def test_what_is_mapped_scores_by_itself() -> None:
+    mine = graph({21: ("mug", 1.0), 23: ("ball", 3.0)}, [(21, "near", 23)])
+    relations = RelationScore()
+    relations.add(mine, TRUTH, score_nodes(mine, TRUTH, {11}).match, {11})
+    assert relations.f1("mapped") == 0.0
+    assert np.isnan(relations.f1("all"))
