@@ -234,25 +234,3 @@ def seconds(duration: float) -> str:
 def milliseconds(nanoseconds: float) -> str:
     """1234567 → "1.23 ms"."""
     return f"{nanoseconds * 1e-6:,.2f} ms"
-
-
-_UNITS = {
-    "m": "m",
-    "s": "s",
-    "ms": "ms",
-    "deg": "°",
-    "rad": "rad",
-    "hz": "Hz",
-    "percent": "%",
-}
-
-
-def figure(name: str, value: Any) -> tuple[str, str, str]:
-    """(name, value, unit) for people: ("ate_rmse_m", 0.0213) → ("ate rmse", "0.0213", "m")."""
-    stem, _, unit = name.rpartition("_")
-    if isinstance(value, (int, float)) and not isinstance(value, bool) and stem and unit in _UNITS:
-        name = stem
-    else:
-        unit = ""
-    text = f"{value:.4g}" if isinstance(value, float) else f"{value:,}" if type(value) is int else str(value)
-    return name.replace("_", " "), text, _UNITS.get(unit, "")

@@ -12,7 +12,8 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.output import count, figure, plural, seconds, size, table
+from dataflow.cli.output import count, plural, seconds, size, table
+from dataflow.records.figures import figure
 from dataflow.supervision.report import RunReport
 from dataflow.sync import TICK
 

@@ -201,15 +201,18 @@ class _Announcer:
 
 def _view_running(target: Target, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool) -> None:
     from dataflow.client.attach import graph_of, tap
+    from dataflow.graph.sections import PLACE_FRAMES
 
     if wait:
         importlib.import_module("dataflow.view.sink")  # takes long; done when the graph begins, which may be short
     found = running_graph(name, wait)
     running = graph_of(found)
     chosen = chosen_streams(streams, running.streams, running.namespace)
-    with tap(found, [f"/{name}" for name in chosen] if streams else ["**"]) as client:
+    others = [name for name, stream in running.streams.items() if set(stream.types) & set(PLACE_FRAMES)]
+    others = [name for name in others if name not in chosen]
+    with tap(found, [f"/{name}" for name in (*chosen, *others)] if streams else ["**"]) as client:
         say(f"following {escape(running.name)} (process {found.pid})")
-        _draw_running(target, client, found, running, chosen, logs=not streams, until_end=until_end)
+        _draw_running(target, client, found, running, chosen, others, logs=not streams, until_end=until_end)
 
 
 def _draw_running(
@@ -218,11 +221,15 @@ def _draw_running(
     found: RunningGraph,
     running: Graph,
     chosen: list[str],
+    others: list[str],
     *,
     logs: bool,
     until_end: bool,
 ) -> None:
-    """Draws the streams that were chosen until the graph ends, and what it logs with them."""
+    """Draws the streams that were chosen until the graph ends, and what it logs with them.
+
+    `others` are not shown, but place frames.
+    """
     from dataflow.client.attach import still_runs
     from dataflow.names import logs_key
     from dataflow.recording import LogLine
@@ -231,7 +238,8 @@ def _draw_running(
 
     log_stream = logs_key(running.namespace)
     with _sink(target) as sink, closing(LogFollower(found.pid)) as follower:
-        sink.open(_types(running, chosen, log_stream if logs else None), _showing(running, None if logs else chosen))
+        types = _types(running, [*chosen, *others], log_stream if logs else None)
+        sink.open(types, _showing(running, None if logs else chosen), hidden=others)
         _Announcer(sink).announce()
         clock, look_due = 0, 0.0
         while True:

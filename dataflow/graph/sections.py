@@ -53,8 +53,11 @@ class Record:
     flight: Flight | None = None
 
 
-PANELS = ("world", "cameras", "scene", "map", "text", "plots", "status", "log")
+PANELS = ("world", "cameras", "scene", "map", "text", "scores", "plots", "status", "log")
 """Parts of the viewer's window that a graph may choose."""
+
+PLACE_FRAMES = ("Transforms", "Odometry", "Pose")
+"""Message types that say where frames lie: the viewer takes such streams even where they are hidden, for that alone."""
 
 
 @dataclass(frozen=True, slots=True)

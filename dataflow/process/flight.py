@@ -132,6 +132,9 @@ class FlightSink:
     def log(self, line: LogLine) -> None:
         self._sink.log(line)
 
+    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Sums of operators are told by their finish records."""
+
     def flush(self) -> None:
         self._sink.flush()
 

@@ -92,6 +92,9 @@ class RecorderSink:
         else:
             self._early_logs.append(line)
 
+    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Sums of operators are told by their finish records."""
+
     def flush(self) -> None:
         self.writer.flush()
 

@@ -67,6 +67,9 @@ class StreamSink(Protocol):
     def log(self, line: LogLine) -> None:
         """An operator has logged or printed something."""
 
+    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Operators have ended, and this is what each sums up."""
+
     def flush(self) -> None: ...
 
     def close(self, outcome: str) -> Mapping[str, Any]:
@@ -262,6 +265,8 @@ class SinkProcess:
                 self._outcome = fields["outcome"]
                 self._left = True
                 self._drain()
+                if self.sink is not None:
+                    self.sink.summaries(fields.get("summaries", {}))
             case "lost":
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")

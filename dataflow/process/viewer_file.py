@@ -45,6 +45,10 @@ class ViewerFileSink:
     def log(self, line: LogLine) -> None:
         self.viewer.log(self._logs, as_alarm(line, self._clock), wait=PATIENCE)
 
+    def summaries(self, found: Mapping[str, Mapping[str, Any]]) -> None:
+        """Shows the scores among them."""
+        self.viewer.scores(found)
+
     def end(self, stream: str, final_stamp: int | None, reason: str) -> None:
         """A stream that ended stays as it is."""
 

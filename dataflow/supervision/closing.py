@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from dataflow.supervision.life import Life, Step
+from dataflow.supervision.outcome import summaries_of
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run_state import Phase, RunState
 from dataflow.supervision.supervised import Supervised
@@ -97,7 +98,10 @@ class Closing:
             if process.life is Life.AWAY:
                 process.take(Step.GIVE_UP, run.steady)
             elif process.is_sink == sinks and process.take(Step.LEAVE, run.steady):
-                run.send(process, "leave", outcome=outcome)
+                if sinks:
+                    run.send(process, "leave", outcome=outcome, summaries=summaries_of(run))
+                else:
+                    run.send(process, "leave", outcome=outcome)
         return _Stage(sinks, run.steady + self._time_for(sinks=sinks))
 
     def _give_up_on(self, late: list[Supervised]) -> None:

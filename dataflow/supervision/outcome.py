@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from dataflow.supervision.report import RunReport
 from dataflow.supervision.run_state import RunState
 from dataflow.sync import FOREVER, NEVER
@@ -23,7 +26,7 @@ def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport
             for node in status.operators
             if status.drops.get(node)
         },
-        summaries={node: s for r in reports.values() for node, s in r.get("summaries", {}).items()},
+        summaries=summaries_of(run),
         transport={label: r["transport"] for label, r in reports.items() if "transport" in r},
         files={p.label: p.facts for p in run.processes.values() if p.is_sink},
         first=status.first,
@@ -38,3 +41,9 @@ def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport
             if found
         },
     )
+
+
+def summaries_of(run: RunState) -> dict[str, Mapping[str, Any]]:
+    """Returns what operators summed up at their end, as far as their processes have told."""
+    reports = [process.report or {} for process in run.processes.values()]
+    return {node: found for report in reports for node, found in report.get("summaries", {}).items()}

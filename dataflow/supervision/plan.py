@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dataflow.graph.model import Graph, Placement, current_placement
+from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.names import firings_key
 
 if TYPE_CHECKING:  # runs without faults read no fault plan
@@ -139,7 +140,8 @@ def process_plans(plan: RunPlan) -> dict[str, ProcessPlan]:
         options |= {"label": f"{graph.name}-{os.getpid()}", "settle": FLIGHT_SETTLES}
         sinks[RECORDER] = ("record", everything, options)
     if plan.view_file is not None:
-        shown = tuple(s for s in sorted(streams) if s not in graph.view.hide)
+        hidden = {s for s in graph.view.hide if not set(graph.streams[s].types) & set(PLACE_FRAMES)}
+        shown = tuple(sorted(streams - hidden))
         sinks[VIEWER_FILE] = ("view", shown, {"path": str(plan.view_file)})
     for label, (_, taken, _) in sinks.items():
         for stream in taken:

@@ -15,6 +15,7 @@ from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCl
 from dataflow.view.canvas import Role, plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
 from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, Outlook, entity_of
+from dataflow.view.scores import SCORES
 from dataflow.view.visualizers.scene_tree import HEIGHT, WIDTH
 
 _BACKGROUND = (24, 27, 33)
@@ -38,8 +39,10 @@ def blueprint(
     return blueprint_of(layout(streams, graph), outlook=outlook, following=following)
 
 
-def blueprint_of(shown: Layout, *, outlook: Outlook | None = None, following: bool = False) -> rrb.Blueprint:
-    """The views for a layout."""
+def blueprint_of(
+    shown: Layout, *, outlook: Outlook | None = None, following: bool = False, scores: bool = False
+) -> rrb.Blueprint:
+    """The views for a layout; `scores`: a run's scores are there."""
     chosen = shown.panels or PANELS
     world = _world(shown, outlook) if "world" in chosen else None
     cameras = [_camera(camera, shown) for camera in shown.cameras] if "cameras" in chosen else []
@@ -51,12 +54,13 @@ def blueprint_of(shown: Layout, *, outlook: Outlook | None = None, following: bo
 
     told = [name for name in _with_role(shown, "graph") if name not in shown.aside]
     words = _texts(shown) if "text" in chosen else []
+    judged = [rrb.TextDocumentView(origin=SCORES, name="Scores")] if scores and "scores" in chosen else []
     if told and world is not None:
         left = _stack((world, 5), (_tabs(side), 2))
-        beside = _stack((_tabs(cameras), 4), (_tabs(words), 4), (_tabs(plots), 2), (status, 1), (log, 1))
+        beside = _stack((_tabs(cameras), 4), (_one_of([*words, *judged]), 4), (_tabs(plots), 2), (status, 1), (log, 1))
     else:
         left = _stack((world, 3), (_row(cameras, 3), 2))
-        beside = _stack((_tabs([*side, *words]), 3), (_tabs(plots), 3), (status, 1), (log, 2))
+        beside = _stack((_tabs([*side, *words, *judged]), 3), (_tabs(plots), 3), (status, 1), (log, 2))
     if left is not None and beside is not None:
         root: Part = rrb.Horizontal(left, beside, column_shares=[2, 1] if told else [7, 3])
     else:
@@ -235,10 +239,13 @@ def _row(parts: Sequence[Part], columns: int) -> Part | None:
 
 def _tabs(parts: Sequence[Part]) -> Part | None:
     """One of several at a time, or, of two, both."""
-    if not parts:
-        return None
-    if len(parts) <= 2:
-        return parts[0] if len(parts) == 1 else rrb.Vertical(contents=parts)
+    return rrb.Vertical(contents=parts) if len(parts) == 2 else _one_of(parts)
+
+
+def _one_of(parts: Sequence[Part]) -> Part | None:
+    """One at a time, the first at first."""
+    if len(parts) <= 1:
+        return parts[0] if parts else None
     return rrb.Tabs(contents=parts, active_tab=0)
 
 

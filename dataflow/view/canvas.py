@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -12,7 +13,7 @@ import numpy.typing as npt
 import rerun as rr
 from rerun.error_utils import catch_and_log_exceptions
 
-from dataflow.messages import Message
+from dataflow.messages import Message, Odometry, Pose, Transforms
 from dataflow.view import colors
 from dataflow.view.frames import FrameCycleError, Rank
 from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
@@ -82,19 +83,31 @@ class Canvas:
         if self.scene.once(self.stream, text):
             self.recording.log(VIEWER_LOG, rr.TextLog(f"{self.stream}: {text}", level=level))
 
+    def place_frames(self, message: Message) -> None:
+        """Says where the frames lie that a message places, and draws nothing."""
+        match message:
+            case Transforms():
+                for frame, child, T in zip(message.frames, message.child_frames, message.matrices(), strict=True):
+                    self.place(frame, child, T, tree=True)
+            case Pose() | Odometry() if message.child_frame and message.child_frame != message.frame:
+                self.place(message.frame, message.child_frame, message.matrix())
+
     def place(self, parent: str, child: str, T_parent_child: npt.NDArray[np.float64], *, tree: bool = False) -> None:
         """Says where `child` lies: `T_parent_child` (4×4). `tree`: from a stream of transforms, which goes first.
 
         What cannot be (a frame within itself) is not drawn, and said once.
         """
+        if self.stream in self.scene.layout.placing:
+            place = partial(self.scene.offer, tree=tree)
+        else:
+            place = partial(self.scene.place, rank=Rank.TREE if tree else self.scene.rank(self.stream))
         try:
-            self.scene.place(
+            place(
                 self.recording,
                 parent=parent or NAMELESS,
                 child=child or NAMELESS,
                 T_parent_child=T_parent_child,
                 stream=self.stream,
-                rank=Rank.TREE if tree else self.scene.rank(self.stream),
                 stamp=self.stamp,
                 static=self.static,
             )
@@ -146,14 +159,17 @@ def visualize(
     """Draws `message` at `entity` on the timeline `stamp`; `stream` defaults to the entity's own name.
 
     Sets the calling thread's time on `recording`. Raises whatever the visualiser raises: a message that cannot be drawn
-    must not pass for one that was drawn.
+    must not pass for one that was drawn. Of a stream that is only to place frames nothing is drawn.
     """
     _load()
     draw = next(_visualizers[c] for c in type(message).__mro__ if c in _visualizers)
     recording.set_time(TIMELINE, timestamp=np.datetime64(message.stamp, "ns"))
     canvas = Canvas(recording, entity, stream or entity.lstrip("/"), message.stamp, scene)
     with catch_and_log_exceptions(strict=True):  # this thread only: Rerun otherwise turns errors into warnings
-        draw(canvas, message)
+        if canvas.stream in scene.layout.placing:
+            canvas.place_frames(message)
+        else:
+            draw(canvas, message)
 
 
 def _load() -> None:

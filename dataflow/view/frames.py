@@ -35,6 +35,7 @@ class Rank(IntEnum):
     TREE = 0
     ESTIMATE = 1
     TRUTH = 2
+    UNSHOWN = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,6 +131,11 @@ class FrameTree:
         if rival is not None:
             changes += self._align(child, rival, owner)
         return changes + self._join_roots()
+
+    def owner(self, frame: str) -> str | None:
+        """Returns the stream that places `frame`; None where nobody does."""
+        edge = self._edges.get(frame)
+        return None if edge is None or edge.assumed else edge.owner
 
     def pose(self, frame: str) -> Matrix | None:
         """`T_root_frame` (4×4), or None for a frame that is unknown."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from dataflow.graph.model import Graph
+from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.messages import (
     Boxes3D,
     CameraInfo,
@@ -29,7 +30,7 @@ COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
 DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 
-_TRUTH = {"truth", "groundtruth", "gt"}
+_TRUTH = {"true", "truth", "groundtruth", "gt"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +53,7 @@ class Layout:
     - `static`: streams whose one message holds for all time.
     - `aside`: truth that is drawn but switched off: scenes, surfaces, and boxes where others are estimated.
     - `kept`: clouds whose points stay where they were seen.
+    - `placing`: streams that are not shown, and of which only the frames that they place are taken.
     - `panels`: the parts of the window that the graph asks for; none: all.
     """
 
@@ -62,25 +64,33 @@ class Layout:
     aside: frozenset[str] = frozenset()
     panels: tuple[str, ...] = ()
     kept: frozenset[str] = frozenset()
+    placing: frozenset[str] = frozenset()
 
     def of_type(self, *types: type[Message]) -> tuple[str, ...]:
         """The streams of some types, sorted."""
         return tuple(name for name, type_ in self.streams.items() if issubclass(type_, types))
 
 
-def layout(streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()) -> Layout:
+def layout(
+    streams: Mapping[str, type[Message]],
+    graph: Graph | None = None,
+    static: Iterable[str] = (),
+    hidden: Iterable[str] = (),
+) -> Layout:
     """The layout of `streams` (name → message type), less those that are hidden and those that only decode another.
 
     With a graph, what is drawn over an image is found by walking the graph upstream; without one, by the words that
-    names share. `static` adds to what the graph says.
+    names share. `static` and `hidden` add to what the graph says.
     """
-    hidden = set(graph.view.hide) if graph is not None else set()
+    hidden = {*hidden, *(graph.view.hide if graph is not None else ())}
+    placing = frozenset(name for name, type_ in streams.items() if name in hidden and type_.SCHEMA in PLACE_FRAMES)
     shown = {name: streams[name] for name in sorted(streams) if name not in hidden}
     copies = _decoded(shown, graph) if graph is not None else {}
     shown = {name: type_ for name, type_ in shown.items() if name not in copies}
-    fixed = {name for name in static if name in shown}
+    fixed = set(static)
     if graph is not None:
-        fixed |= {name for name, stream in graph.streams.items() if stream.static and name in shown}
+        fixed |= {name for name, stream in graph.streams.items() if stream.static}
+    fixed &= shown.keys() | placing
 
     images = [name for name, type_ in shown.items() if issubclass(type_, COLOR)]
     depths = [name for name, type_ in shown.items() if issubclass(type_, DEPTH)]
@@ -101,7 +111,9 @@ def layout(streams: Mapping[str, type[Message]], graph: Graph | None = None, sta
     panels = graph.view.panels if graph is not None else ()
     aside = _aside(shown, graph)
     kept = frozenset(graph.view.keep if graph is not None else ())
-    return Layout(MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed), aside, panels, kept)
+    return Layout(
+        MappingProxyType(shown), cameras, MappingProxyType(planes), frozenset(fixed), aside, panels, kept, placing
+    )
 
 
 def plane_name(stream: str) -> str:
@@ -110,7 +122,7 @@ def plane_name(stream: str) -> str:
 
 
 def is_truth(stream: str) -> bool:
-    """Tells whether a stream's name says that it is ground truth (`truth`, `ground_truth`, `gt`)."""
+    """Tells whether a stream's name says that it is ground truth (`true`, `truth`, `ground_truth`, `gt`)."""
     return bool(_TRUTH & set(_words(stream)))
 
 

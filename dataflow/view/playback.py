@@ -7,9 +7,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from operator import itemgetter
 
 from dataflow.graph.model import Graph
+from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.messages import Alarm, Message
 from dataflow.recording import LogLine, Recorded, Recording
 from dataflow.recording.layout import RECORDING, logs_topic
+from dataflow.records.figures import recorded_summaries
 from dataflow.view.process import ViewerError
 from dataflow.view.sink import ViewerSink
 
@@ -34,7 +36,8 @@ def from_recording(
     """Opens `sink` for the recorded `streams` (None: all that have a message type) and logs what they hold.
 
     Static streams come first and whole; of the others, messages with start ≤ stamp ≤ end (ns). `graph` says what is
-    drawn over what, and what is hidden. The run's log is shown too where all streams are. Waits for the
+    drawn over what, and what is hidden. Frames are placed by what is recorded of them, whatever is shown. The run's log
+    is shown too where all streams are, and its scores where there is a graph. Waits for the
     viewer instead of dropping. `progress` is called with each stamp. Returns how many messages were handed over; the
     sink stays open. Raises `ViewerError` for a viewer that cannot be reached or takes nothing for 30 s,
     `RecordingError` for an unknown stream and for data that does not decode.
@@ -45,16 +48,25 @@ def from_recording(
         for name, info in readable.items()
         if info.message_type is not None and (streams is None or name in streams)
     }
-    static = [name for name in types if readable[name].static]
+    others = {
+        name: info.message_type
+        for name, info in readable.items()
+        if info.message_type is not None and name not in types and info.message_type.SCHEMA in PLACE_FRAMES
+    }
+    static = [name for name in (*types, *others) if readable[name].static]
     lines: Sequence[tuple[int, LogLine]] = ()
     if types.keys() >= readable.keys():
         lines = [entry for entry in recording.logs() if (start or 0) <= entry[0] and (end is None or entry[0] <= end)]
     logs = logs_topic(recording.metadata.get(RECORDING, {}).get("namespace", ""))
     if lines:
         types[logs] = Alarm
-    sink.open(types, graph, static)
+    sink.open(types | others, graph, static, hidden=others)
+    if graph is not None:
+        judges = (name for name, node in graph.nodes.items() if not node.outputs)
+        sink.scores(recorded_summaries(recording, judges))
+    wanted = None if streams is None else [*streams, *others]
     count = 0
-    for stream, message in _with_lines(recording.messages(streams, start, end), logs, lines):
+    for stream, message in _with_lines(recording.messages(wanted, start, end), logs, lines):
         dropped = sink.statistics().dropped
         count += sink.log(stream, message, wait=_PATIENCE)
         if sink.statistics().dropped > dropped:

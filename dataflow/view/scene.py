@@ -14,6 +14,7 @@ from dataflow.messages.geometry import split_matrix
 from dataflow.view import colors
 from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
 from dataflow.view.layout import Layout, is_truth
+from dataflow.view.unshown import Offer, Unshown
 
 Vector = npt.NDArray[np.float64]
 
@@ -101,6 +102,7 @@ class SceneState:
     trails: dict[str, Trail] = field(default_factory=dict)
     track_paths: dict[str, dict[int, deque[tuple[int, Vector]]]] = field(default_factory=dict)
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
+    unshown: Unshown = field(default_factory=Unshown)
     _noted: set[tuple[str, str]] = field(default_factory=set)
     _ranges: list[float] = field(default_factory=list)
     _around: list[Vector] = field(default_factory=list)
@@ -140,6 +142,7 @@ class SceneState:
         """A message names `frame`: makes sure that it hangs somewhere."""
         if frame not in self.tree:
             self.draw_frames(recording, self.tree.see(frame), stamp)
+            self._take_unshown(recording, frame, stamp)
 
     def place(
         self,
@@ -159,6 +162,39 @@ class SceneState:
         self._posed.setdefault(child)
         changes = self.tree.place(parent, child, T_parent_child, owner=stream, rank=rank, stamp=stamp)
         self.draw_frames(recording, changes, stamp, static=static)
+        self._take_unshown(recording, parent, stamp)
+
+    def offer(
+        self,
+        recording: rr.RecordingStream,
+        *,
+        parent: str,
+        child: str,
+        T_parent_child: Vector,
+        stream: str,
+        tree: bool,
+        stamp: int,
+        static: bool,
+    ) -> None:
+        """A message of a stream that is not shown places `child` in `parent`, if that is needed."""
+        if np.isfinite(T_parent_child).all():
+            rank = Rank.TREE if tree else self.rank(stream)
+            self.unshown.offer(child, Offer(parent, T_parent_child, stream, rank, stamp, static))
+            self._take_unshown(recording, child, stamp)
+
+    def _take_unshown(self, recording: rr.RecordingStream, child: str, stamp: int) -> None:
+        offer = self.unshown.needed(self.tree, child, stamp)
+        if offer is not None and (offer.stamp == stamp or self.tree.owner(child) is None):
+            self.place(
+                recording,
+                parent=offer.parent,
+                child=child,
+                T_parent_child=offer.T_parent_child,
+                stream=offer.stream,
+                rank=Rank.TREE if offer.rank is Rank.TREE else Rank.UNSHOWN,
+                stamp=stamp,
+                static=offer.static,
+            )
 
     def draw_frames(
         self, recording: rr.RecordingStream, changes: list[Change], stamp: int, *, static: bool = False

@@ -12,9 +12,9 @@ import subprocess
 import threading
 import traceback
 import uuid
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 from urllib.parse import urlsplit
@@ -24,11 +24,13 @@ import rerun as rr
 from dataflow.graph.model import Graph
 from dataflow.messages import Message
 from dataflow.view import process
+from dataflow.view.backlog import Backlog, Bounds
 from dataflow.view.blueprint import blueprint_of
 from dataflow.view.canvas import visualize
 from dataflow.view.layout import layout
 from dataflow.view.process import LOOPBACK, ViewerError
 from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, SceneState, ViewOptions, entity_of
+from dataflow.view.scores import SCORES, Summaries, document, scores_of
 from dataflow.view.targets import GRPC_PORT, Connect, Save, Serve, Spawn, Target
 
 SETTLE = 1_000_000_000
@@ -42,31 +44,12 @@ _FILE_BATCHES = rr.ChunkBatcherConfig(flush_tick=10.0, flush_num_bytes=8 << 20)
 
 
 @dataclass(frozen=True, slots=True)
-class Bounds:
-    """Bounds on what may wait for the viewer: messages and bytes of arrays."""
-
-    messages: int = 500
-    bytes: int = 64 << 20
-
-
-@dataclass(frozen=True, slots=True)
 class SinkStatistics:
     """Counts of messages: drawn, dropped because the viewer was too slow, failed to draw."""
 
     drawn: int
     dropped: int
     failed: int
-
-
-@dataclass(slots=True)
-class _Waiting:
-    """The queue between the callers and the drawing thread; guarded by `changed`."""
-
-    changed: threading.Condition = field(default_factory=threading.Condition)
-    static: deque[tuple[str, Message]] = field(default_factory=deque)
-    messages: deque[tuple[str, Message]] = field(default_factory=deque)
-    bytes: int = 0
-    closing: bool = False
 
 
 class ViewerSink:
@@ -86,34 +69,39 @@ class ViewerSink:
     ) -> None:
         self.target = target
         self._options = options or (FILE_OPTIONS if isinstance(target, Save) else ViewOptions())
-        self._bounds = bounds or Bounds()
         self._report = report or logging.getLogger(__name__).warning
         self._application = application
         self._recording: rr.RecordingStream | None = None
         self._scene = SceneState()
         self._thread: threading.Thread | None = None
         self._server: subprocess.Popen[bytes] | None = None
-        self._waiting = _Waiting()
+        self._backlog = Backlog(bounds or Bounds())
         self._counts: Counter[str] = Counter()
         self._reported: set[tuple[str, str]] = set()
         self._started_at: int | None = None
         self._graph: Graph | None = None
         self._outlook: Outlook | None = None
         self._seen: set[str] = set()
+        self._scores: Summaries = {}
         self._laid_out = False
 
     def open(
-        self, streams: Mapping[str, type[Message]], graph: Graph | None = None, static: Iterable[str] = ()
+        self,
+        streams: Mapping[str, type[Message]],
+        graph: Graph | None = None,
+        static: Iterable[str] = (),
+        hidden: Iterable[str] = (),
     ) -> None:
         """Starts or reaches the viewer and lays out its views. Raises `ViewerError`.
 
-        `streams`: name → message type. What the graph hides is not sent. `static`: streams whose one message holds for
-        all time, besides those that the graph says.
+        `streams`: name → message type. `static`: streams whose one message holds for all time, besides those that the
+        graph says. `hidden`: streams that are not shown, besides those that the graph hides; where they place frames,
+        these are placed all the same.
         """
         if self._recording is not None:
             raise ViewerError("this sink is open already")
         self._graph = graph
-        self._scene = SceneState(layout(streams, graph, static), self._options)
+        self._scene = SceneState(layout(streams, graph, static, hidden), self._options)
         name = graph.name if graph is not None else self._application
         batches = _FILE_BATCHES if isinstance(self.target, Save) else None
         recording = rr.RecordingStream(name, recording_id=uuid.uuid4(), batcher_config=batches)
@@ -139,29 +127,22 @@ class ViewerSink:
         """
         if self._recording is None:
             raise ViewerError("this sink is not open: call open() first")
-        if stream not in self._scene.layout.streams:
+        layout = self._scene.layout
+        if stream not in layout.streams and stream not in layout.placing:
             return False
-        waiting, size = self._waiting, message.nbytes()
-        with waiting.changed:
-            if waiting.closing:
-                return False
-            if stream in self._scene.layout.static:
-                waiting.static.append((stream, message))
-                waiting.changed.notify_all()
-                return True
-            if wait > 0:
-                waiting.changed.wait_for(lambda: not self._full(size) or waiting.closing, wait)
-            dropped = 0
-            while waiting.messages and self._full(size):
-                waiting.bytes -= waiting.messages.popleft()[1].nbytes()
-                dropped += 1
-            waiting.messages.append((stream, message))
-            waiting.bytes += size
-            self._counts["dropped"] += dropped
-            waiting.changed.notify_all()
+        if stream in layout.static:
+            return self._backlog.put_static(stream, message)
+        dropped = self._backlog.put(stream, message, wait)
+        if dropped is None:
+            return False
+        self._counts["dropped"] += dropped
         if dropped:
             self._tell("", "slow", "the viewer is too slow: some messages are not shown (the oldest are dropped)")
         return True
+
+    def scores(self, summaries: Summaries) -> None:
+        """Shows what operators have summed up at the end of a run: those without outputs, with a graph."""
+        self._backlog.put_scores(scores_of(summaries, self._graph))
 
     def statistics(self) -> SinkStatistics:
         """Returns what became of the messages so far."""
@@ -169,16 +150,13 @@ class ViewerSink:
 
     def backlog(self) -> int:
         """Tells how many messages wait to be drawn."""
-        with self._waiting.changed:
-            return len(self._waiting.static) + len(self._waiting.messages)
+        return len(self._backlog)
 
     def close(self, timeout: float = 10.0) -> bool:
         """Draws what waits, flushes and lets go of the viewer; returns whether all arrived within `timeout` seconds."""
         if self._recording is None or self._thread is None:
             return True
-        with self._waiting.changed:
-            self._waiting.closing = True
-            self._waiting.changed.notify_all()
+        self._backlog.close()
         self._thread.join(timeout)
         finished = not self._thread.is_alive()
         if not finished:
@@ -193,13 +171,6 @@ class ViewerSink:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-    def _full(self, size: int) -> bool:
-        """Tells whether another message of `size` bytes is too much; one message alone never is."""
-        waiting = self._waiting
-        return bool(waiting.messages) and (
-            len(waiting.messages) >= self._bounds.messages or waiting.bytes + size > self._bounds.bytes
-        )
 
     def _reach(self, recording: rr.RecordingStream) -> None:
         recording.set_log_time_enabled(False)
@@ -233,20 +204,14 @@ class ViewerSink:
 
     def _run(self) -> None:
         """The drawing thread: everything that may wait for the viewer happens here."""
-        recording, waiting = self._recording, self._waiting
+        recording = self._recording
         assert recording is not None
-        while True:
-            with waiting.changed:
-                waiting.changed.wait_for(lambda: waiting.static or waiting.messages or waiting.closing)
-                if waiting.static:
-                    stream, message = waiting.static.popleft()
-                elif waiting.messages:
-                    stream, message = waiting.messages.popleft()
-                    waiting.bytes -= message.nbytes()
-                else:
-                    break
-                waiting.changed.notify_all()
-            self._draw(recording, stream, message)
+        while (entry := self._backlog.take()) is not None:
+            if isinstance(entry, tuple):
+                self._draw(recording, *entry)
+            else:
+                self._scores = entry
+                self._guarded("", lambda: self._score(recording))
         self._guarded("", lambda: self._settle(recording))
         if isinstance(self.target, Save):
             self._guarded("", lambda: self._look_again(recording))
@@ -271,6 +236,11 @@ class ViewerSink:
             self._guarded("", lambda: self._settle(recording))
         for doubt in self._scene.doubts(message.stamp):
             recording.log(VIEWER_LOG, rr.TextLog(doubt, level="INFO"))
+
+    def _score(self, recording: rr.RecordingStream) -> None:
+        recording.log(SCORES, document(self._scores), static=True)
+        if self._outlook is not None:
+            self._lay_out(recording)
 
     def _settle(self, recording: rr.RecordingStream) -> None:
         """Decides, once, which way is up and where to look from."""
@@ -306,7 +276,8 @@ class ViewerSink:
         full = self._scene.layout
         shown = layout({name: type_ for name, type_ in full.streams.items() if name in self._seen}, self._graph)
         following = not isinstance(self.target, Save) or self.target.at_end
-        recording.send_blueprint(blueprint_of(shown, outlook=self._outlook, following=following))
+        blueprint = blueprint_of(shown, outlook=self._outlook, following=following, scores=bool(self._scores))
+        recording.send_blueprint(blueprint)
 
     def _guarded(self, stream: str, action: Callable[[], object]) -> bool:
         """Runs an action whose failure must not end the viewer; returns whether it worked."""

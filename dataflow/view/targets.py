@@ -37,9 +37,9 @@ class Serve:
 
     @property
     def url(self) -> str:
-        """Returns what to open in the browser."""
+        """Returns what to open in the browser: dark, as colours of classes are chosen to be read on."""
         data = quote(f"rerun+http://{LOOPBACK}:{self.grpc_port}/proxy", safe="")
-        return f"http://{LOOPBACK}:{self.web_port}/?url={data}"
+        return f"http://{LOOPBACK}:{self.web_port}/?url={data}&theme=dark"
 
 
 @dataclass(frozen=True, slots=True)

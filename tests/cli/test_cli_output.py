@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from dataflow.cli.arguments import chosen_streams, existing, output_file, window
-from dataflow.cli.output import figure, friendly_errors, jsonable, plural, seconds, size
+from dataflow.cli.output import friendly_errors, jsonable, plural, seconds, size
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report, report_json
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
@@ -34,13 +34,6 @@ def test_sizes_change_unit_at_a_thousand(nbytes: float, text: str) -> None:
 )
 def test_durations_are_written_for_people(duration: float, text: str) -> None:
     assert seconds(duration) == text
-
-
-def test_figures_carry_the_unit_of_their_name() -> None:
-    assert figure("ate_rmse_m", 0.0212999) == ("ate rmse", "0.0213", "m")
-    assert figure("rpe_1s_rmse_deg", 0.5) == ("rpe 1s rmse", "0.5", "°")
-    assert figure("unmatched_poses", 12345) == ("unmatched poses", "12,345", "")
-    assert figure("alignment_m", "se3") == ("alignment m", "se3", "")
 
 
 def test_one_stream_is_not_plural() -> None:

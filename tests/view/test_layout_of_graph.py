@@ -15,6 +15,7 @@ from dataflow.messages import (
     Detections2D,
     Image,
     Message,
+    Odometry,
     SceneGraph,
 )
 from dataflow.view.layout import layout
@@ -72,6 +73,13 @@ def test_hidden_streams_are_not_shown() -> None:
     shown = layout(TYPES, graph(hide=("r/left/image", "r/left/info")))
     assert "r/left/image" not in shown.streams
     assert {camera.image for camera in shown.cameras} == {"r/right/image", "r/gray/image", "r/monodepth/depth"}
+
+
+def test_of_hidden_streams_those_that_place_frames_are_taken_for_that() -> None:
+    types = TYPES | {"r/odometry/odometry": Odometry}
+    hidden = ("r/left/image", "r/odometry/odometry")
+    assert layout(types, graph(hide=hidden)).placing == {"r/odometry/odometry"}
+    assert layout(TYPES, graph(), hidden=hidden[:1]).streams.keys() == TYPES.keys() - {"r/left/image"}
 
 
 def test_an_image_and_what_only_decodes_it_are_shown_once_with_overlays_on_the_one_that_stays() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 import rerun.blueprint as rrb
 from rrd_rows import at, blueprint_rows, rows
 
-from dataflow.graph.model import Bundle, Graph
+from dataflow.graph.model import Bundle, Graph, Live, Node
 from dataflow.graph.sections import Record, View
 from dataflow.messages import (
     CameraInfo,
@@ -20,9 +21,11 @@ from dataflow.messages import (
     Diagnostics,
     Image,
     Imu,
+    LaserScan,
     Message,
     Pose,
     SceneGraph,
+    Transforms,
     array,
 )
 from dataflow.recording import Recording, RecordingWriter
@@ -37,10 +40,10 @@ from dataflow.view import (
     parse_target,
     visualizer,
 )
+from dataflow.view.backlog import Bounds
 from dataflow.view.blueprint import blueprint
 from dataflow.view.frames import Rank
 from dataflow.view.scene import SceneState
-from dataflow.view.sink import Bounds
 
 STAMP = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -75,6 +78,10 @@ def imu(stamp: int) -> Imu:
 
 def pose(stamp: int, x: float = 0.0) -> Pose:
     return Pose(stamp=stamp, frame="world", child_frame="optical", position=[x, 0, 0], orientation=[0, 0, 0, 1])
+
+
+def scan(stamp: int) -> LaserScan:
+    return LaserScan(stamp=stamp, frame="lidar", angle_min=0.0, angle_max=0.1, ranges=[1.0, 2.0])
 
 
 def test_a_saved_file_holds_the_messages_at_their_stamps(tmp_path: Path) -> None:
@@ -267,6 +274,72 @@ def test_a_recording_is_played_with_its_static_streams_whole(tmp_path: Path) -> 
     found = rows(tmp_path / "a.rrd")
     assert [row.stamp for row in at(found, "/r/c/info", "Pinhole:resolution")] == [None]
     assert [r.stamp - STAMP for r in at(found, "/r/c/truth/space/axes", "Arrows3D:vectors")] == [3, 4, 5]
+
+
+@pytest.mark.parametrize("by_graph", [True, False])
+def test_a_stream_that_is_not_shown_places_its_frame_all_the_same(by_graph: bool, tmp_path: Path) -> None:
+    path, nothing = tmp_path / "a.rrd", Graph("g", "r", {}, {}, Record(()), Bundle("g.yaml", {"g.yaml": ""}))
+    made = replace(nothing, view=View(hide=("odometry", "frames")))
+    with ViewerSink(Save(path)) as sink:
+        sink.open(
+            {"odometry": Pose, "frames": Transforms, "scan": LaserScan},
+            made if by_graph else nothing,
+            static=["frames"],
+            hidden=() if by_graph else ["odometry", "frames"],
+        )
+        frames = Transforms(
+            stamp=STAMP,
+            frames=("optical",),
+            child_frames=("lidar",),
+            translations=[[0, 0, 0.5]],
+            rotations=[[0, 0, 0, 1]],
+        )
+        assert sink.log("frames", frames)
+        for k in range(3):
+            assert sink.log("odometry", pose(STAMP + k, 2.0 + k))
+            sink.log("scan", scan(STAMP + k))
+    found = rows(path)
+    placed = {row.stamp: row.values for row in at(found, "/frames/optical", "Transform3D:translation")}
+    assert placed[STAMP + 2] == [[4.0, 0.0, 0.0]]
+    assert at(found, "/frames/lidar", "Transform3D:translation")[0].values == [[0.0, 0.0, 0.5]]
+    assert not [row for row in found if row.entity.startswith(("/odometry", "/frames/space"))]
+
+
+def test_a_stream_that_is_not_shown_wins_no_frame_from_one_that_is_and_brings_none_of_its_own(tmp_path: Path) -> None:
+    def placed_by(frame: str, k: int, x: float) -> Pose:
+        return Pose(stamp=STAMP + k, frame=frame, child_frame="lidar", position=[x, 0, 0], orientation=[0, 0, 0, 1])
+
+    path = tmp_path / "a.rrd"
+    with ViewerSink(Save(path)) as sink:
+        sink.open({"shown": Pose, "wheels": Pose, "scan": LaserScan}, hidden=["wheels"])
+        for k in range(3):
+            sink.log("wheels", placed_by("wheel_odom", k, 9.0))
+            sink.log("scan", scan(STAMP + k))
+            sink.log(
+                "shown",
+                Pose(stamp=STAMP + k, frame="world", child_frame="lidar", position=[2, 0, 0], orientation=[0, 0, 0, 1]),
+            )
+    found = rows(path)
+    assert {row.values[0] for row in at(found, "/frames/lidar", "Transform3D:parent_frame")} == {"world"}
+    assert not [row for row in found if row.entity == "/frames/wheel_odom"]
+
+
+def test_scores_of_operators_without_outputs_have_a_panel(tmp_path: Path) -> None:
+    judge, maker = (
+        Node(name, "nowhere:Nothing", {}, {}, outputs, Live("newest", 1, {}))
+        for name, outputs in (("trajectory_score", {}), ("odometry", {"pose": "r/odometry/pose"}))
+    )
+    made = Graph("g", "r", {n.name: n for n in (judge, maker)}, {}, Record(()), Bundle("g.yaml", {"g.yaml": ""}))
+    path = tmp_path / "a.rrd"
+    with ViewerSink(Save(path)) as sink:
+        sink.open({"r/odometry/pose": Pose}, made)
+        sink.log("r/odometry/pose", pose(STAMP))
+        sink.scores({"trajectory_score": {"ate_rmse_m": 0.01269, "matched": 1210}, "odometry": {"frames": 3}})
+    (text,) = (row.values[0] for row in at(rows(path), "/viewer/scores", "TextDocument:text"))
+    assert "| ate rmse | 0.01269 m |" in text
+    assert "| matched | 1,210 |" in text
+    assert "frames" not in text
+    assert "Scores" in [row.values[0] for row in blueprint_rows(path) if row.component.endswith("display_name")]
 
 
 def test_targets_are_named_in_words() -> None:

@@ -22,8 +22,8 @@ _GAP = 5.0  # metres: a farther step than this is a jump, and no line is drawn a
 @visualizer(Transforms, "space")
 def transforms(canvas: Canvas, message: Transforms) -> None:
     """Frames of the tree, with their axes."""
-    for frame, child, T in zip(message.frames, message.child_frames, message.matrices(), strict=True):
-        canvas.place(frame, child, T, tree=True)
+    canvas.place_frames(message)
+    for child in message.child_frames:
         if child and canvas.scene.changed(canvas.entity, f"axes {child}", True):
             where = f"space/{rr.escape_entity_path_part(child)}"
             canvas.log(where, rr.CoordinateFrame(child), _axes(np.eye(4), 0.6 * _AXIS), static=True)
@@ -32,13 +32,15 @@ def transforms(canvas: Canvas, message: Transforms) -> None:
 @visualizer(Pose, "space")
 def pose(canvas: Canvas, message: Pose) -> None:
     """Axes, the trail behind them, the covariance of the position; a named child frame follows the pose."""
-    _moving(canvas, message.frame, message.child_frame, message.matrix(), message.covariance)
+    canvas.place_frames(message)
+    _moving(canvas, message.frame, message.matrix(), message.covariance)
 
 
 @visualizer(Odometry, "space", "plot")
 def odometry(canvas: Canvas, message: Odometry) -> None:
     """As a pose, and a curve of the speed: as given, else from one pose to the next; and of the rate of turn."""
-    _moving(canvas, message.frame, message.child_frame, message.matrix(), message.pose_covariance)
+    canvas.place_frames(message)
+    _moving(canvas, message.frame, message.matrix(), message.pose_covariance)
     speed = None if message.linear is None else float(np.linalg.norm(message.linear))
     before = canvas.scene.remembered.get((canvas.entity, "before"))
     canvas.scene.remembered[canvas.entity, "before"] = (message.stamp, message.position)
@@ -109,7 +111,6 @@ def nav_sat_fix(canvas: Canvas, message: NavSatFix) -> None:
 def _moving(
     canvas: Canvas,
     frame: str,
-    child: str,
     T_frame_child: npt.NDArray[np.float64],
     covariance: npt.NDArray[np.float64] | None,
 ) -> None:
@@ -119,8 +120,6 @@ def _moving(
         canvas.clear("space/name")
         canvas.scene.trails.pop(canvas.entity, None)
         return
-    if child and child != frame:
-        canvas.place(frame, child, T_frame_child)
     canvas.draw("space/axes", frame, _axes(T_frame_child, _AXIS))
     position = T_frame_child[:3, 3]
     if covariance is not None:

@@ -1,0 +1,35 @@
+"""What operators sum up at their end, such as the scores of metrics, as a panel of tables."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import rerun as rr
+
+from dataflow.graph.model import Graph
+from dataflow.records.figures import figure
+
+SCORES = "/viewer/scores"
+"""Entity of the scores."""
+
+Summaries = Mapping[str, Mapping[str, Any]]
+"""Operator → name of a figure → value."""
+
+
+def scores_of(summaries: Summaries, graph: Graph | None) -> Summaries:
+    """Returns those of operators without outputs, which only judge; of others the report of the run tells."""
+    nodes = graph.nodes if graph is not None else {}
+    return {name: found for name, found in summaries.items() if found and not (name in nodes and nodes[name].outputs)}
+
+
+def document(summaries: Summaries) -> rr.TextDocument:
+    """One table for each operator; a figure's value with its unit."""
+    parts = []
+    for operator, found in summaries.items():
+        rows = [f"| **{operator.replace('_', ' ')}** | of the whole run |", "|---|---|"]
+        for name, value in found.items():
+            label, text, unit = figure(name, value)
+            rows.append(f"| {label} | {' '.join((text, unit)).rstrip()} |".replace("\n", " "))
+        parts.append("\n".join(rows))
+    return rr.TextDocument("\n\n".join(parts), media_type=rr.MediaType.MARKDOWN)
