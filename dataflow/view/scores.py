@@ -1,4 +1,4 @@
-"""What operators sum up at their end, such as the scores of metrics, as a panel of tables."""
+"""Figures that operators sum up at their end, such as the scores of metrics, as a panel of tables."""
 
 from __future__ import annotations
 

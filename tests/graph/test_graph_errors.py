@@ -353,7 +353,7 @@ CASES = {
     ),
     "no_such_panel": (
         HEAD + "view: {panels: [world, plot]}\n",
-        "4:24: panels must be one of world, cameras, scene, map, text, plots, status, log, not the text 'plot'",
+        "4:24: panels must be one of world, cameras, scene, map, text, scores, plots, status, log, not the text 'plot'",
         "did you mean 'plots'?",
     ),
     "layout_of_no_kind": (
