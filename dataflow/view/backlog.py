@@ -1,4 +1,4 @@
-"""Messages that wait to be drawn: bounded in number and bytes; where there is no room, the oldest goes.
+"""Messages that wait to be drawn: bounded in number and bytes; where there is no room, the oldest goes."""
 
 from __future__ import annotations
 
