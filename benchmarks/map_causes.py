@@ -18,15 +18,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from semantic_map import IOU, PIXELS, SEARCH, VISIBLE, scored
-from sensed_worlds import Frame, World, sensed
+from semantic_map import IOU, PIXELS, VISIBLE, scored
+from sensed_worlds import Frame, Mapper, World, sensed
 
 from dataflow.messages import Boxes3D, SceneGraph
 from dataflow.messages.geometry import transform_points
-from operators.cloud import PlaneSegmenter
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
-from operators.scene import ObjectLifter, SemanticMap
+from operators.scene import SemanticMap
 from operators.scene.box_overlap import upright_iou
 from operators.scene.scoring import Box, NodeScore, boxes_of
 from operators.tracking.assignment import overlap
@@ -47,28 +46,14 @@ class Trail:
 
 def follow(world: World, every: int, **params: Any) -> tuple[dict[int, Trail], list[SceneGraph], SemanticMap]:
     """Runs lifter and map on what was sensed, and notes what became of every object that was plainly seen."""
-    lifter, planes, known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
-    for operator in (lifter, planes, known):
-        operator.setup()
+    mapper = Mapper(**params)
     trails: dict[int, Trail] = defaultdict(Trail)
     nodes: list[SceneGraph] = []
     for frame in world.frames[::every]:
-        found = lifter.process(
-            frame.detections, frame.cloud, world.image_info, world.extrinsics, frame.segmentation, frame.camera
-        )
-        made = known.process(
-            found["boxes"],
-            found["clusters"],
-            frame.cloud,
-            frame.camera,
-            world.extrinsics,
-            found["images"],
-            world.image_info,
-            planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
-        )
-        nodes.append(made["nodes"])
+        found, made = mapper.take(world, frame, frame.detections, frame.segmentation)
+        nodes.append(made)
         _note(trails, frame, world, found["boxes"], found["clusters"].labels)
-    return trails, nodes, known
+    return trails, nodes, mapper.known
 
 
 def _note(trails: dict[int, Trail], frame: Frame, world: World, boxes: Boxes3D, labels: Any) -> None:

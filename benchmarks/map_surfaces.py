@@ -18,14 +18,12 @@ from pathlib import Path
 import numpy as np
 from map_causes import classes_of, instances_of
 from numpy.typing import NDArray
-from semantic_map import SEARCH
-from sensed_worlds import KINDS, Frame, World, sensed
+from sensed_worlds import KINDS, Frame, Mapper, World, sensed
 
 from dataflow.messages import SceneGraph
 from dataflow.messages.geometry import transform_points
-from operators.cloud import PlaneSegmenter
 from operators.geometry.extrinsics import transform_between
-from operators.scene import ObjectLifter, SceneGraphBuilder, SemanticMap
+from operators.scene import SceneGraphBuilder
 from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import Cells
 from operators.scene.scoring import Box, boxes_of, match_nodes
@@ -68,25 +66,11 @@ class Figures:
 
 def mapped(world: World) -> tuple[list[SceneGraph], list[SceneGraph]]:
     """Returns the map, and the graph built on it, once a second."""
-    lifter, planes, known, builder = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(), SceneGraphBuilder()
-    for each in (lifter, planes, known, builder):
-        each.setup()
+    mapper, builder = Mapper(), SceneGraphBuilder()
+    builder.setup()
     maps, graphs = [], []
     for k, frame in enumerate(world.frames):
-        found = lifter.process(
-            frame.detections, frame.cloud, world.image_info, world.extrinsics, frame.segmentation, frame.camera
-        )
-        surfaces = planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces")
-        nodes = known.process(
-            found["boxes"],
-            found["clusters"],
-            frame.cloud,
-            frame.camera,
-            world.extrinsics,
-            found["images"],
-            world.image_info,
-            surfaces,
-        )["nodes"]
+        nodes = mapper.take(world, frame, frame.detections, frame.segmentation)[1]
         graph = builder.process(nodes, frame.base)["graph"]
         if k % 4 == 0:
             maps.append(nodes)

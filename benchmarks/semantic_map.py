@@ -15,23 +15,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sensed_worlds import World, sensed
+from sensed_worlds import Mapper, World, sensed
 
 from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
-from operators.cloud import PlaneSegmenter
-from operators.scene import ObjectLifter, SemanticMap
 from operators.scene.scoring import MOVERS, NodeScore, PlainlySeen, score_nodes
 
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5
-SEARCH: dict[str, Any] = {"voxel": 0.08, "period": 2.0}
-"""Parameters of PlaneSegmenter, as in graphs/core/perception.yaml."""
 
 
 def mapped(world: World, *, true: bool, **params: Any) -> list[SceneGraph]:
     """Returns the map after each frame."""
-    lifter, planes, known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
-    for operator in (lifter, planes, known):
-        operator.setup()
+    mapper = Mapper(**params)
     nodes: list[SceneGraph] = []
     for frame in world.frames:
         detections: Detections2D = frame.objects if true else frame.detections
@@ -39,18 +33,7 @@ def mapped(world: World, *, true: bool, **params: Any) -> list[SceneGraph]:
         if true:
             enough = (frame.objects.visible >= 0.2) & (frame.objects.pixel_counts >= 100)
             detections = chosen(frame.objects, enough)
-        found = lifter.process(detections, frame.cloud, world.image_info, world.extrinsics, masks, frame.camera)
-        made = known.process(
-            found["boxes"],
-            found["clusters"],
-            frame.cloud,
-            frame.camera,
-            world.extrinsics,
-            found["images"],
-            world.image_info,
-            planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
-        )
-        nodes.append(made["nodes"])
+        nodes.append(mapper.take(world, frame, detections, masks)[1])
     return nodes
 
 

@@ -23,13 +23,16 @@ from dataflow.messages import (
     SegmentationMap,
     Transforms,
 )
-from operators.cloud import CloudBuilder
+from operators.cloud import CloudBuilder, PlaneSegmenter
 from operators.detection import CustomDetector
+from operators.scene import ObjectLifter, SemanticMap
 from operators.segmentation import Segmenter
 from operators.sources.simulated_robot import SimulatedRobot
 
 KINDS = ("office", "table_top", "corridor")
 RATE, SECONDS = 4.0, 50
+SEARCH: dict[str, Any] = {"voxel": 0.08, "period": 2.0}
+"""Parameters of PlaneSegmenter, as in graphs/core/perception.yaml."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,32 @@ class World:
     image_info: CameraInfo
     extrinsics: Transforms
     frames: list[Frame]
+
+
+class Mapper:
+    """Lifter, planes and map, wired as in the perception graph."""
+
+    def __init__(self, **params: Any) -> None:
+        self.lifter, self.planes, self.known = ObjectLifter(), PlaneSegmenter(**SEARCH), SemanticMap(**params)
+        for operator in (self.lifter, self.planes, self.known):
+            operator.setup()
+
+    def take(
+        self, world: World, frame: Frame, detections: Detections2D, masks: SegmentationMap
+    ) -> tuple[dict[str, Any], SceneGraph]:
+        """Returns what was lifted from a frame, and the map after it."""
+        found = self.lifter.process(detections, frame.cloud, world.image_info, world.extrinsics, masks, frame.camera)
+        made = self.known.process(
+            found["boxes"],
+            found["clusters"],
+            frame.cloud,
+            frame.camera,
+            world.extrinsics,
+            found["images"],
+            world.image_info,
+            self.planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
+        )
+        return dict(found), made["nodes"]
 
 
 def sense(kind: str, seed: int) -> World:
