@@ -1,4 +1,4 @@
-"""`dataflow scene`: the scene graph of a recording, in words, as JSON, or asked for something."""
+"""Commands of `dataflow scene`: the scene graph of a recording, in words, as JSON, or asked for something."""
 
 from __future__ import annotations
 
