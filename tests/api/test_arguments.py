@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 from watched import Camera, Judge, Photometer
 
 import dataflow
 from dataflow.arguments import checked, describe, find_fault
+from dataflow.cli.main import app
 from dataflow.messages import Number
 from dataflow.reexecution.recorded_run import ReplayError
 
@@ -220,3 +223,12 @@ def test_what_the_call_itself_refuses_is_left_to_it() -> None:
     with pytest.raises(TypeError, match="unexpected keyword argument 'heigth'"):
         sized(2, heigth=3)  # type: ignore[call-arg]
     assert describe(Sequence[float]) == "a sequence of numbers"
+
+
+def test_the_command_takes_only_several_times(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    watch().run(record=path)
+
+    shown = CliRunner().invoke(app, ["verify", str(path), "--only", "meter", "--only", "judge", "--json", "-j", "1"])
+    assert shown.exit_code == 0, shown.output
+    assert {operator["operator"] for operator in json.loads(shown.stdout)["operators"]} == {"meter", "judge"}
