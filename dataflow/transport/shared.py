@@ -28,6 +28,7 @@ SLOTS: Final = 4096
 BOARD_BYTES: Final = 8 * (SLOTS + 1)
 _SEAL_FUTURE_WRITE: Final = 0x0010  # Linux 5.1; not in Python 3.11's fcntl
 POOL_NAME: Final = "dataflow-pool-"
+_REFERENCE: Final = bytes([Kind.REFERENCE])
 
 
 class SharedMemoryError(RuntimeError):
@@ -139,7 +140,7 @@ class PoolReader:
         mapped and `DecodeError` for what is no reference.
         """
         _, _, _, head_bytes, body_bytes = PRELUDE.unpack_from(payload)
-        fields = _reference(payload[PRELUDE.size + head_bytes :], body_bytes)
+        fields = _reference(memoryview(payload)[PRELUDE.size + head_bytes :], body_bytes)
         pool_id, base, pid, descriptor, offset, size, slot, generation = fields
         used = board.pool(base)
         pool = self._map(pool_id, pid, descriptor) if used is None else used
@@ -160,13 +161,13 @@ class PoolReader:
 
 def is_reference(payload: bytes) -> bool:
     """Tells whether the payload is an envelope that stands for one in shared memory."""
-    return len(payload) >= PRELUDE.size and payload[:4] == MAGIC and payload[5] == Kind.REFERENCE
+    return payload[5:6] == _REFERENCE and payload[:4] == MAGIC and len(payload) >= PRELUDE.size
 
 
 _unpack = partial(msgpack.unpackb, raw=False, use_list=False, max_array_len=8, max_str_len=16, max_map_len=0)
 
 
-def _reference(body: bytes, body_bytes: int) -> tuple[Any, ...]:
+def _reference(body: memoryview, body_bytes: int) -> tuple[Any, ...]:
     try:
         fields = _unpack(body)
     except Exception as error:  # msgpack raises a dozen types for malformed input
@@ -176,7 +177,8 @@ def _reference(body: bytes, body_bytes: int) -> tuple[Any, ...]:
         or not isinstance(fields, tuple)
         or len(fields) != 8
         or type(fields[0]) is not str
-        or not all(type(f) is int and f >= 0 for f in fields[1:])
+        or {type(f) for f in fields[1:]} != {int}
+        or min(fields[1:]) < 0
     ):
         raise DecodeError("reference: expected [pool id, base, process, descriptor, offset, size, slot, generation]")
     return fields
