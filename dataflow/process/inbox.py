@@ -48,7 +48,7 @@ class Inbox:
 
     def take_turn(self) -> bool:
         """Takes the turn until `give_turn`, on any thread, if the one that has it waits and nothing is there for it."""
-        if not self._asleep or not self._turn.acquire(blocking=False):
+        if not self._asleep or not self._turn.acquire(False):
             return False
         if self._items:
             self._turn.release()
