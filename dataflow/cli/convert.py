@@ -30,7 +30,19 @@ if TYPE_CHECKING:
     from dataflow.interop.export.report import Exported
 
 Format = Literal[
-    "mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "kitti-raw", "lerobot", "csv", "parquet"
+    "mcap",
+    "ros2",
+    "foxglove",
+    "rrd",
+    "tum",
+    "7scenes",
+    "euroc",
+    "kitti",
+    "kitti-raw",
+    "lerobot",
+    "lerobot-v3",
+    "csv",
+    "parquet",
 ]
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 """Of formats that are one file; the others are folders."""
@@ -63,8 +75,9 @@ def convert(
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
     kept as they are. Into mcap, ros2 and foxglove, attachments and metadata records of an MCAP file go along; other
     formats have no place for them, which is said. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a
-    kind: --stream chooses among several. Into lerobot, every image of the first camera is a frame, with the newest
-    message of every other stream.
+    kind: --stream chooses among several. Into lerobot (format 2.1) and lerobot-v3 (3.0), every image of the first
+    camera is a frame, with the newest message of every other stream; images stay images, lossless, since no video
+    encoder is among the dependencies.
 
     Exit codes:
 
@@ -83,6 +96,7 @@ def convert(
       dataflow convert run.mcap folder --to kitti --stream camera/*
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
+      dataflow convert run.mcap folder --to lerobot-v3 --action cmd/twist --task "pick up the cup"
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
@@ -96,8 +110,8 @@ def convert(
             _tell_rrd(recording)
             return
         with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            if to != "lerobot" and (action is not None or task):
-                raise fail("--action and --task are of --to lerobot")
+            if not to.startswith("lerobot") and (action is not None or task):
+                raise fail("--action and --task are of --to lerobot and lerobot-v3")
             done = _export(material, output, to, overwrite, watch, action, task)
     if json:
         print_json(done.as_json())
@@ -196,10 +210,12 @@ def _export(
             export_foxglove(material, output, done)
         case "ros2":
             export_ros2(material, output, done)
-        case "lerobot":
+        case "lerobot" | "lerobot-v3":
             from dataflow.interop.export.lerobot import export_lerobot
+            from dataflow.interop.export.lerobot_layouts import Layout21, Layout30
 
-            export_lerobot(material, output, done, action=action, task=task)
+            layout = Layout21() if to == "lerobot" else Layout30()
+            export_lerobot(material, output, done, layout=layout, action=action, task=task)
         case "csv":
             export_csv(material, output, done)
         case "parquet":
