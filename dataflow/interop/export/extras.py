@@ -21,7 +21,7 @@ ROSBAG2 = "rosbag2"
 
 
 class Extras:
-    """What the files of a material hold besides messages, under the names that they get in one file.
+    """Attachments and metadata records of a material's files, under the names that they get in one file.
 
     Of several files (a split bag), what they hold equally is there once, and other content of one name is called
     `FILE/NAME`. `runs`: metadata records that describe a run of ours, which a conversion does not keep.

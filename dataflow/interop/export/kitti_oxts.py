@@ -25,7 +25,7 @@ MODES = {"no_fix": 0, "fix": 3, "gbas": 4, "rtk_float": 5, "rtk_fixed": 6, "sbas
 """Position mode of the primary receiver by the kind of fix."""
 OXTS = "oxts"
 KINDS: tuple[type[Message], ...] = (Imu, NavSatFix, Odometry)
-"""What a packet is made of."""
+"""The messages that a packet is made of."""
 
 
 def write_oxts(material: Material, stamps: Sequence[int], drive: Path, times: Any, done: Exported) -> str | None:
