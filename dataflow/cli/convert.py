@@ -96,7 +96,7 @@ def convert(
       dataflow convert run.mcap folder --to kitti --stream camera/*
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
-      dataflow convert run.mcap folder --to lerobot-v3 --action cmd/twist --task "pick up the cup"
+      dataflow convert run.mcap folder --to lerobot-v3 --task "pick up cups"
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
