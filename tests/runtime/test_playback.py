@@ -1,4 +1,4 @@
-"""A replay that is paused and stepped makes what one that is not makes, and is not taken for stuck."""
+"""A replay or a run that is paused and stepped makes what one that is not makes, and is not taken for stuck."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dataflow.client.attach import find_running
+from dataflow.client.attach import NotRunning, find_running
 from dataflow.client.playback import ask
 from dataflow.graph import load_graph
 from dataflow.supervision.run import replay, run
@@ -28,7 +28,10 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def stepped(recorded: Path, steer: Any, **options: Any) -> Any:
     """Replays while `steer(supervisor)` runs on a thread of its own."""
+    return replay(recorded, placement="one_process", controls=steered(steer), **options)
 
+
+def steered(steer: Any) -> Any:
     @contextmanager
     def controls(supervisor: Supervisor) -> Iterator[None]:
         thread = threading.Thread(target=steer, args=(supervisor,))
@@ -36,7 +39,7 @@ def stepped(recorded: Path, steer: Any, **options: Any) -> Any:
         yield
         thread.join()
 
-    return replay(recorded, placement="one_process", controls=controls, **options)
+    return controls
 
 
 def until(holds: Any, seconds: float = 30.0) -> None:
@@ -80,7 +83,59 @@ def test_a_script_pauses_and_steps_from_outside(recorded: Path) -> None:
 
     report = stepped(recorded, steer, paused=True)
 
-    assert answers[0] == {"ok": True, "paused": True, "ended": False, "stamp": None}
+    assert answers[0] == {"paused": True, "ended": False, "speed": None, "stamp": None, "replay": True}
     assert answers[1]["paused"]
     assert not answers[-1]["paused"]
     assert report.streams == replay(recorded, placement="one_process").streams
+
+
+def test_a_plain_run_whose_sources_are_in_two_processes_is_paused_stepped_and_paced(recorded: Path) -> None:
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=40"])
+    answers: list[dict[str, Any]] = []
+    given: list[dict[str, int]] = []
+
+    def steer(supervisor: Supervisor) -> None:
+        firings = lambda: {  # noqa: E731
+            name: supervisor.status.operators[name].firings if name in supervisor.status.operators else 0
+            for name in ("left", "right")
+        }
+        until(lambda: supervisor.status.paused)
+        found = find_running("chaos", wait=30)
+        given.append(firings())
+        answers.append(ask(found, "step", 3))
+        until(lambda: firings() == {"left": 3, "right": 3})
+        threading.Event().wait(1.2)  # longer than it may be stuck
+        given.append(firings())
+        answers.append(ask(found, "speed", speed=50.0))
+        until(lambda: supervisor.status.speed == 50.0)
+        supervisor.play("slower")
+        until(lambda: supervisor.status.speed == 25.0)
+        answers.append(ask(found, "resume"))
+
+    report = run(graph, placement="process_each", paused=True, controls=steered(steer), stall_timeout=0.6)
+
+    assert given == [{"left": 0, "right": 0}, {"left": 3, "right": 3}]
+    assert answers[0] | {"stamp": None} == {
+        "paused": True, "ended": False, "speed": None, "stamp": None, "replay": False,
+    }  # fmt: skip
+    assert answers[-1]["speed"] == 25.0
+    assert not answers[-1]["paused"]
+    assert report.streams == replay(recorded, placement="one_process").streams
+
+
+def test_a_live_run_cannot_be_paused_and_says_why() -> None:
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=400"], live=True)
+    told: list[str] = []
+
+    def steer(supervisor: Supervisor) -> None:
+        found = find_running("chaos", wait=30)
+        with pytest.raises(NotRunning) as refused:
+            ask(found, "pause", timeout=30.0)
+        told.append(str(refused.value))
+        supervisor.play("pause")  # is not heard
+        supervisor.stop()
+
+    report = run(graph, placement="one_process", live=True, controls=steered(steer))
+
+    assert "it is a live run: devices and the clock wait for nobody" in told[0]
+    assert report.interrupted
