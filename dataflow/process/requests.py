@@ -96,10 +96,17 @@ class Requests:
                     self.play(asked["action"], int(asked.get("steps", 1)), None if speed is None else float(speed))
                 playback = feeding.playback
                 answer: dict[str, Any] = {"ok": True, "paused": playback.paused, "ended": feeding.ended}
-                answer |= {"speed": playback.speed, "stamp": feeding.last, "replay": bool(feeding.logs)}
+                answer |= {"speed": playback.speed, "stamp": feeding.last, "replay": self._replayed()}
             except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
                 answer = {"ok": False, "error": str(error)}
             query.reply(query.key_expr, msgpack.packb(answer))
+
+    def _replayed(self) -> dict[str, Any] | None:
+        """Tells from when to when a recording is played, and the stamp that `--start` counts from."""
+        spans = [span for log in self._feeding.logs if (span := log.span()) is not None]
+        if self._config.replay is None or not spans:
+            return None
+        return {"span": list(spans[0]), "first": self._config.replay["first"]}
 
     def answer_publication(self, maker: SourceRunner, query: Any) -> None:
         """Takes an envelope from outside for a source that is made for it; on Zenoh's thread.

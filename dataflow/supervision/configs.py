@@ -84,6 +84,7 @@ def _log(plan: RunPlan) -> dict[str, Any]:
         "path": str(log.path),
         "streams": list(log.streams),
         "finals": dict(log.finals),
+        "first": log.first,
         "start": log.start,
         "end": log.end,
         "bag": log.bag,

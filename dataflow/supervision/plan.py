@@ -27,12 +27,14 @@ VIEWER_FILE = "@view"
 class LogPlan:
     """Recorded streams that stand in for sources: stream names, the stamps they ended with, and the span (ns).
 
-    `bag`: how the bag of another system is opened as such streams; None for a recording.
+    `first`: the stamp that `--start` counts from. `bag`: how the bag of another system is opened as such streams; None
+    for a recording.
     """
 
     path: Path
     streams: tuple[str, ...]
     finals: Mapping[str, int] = field(default_factory=dict)
+    first: int = 0
     start: int | None = None
     end: int | None = None
     bag: Mapping[str, Any] | None = None

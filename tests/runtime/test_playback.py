@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from dataflow.client.attach import NotRunning, find_running
-from dataflow.client.playback import ask
+from dataflow.client.playback import ask, steering
+from dataflow.client.replay_bar import ReplayBar
 from dataflow.graph import load_graph
 from dataflow.supervision.run import replay, run
 from dataflow.supervision.supervisor import Supervisor
@@ -83,9 +84,36 @@ def test_a_script_pauses_and_steps_from_outside(recorded: Path) -> None:
 
     report = stepped(recorded, steer, paused=True)
 
-    assert answers[0] == {"paused": True, "ended": False, "speed": None, "stamp": None, "replay": True}
+    assert answers[0] == {"paused": True, "ended": False, "speed": None, "stamp": None} | {
+        "replay": {"span": [10**9, 10**9 + 39 * 8_000_000 + 39 * 7919 % 2_000_001], "first": 10**9}
+    }
     assert answers[1]["paused"]
     assert not answers[-1]["paused"]
+    assert report.streams == replay(recorded, placement="one_process").streams
+
+
+def test_a_playback_bar_moves_a_replay_through_a_graph(recorded: Path) -> None:
+    told: list[Any] = []
+
+    def steer(supervisor: Supervisor) -> None:
+        until(lambda: supervisor.status.paused)
+        with steering(find_running("chaos", wait=30)) as steered:
+            bar = ReplayBar(steered, steered.ask(None))
+            told.append(bar.state())
+            bar.request(playing=False, speed=8.0, seek=None)
+            supervisor.play("step", 2)  # as keys do
+            until(lambda: (bar.refresh(), bar.state()[1] > bar.span[0])[1])
+            told.append(bar.state())
+            told.append(bar.request(playing=True, speed=1000.0, seek=bar.span[0]))
+            told.append(bar.state()[0])
+
+    report = stepped(recorded, steer, paused=True)
+
+    first = 10**9
+    assert told[0] == (False, first, 1.0)
+    assert (told[1][0], told[1][2]) == (False, 8.0)
+    assert told[2].endswith("--start 0.000")
+    assert told[3] is True
     assert report.streams == replay(recorded, placement="one_process").streams
 
 
@@ -116,7 +144,7 @@ def test_a_plain_run_whose_sources_are_in_two_processes_is_paused_stepped_and_pa
 
     assert given == [{"left": 0, "right": 0}, {"left": 3, "right": 3}]
     assert answers[0] | {"stamp": None} == {
-        "paused": True, "ended": False, "speed": None, "stamp": None, "replay": False,
+        "paused": True, "ended": False, "speed": None, "stamp": None, "replay": None,
     }  # fmt: skip
     assert answers[-1]["speed"] == 25.0
     assert not answers[-1]["paused"]
