@@ -1,4 +1,4 @@
-"""What a dataset of LeRobot says of itself: its meta/ folder, in the formats 3.0 and 2.1."""
+"""The meta/ folder of a dataset of LeRobot, which says what is in it: formats 3.0 and 2.1."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _INDEXED_BY_TASK = {
     "creator": {"library": "pyarrow", "version": ""},
     "pandas_version": "2.0.0",
 }
-"""How pandas writes a table whose index is the task: LeRobot looks tasks up by it."""
+"""Says to pandas that the task is the index of a table: LeRobot looks tasks up by it."""
 
 
 @dataclass(frozen=True, slots=True)
