@@ -30,23 +30,10 @@ if TYPE_CHECKING:
     from dataflow.interop.export.report import Exported
 
 Format = Literal[
-    "mcap",
-    "ros2",
-    "foxglove",
-    "rrd",
-    "tum",
-    "7scenes",
-    "euroc",
-    "kitti",
-    "kitti-raw",
-    "lerobot",
-    "lerobot-v2",
-    "csv",
-    "parquet",
+    "mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "kitti-raw", "lerobot", "csv", "parquet"
 ]
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 """Of formats that are one file; the others are folders."""
-LEROBOT = ("lerobot", "lerobot-v2")
 
 
 def convert(
@@ -73,8 +60,7 @@ def convert(
     Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
     kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --stream chooses among
-    several. Into lerobot (format 3.0; lerobot-v2: 2.1), every image of the first camera is a frame, with the newest
-    message of every other stream; images are PNGs in the table, of which lerobot-edit-dataset of LeRobot makes videos.
+    several. Into lerobot, every image of the first camera is a frame, with the newest message of every other stream.
 
     Exit codes:
 
@@ -93,7 +79,6 @@ def convert(
       dataflow convert run.mcap folder --to kitti --stream camera/*
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
-      dataflow convert run.mcap folder --to lerobot-v2
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
@@ -106,7 +91,7 @@ def convert(
             view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
             return
         with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            if to not in LEROBOT and (action is not None or task):
+            if to != "lerobot" and (action is not None or task):
                 raise fail("--action and --task are of --to lerobot")
             done = _export(material, output, to, overwrite, watch, action, task)
     if json:
@@ -188,11 +173,10 @@ def _export(
             export_foxglove(material, output, done)
         case "ros2":
             export_ros2(material, output, done)
-        case "lerobot" | "lerobot-v2":
-            from dataflow.interop.export.lerobot import export_lerobot, export_lerobot_v2
+        case "lerobot":
+            from dataflow.interop.export.lerobot import export_lerobot
 
-            export = export_lerobot if to == "lerobot" else export_lerobot_v2
-            export(material, output, done, action=action, task=task)
+            export_lerobot(material, output, done, action=action, task=task)
         case "csv":
             export_csv(material, output, done)
         case "parquet":

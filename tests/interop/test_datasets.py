@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-import pandas as pd
 import pyarrow.parquet as pq
 import pytest
 
 from dataflow.interop.export.kitti_raw import export_kitti_raw
-from dataflow.interop.export.lerobot import export_lerobot, export_lerobot_v2
+from dataflow.interop.export.lerobot import export_lerobot
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.messages import CameraInfo, Image, JointState, Message, Number, PointCloud, Text, Transforms, Twist
+from dataflow.messages import CameraInfo, Image, JointState, Message, PointCloud, Text, Transforms, Twist
 from dataflow.recording import RecordingError, RecordingWriter
 from operators.sources.kitti_raw import KittiRaw
 
@@ -61,9 +59,9 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
         export_lerobot(material, tmp_path / "set", done, action="cmd/twist", task="pick it up")
 
     info = json.loads((tmp_path / "set/meta/info.json").read_text())
-    table = pq.read_table(tmp_path / "set" / info["data_path"].format(chunk_index=0, file_index=0))
+    table = pq.read_table(tmp_path / "set" / info["data_path"].format(episode_chunk=0, episode_index=0))
     rows = table.to_pylist()
-    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v3.0", 10, 5)
+    assert (info["codebase_version"], info["fps"], info["total_frames"]) == ("v2.1", 10, 5)
     assert [row["stamp"] for row in rows] == [m.stamp for m in material_of["camera/image"][1:]]
     assert [row["observation.state"] for row in rows] == [[5.0 * k, -5.0 * k] for k in range(1, 6)]
     assert [row["action"][0] for row in rows] == [0.0, 1.0, 2.0, 3.0, 4.0]
@@ -76,48 +74,9 @@ def test_a_lerobot_dataset_holds_each_image_with_what_was_newest_then(tmp_path: 
     assert done.left_out == {"said": "it holds no numbers of which each message has as many"}
 
 
-def test_a_lerobot_dataset_lists_its_episode_and_looks_its_task_up(tmp_path: Path) -> None:
-    """With pandas and the names of columns that LeRobot 0.4 asks for."""
+def test_the_statistics_of_a_lerobot_dataset_are_those_of_its_columns(tmp_path: Path) -> None:
     with Material(write(tmp_path / "a.mcap", arm())) as material:
-        export_lerobot(material, tmp_path / "set", Exported(), action="cmd/twist", task="pick it up")
-
-    meta = tmp_path / "set/meta"
-    tasks = pd.read_parquet(meta / "tasks.parquet")
-    assert tasks.loc["pick it up"].task_index == 0
-    assert tasks.iloc[0].name == "pick it up"
-    (episode,) = pq.read_table(meta / "episodes/chunk-000/file-000.parquet").to_pylist()
-    assert (episode["dataset_from_index"], episode["dataset_to_index"], episode["length"]) == (0, 5, 5)
-    assert (episode["data/chunk_index"], episode["data/file_index"], episode["tasks"]) == (0, 0, ["pick it up"])
-    stats = json.loads((meta / "stats.json").read_text())
-    rows = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet").to_pylist()
-    for key in ("action", "observation.state", "timestamp"):
-        values = np.array([np.atleast_1d(row[key]) for row in rows])
-        assert np.allclose(stats[key]["mean"], values.mean(0))
-        assert episode[f"stats/{key}/mean"] == stats[key]["mean"]
-    assert np.array(stats["observation.images.camera.image"]["std"]).shape == (3, 1, 1)
-    assert {row["task_index"] for row in rows} == {0}
-    assert sorted(p.name for p in meta.rglob("*") if p.is_file()) == [
-        "file-000.parquet", "info.json", "stats.json", "tasks.parquet",
-    ]  # fmt: skip
-
-
-@pytest.mark.parametrize("export", [export_lerobot, export_lerobot_v2])
-def test_a_single_number_is_a_number_in_a_lerobot_dataset(tmp_path: Path, export: Any) -> None:
-    streams = arm()
-    numbers: list[Message] = [Number(stamp=START + k * SECOND // 10, value=float(k)) for k in range(6)]
-    with Material(write(tmp_path / "a.mcap", {"camera/image": streams["camera/image"], "gauge": numbers})) as material:
-        export(material, tmp_path / "set", Exported())
-
-    (file,) = (tmp_path / "set/data").rglob("*.parquet")
-    table = pq.read_table(file)
-    assert table["observation.state"].to_pylist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    features = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
-    assert features["observation.state"] == {"dtype": "float32", "_type": "Value"}
-
-
-def test_the_statistics_of_an_older_lerobot_dataset_are_those_of_its_columns(tmp_path: Path) -> None:
-    with Material(write(tmp_path / "a.mcap", arm())) as material:
-        export_lerobot_v2(material, tmp_path / "set", Exported())
+        export_lerobot(material, tmp_path / "set", Exported())
 
     table = pq.read_table(tmp_path / "set/data/chunk-000/episode_000000.parquet")
     states = np.array(table["observation.state"].to_pylist())

@@ -1,15 +1,14 @@
-"""A dataset of LeRobot (3.0, 2.1): a table of frames with their images, states and actions, and what is in it.
+"""A dataset of LeRobot (format 2.1): a table of frames with their images, states and actions, and what is in it.
 
 A frame is an image of the first camera with the newest message of every other stream, as a graph that samples them
 would be given. LeRobot takes frames as equally far apart, so a frame's time is its number over the rate; when it was is
-in the column `stamp`. Images lie in the table as PNG, without loss. No video is written: PyAV, by which LeRobot
-encodes, brings encoders under the GPL, and LeRobot makes videos of images itself.
+in the column `stamp`.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,13 +18,13 @@ import numpy.typing as npt
 
 from dataflow.interop.conversions import convert
 from dataflow.interop.export.frames import IMAGES
-from dataflow.interop.export.lerobot_meta import DATA_V2, DATA_V3, Described, describe_v2, describe_v3
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Image, Message
 from dataflow.messages.base import ArrayField
 from dataflow.recording.errors import RecordingError
 
+VERSION = "v2.1"
 ROWS = 64
 """Frames of a row group: their images are in memory together."""
 SAMPLED_PIXELS = 4096
@@ -74,40 +73,22 @@ class _Plan:
 def export_lerobot(
     material: Material, folder: Path, done: Exported, *, action: str | None = None, task: str = ""
 ) -> None:
-    """Writes data/ and meta/ in format 3.0. Raises `RecordingError` without pyarrow, images or numbers."""
-    _write_episode(material, folder, DATA_V3.format(chunk_index=0, file_index=0), done, describe_v3, action, task)
-
-
-def export_lerobot_v2(
-    material: Material, folder: Path, done: Exported, *, action: str | None = None, task: str = ""
-) -> None:
-    """As `export_lerobot`, in format 2.1, for versions of LeRobot before 0.4."""
-    _write_episode(material, folder, DATA_V2.format(episode_chunk=0, episode_index=0), done, describe_v2, action, task)
-
-
-def _write_episode(
-    material: Material,
-    folder: Path,
-    data: str,
-    done: Exported,
-    describe: Callable[[Path, Described, Exported], None],
-    action: str | None,
-    task: str,
-) -> None:
+    """Writes data/, meta/ and the images in the table. Raises `RecordingError` without pyarrow, images or numbers."""
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
         raise RecordingError("--to lerobot needs pyarrow: pip install pyarrow") from None
     plan = _planned(material, action, done)
-    frames = 0
-    path = folder / data
+    stamps: list[int] = []
+    path = folder / "data" / "chunk-000" / "episode_000000.parquet"
     path.parent.mkdir(parents=True, exist_ok=True)
     fps = _rate(material, plan.anchor)
     writer: Any = None
     for rows in _batches(_frames(material, plan, done)):
-        columns = _columns(rows, plan, frames, fps)
-        frames += len(rows)
+        number = len(stamps)
+        stamps += [stamp for stamp, _ in rows]
+        columns = _columns(rows, plan, number, fps)
         if writer is None:
             schema = _schema(pa, plan)
             writer = pq.ParquetWriter(path, schema, compression="zstd")
@@ -116,7 +97,7 @@ def _write_episode(
         raise RecordingError(f"{material.path}: no image of {material.names[plan.anchor]} has all others before it")
     writer.close()
     done.files.append(str(path))
-    describe(folder, _described(plan, frames, fps, task or material.path.stem), done)
+    _describe(folder, plan, len(stamps), fps, task or material.path.stem, done)
 
 
 def _planned(material: Material, action: str | None, done: Exported) -> _Plan:
@@ -194,8 +175,7 @@ def _columns(rows: list[tuple[int, dict[str, Message]]], plan: _Plan, first: int
         columns[key] = [_picture(key, found[stream], plan) for _, found in rows]
     for key, streams in (("observation.state", plan.states), ("action", [plan.action] if plan.action else [])):
         if streams:
-            vectors = [_vector(key, [found[s] for s in streams], streams, plan) for _, found in rows]
-            columns[key] = [v[0] for v in vectors] if len(plan.vectors[key]) == 1 else vectors
+            columns[key] = [_vector(key, [found[s] for s in streams], streams, plan) for _, found in rows]
     numbers = range(first, first + len(rows))
     columns["timestamp"] = [number / fps for number in numbers]
     columns |= {"frame_index": list(numbers), "index": list(numbers), "stamp": [stamp for stamp, _ in rows]}
@@ -254,19 +234,18 @@ def _schema(pa: Any, plan: _Plan) -> Any:
     for key in plan.images:
         fields.append((key, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
         features[key] = {"_type": "Image"}
-    number = {"dtype": "float32", "_type": "Value"}
     for key, names in plan.vectors.items():
-        single = len(names) == 1  # LeRobot reads what has the shape (1,) as numbers
-        fields.append((key, pa.float32() if single else pa.list_(pa.float32(), len(names))))
-        features[key] = number if single else {"feature": number, "length": len(names), "_type": "Sequence"}
+        fields.append((key, pa.list_(pa.float32(), len(names))))
+        features[key] = {"feature": {"dtype": "float32", "_type": "Value"}, "length": len(names), "_type": "Sequence"}
     for key, kind in (("timestamp", "float32"), *((name, "int64") for name in INDEXES)):
         fields.append((key, pa.float32() if kind == "float32" else pa.int64()))
         features[key] = {"dtype": kind, "_type": "Value"}
     return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": features}})})
 
 
-def _described(plan: _Plan, frames: int, fps: float, task: str) -> Described:
-    features: dict[str, dict[str, Any]] = {}
+def _describe(folder: Path, plan: _Plan, frames: int, fps: float, task: str, done: Exported) -> None:
+    """Writes meta/: what the columns are, the tasks, the episodes, and their statistics."""
+    features: dict[str, Any] = {}
     for key in plan.images:
         names = ["height", "width", "channels"]
         features[key] = {"dtype": "image", "shape": [*plan.sizes[key], 3], "names": names}
@@ -274,7 +253,32 @@ def _described(plan: _Plan, frames: int, fps: float, task: str) -> Described:
         features[key] = {"dtype": "float32", "shape": [len(words)], "names": words}
     for key in ("timestamp", *INDEXES):
         features[key] = {"dtype": "float32" if key == "timestamp" else "int64", "shape": [1], "names": None}
+    info = {
+        "codebase_version": VERSION,
+        "robot_type": None,
+        "total_episodes": 1,
+        "total_frames": frames,
+        "total_tasks": 1,
+        "total_videos": 0,
+        "total_chunks": 1,
+        "chunks_size": 1000,
+        "fps": int(fps) if fps == int(fps) else fps,
+        "splits": {"train": "0:1"},
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": None,
+        "features": features,
+    }
     statistics = {
         key: found.as_json(frames, (3, 1, 1) if key in plan.images else (-1,)) for key, found in plan.statistics.items()
     }
-    return Described(frames, fps, task, features, statistics)
+    lines = {
+        "info.json": json.dumps(info, indent=4),
+        "tasks.jsonl": json.dumps({"task_index": 0, "task": task}),
+        "episodes.jsonl": json.dumps({"episode_index": 0, "tasks": [task], "length": frames}),
+        "episodes_stats.jsonl": json.dumps({"episode_index": 0, "stats": statistics}),
+    }
+    for name, text in lines.items():
+        path = folder / "meta" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text + "\n", encoding="utf-8")
+        done.files.append(str(path))
