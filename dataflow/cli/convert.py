@@ -19,6 +19,7 @@ from dataflow.cli.arguments import (
     Json,
     Overwrite,
     Start,
+    Without,
     chosen_streams,
     existing_recording,
     output_file,
@@ -44,6 +45,7 @@ def convert(
         list[str] | None,
         typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
     ] = None,
+    without: Without = None,
     start: Start = None,
     end: End = None,
     clock: Clock = "auto",
@@ -59,8 +61,9 @@ def convert(
 
     Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
-    kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --stream chooses among
-    several. Into lerobot, every image of the first camera is a frame, with the newest message of every other stream.
+    kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --without leaves out
+    others, --stream names all that are taken. Into lerobot, every image of the first camera is a frame, with the newest
+    message of every other stream.
 
     Exit codes:
 
@@ -76,7 +79,7 @@ def convert(
       dataflow convert run.mcap folder --to tum
       dataflow convert run.mcap folder --to 7scenes
       dataflow convert run.mcap folder --to euroc
-      dataflow convert run.mcap folder --to kitti --stream camera/*
+      dataflow convert run.mcap folder --to kitti --stream "camera/*"
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
       dataflow convert run.mcap folder --to csv --stream imu/imu
@@ -86,11 +89,16 @@ def convert(
         existing_recording(recording)
         _check_output(output, to, overwrite)
         if to == "rrd":
-            from dataflow.cli.viewing import view
+            from dataflow.cli.drawing import draw_recording, drawn_as_json, report
+            from dataflow.view import Save
 
-            view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
+            drawn = draw_recording(recording, Save(output), streams, without, start, end, clock)
+            if json:
+                print_json(drawn_as_json(drawn[0]))
+            else:
+                report(*drawn)
             return
-        with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
+        with _opened(recording, streams, without, start, end, clock) as material, _progress(quiet or json) as watch:
             if to != "lerobot" and (action is not None or task):
                 raise fail("--action and --task are of --to lerobot")
             done = _export(material, output, to, overwrite, watch, action, task)
@@ -120,7 +128,12 @@ def _check_output(output: Path, to: str, overwrite: bool) -> None:
 
 @contextmanager
 def _opened(
-    path: Path, words: list[str] | None, start: float | None, end: float | None, clock: Literal["auto", "header", "log"]
+    path: Path,
+    words: list[str] | None,
+    without: list[str] | None,
+    start: float | None,
+    end: float | None,
+    clock: Literal["auto", "header", "log"],
 ) -> Iterator[Material]:
     from dataflow.interop.export.material import Material
     from dataflow.recording.cutting import cut_of
@@ -136,7 +149,7 @@ def _opened(
             with Recording(path) as opened:
                 metadata = opened.metadata
                 namespace = metadata.get(RECORDING, {}).get("namespace", "")
-        chosen = chosen_streams(words, names, namespace) if words else None
+        chosen = chosen_streams(words, names, namespace, without) if words or without else None
         firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
         firsts += [t.first for t in whole.untouched if t.first is not None]
         part = None if whole.foreign else cut_of(metadata)

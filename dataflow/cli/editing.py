@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, Overwrite, chosen_streams, output_file
+from dataflow.cli.arguments import FLAG, Json, Overwrite, Without, chosen_streams, output_file
 from dataflow.cli.material import (
     Material,
     Out,
@@ -82,12 +82,9 @@ def filter_(
     output: Out,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--streams", metavar="PATTERN", help="Keep these streams; wildcards work. May be repeated."),
+        typer.Option("--stream", metavar="STREAM", help="Keep these streams; wildcards work. May be repeated."),
     ] = None,
-    without: Annotated[
-        list[str] | None,
-        typer.Option("--without", metavar="PATTERN", help="Leave these streams out. May be repeated."),
-    ] = None,
+    without: Without = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -105,22 +102,18 @@ def filter_(
 
     Examples:
 
-      dataflow filter run.mcap --streams imu/* --streams camera/* -o sensors.mcap
-      dataflow filter run.mcap --without camera/** -o small.mcap
+      dataflow filter run.mcap --stream imu/imu --stream "camera/*" -o s.mcap
+      dataflow filter run.mcap --without "camera/**" -o small.mcap
     """
     from dataflow.editing.part import Part, write_part
 
     with friendly_errors(), opened_material(recording) as origin, copying("filtering", quiet or json) as watch:
         if not streams and not without:
-            raise fail("nothing to choose by: name streams with --streams, or with --without")
+            raise fail("nothing to choose by: name streams with --stream, or with --without")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         refuse_itself(output, [recording])
         names = sorted(origin.counts())
-        kept = chosen_streams(streams, names, origin.namespace)
-        left_out = set(chosen_streams(without, names, origin.namespace)) if without else set()
-        kept = [name for name in kept if name not in left_out]
-        if not kept:
-            raise fail("no stream is left: --without takes all that --streams gives")
+        kept = chosen_streams(streams, names, origin.namespace, without)
         done = write_part(origin, Part(streams=kept), output, overwrite=overwrite, watch=watch)
     if json:
         print_json(done.as_json())

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from typer import Context
+from typer.main import get_command
 
 from dataflow.cli import main, plugins
 from dataflow.cli.commands import BUILT_IN, Command, Commands
@@ -87,6 +89,36 @@ def test_a_fault_of_ours_is_one_message_and_code_2(monkeypatch, capsys, asked: s
     assert ended.value.code == 2
     assert "internal error: KeyError: 'nobody thought of this'" in told
     assert ("Traceback" in told) == (asked == "1")
+
+
+def every_command() -> list[tuple[str, ...]]:
+    """All commands and groups with their subcommands, of plug-ins too, as the words that call them."""
+    group = get_command(app)
+    context = Context(group)
+    found: list[tuple[str, ...]] = []
+    for name in group.list_commands(context):
+        inner = group.get_command(context, name)
+        found += [(name,), *((name, each) for each in getattr(inner, "commands", {}))]
+    return found
+
+
+@pytest.mark.parametrize("words", every_command(), ids=" ".join)
+def test_every_command_and_subcommand_has_indented_examples_of_itself(dataflow, words: tuple[str, ...]) -> None:
+    lines = dataflow(*words, "--help").stdout.splitlines()
+
+    examples = [line for line in lines if line.startswith("   dataflow ")]  # one space is the page's margin
+    assert any(line.strip() == "Examples:" for line in lines)
+    assert examples
+    assert all(line.split()[1 : 1 + len(words)] == list(words) for line in examples)
+
+
+@pytest.mark.parametrize("words", every_command(), ids=" ".join)
+def test_no_option_is_explained_by_a_type(dataflow, words: tuple[str, ...]) -> None:
+    told = dataflow(*words, "--help").stdout
+
+    options = told[told.index("─ Options") :]
+    assert not [kind for kind in ("<int", "<float", "<str", "<path", "<bool") if kind in options]
+    assert "[default: None]" not in told
 
 
 @pytest.mark.parametrize("words", [["run"], ["param", "set"], ["train"], ["evaluate", "detector"], []])
