@@ -49,7 +49,7 @@ def evaluate_detector(
     """
     with friendly():
         from operators.detection.custom.assessment import assess
-        from operators.detection.custom.dataset import read_detection_data
+        from operators.detection.custom.folder import read_detection_data
         from operators.weights import training_seed
 
         read = read_detection_data(data, training_seed(weights) if seed is None else seed)
