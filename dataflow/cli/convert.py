@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -92,16 +93,22 @@ def convert(
             from dataflow.cli.drawing import draw_recording, drawn_as_json, report
             from dataflow.view import Save
 
-            drawn = draw_recording(recording, Save(output), streams, without, start, end, clock)
+            with _complete(output) as place:
+                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock)
             if json:
-                print_json(drawn_as_json(drawn[0]))
+                print_json(drawn_as_json(drawn[0], output))
             else:
-                report(*drawn)
+                report(*drawn, output)
             return
-        with _opened(recording, streams, without, start, end, clock) as material, _progress(quiet or json) as watch:
-            if to != "lerobot" and (action is not None or task):
-                raise fail("--action and --task are of --to lerobot")
-            done = _export(material, output, to, overwrite, watch, action, task)
+        if to != "lerobot" and (action is not None or task):
+            raise fail("--action and --task are of --to lerobot")
+        with (
+            _opened(recording, streams, without, start, end, clock) as material,
+            _progress(quiet or json) as watch,
+            _complete(output) as place,
+        ):
+            done = _export(material, place, to, watch, action, task)
+        done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
     if json:
         print_json(done.as_json())
         return
@@ -124,6 +131,17 @@ def _check_output(output: Path, to: str, overwrite: bool) -> None:
         raise fail(f"{output} exists; {to} is written to a new or empty folder")
     elif output.exists():
         output.rmdir()
+
+
+@contextmanager
+def _complete(output: Path) -> Iterator[Path]:
+    """Gives a place to write to, of the same name; what is written there appears as `output` when it is complete."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
+        place = Path(folder) / output.name
+        yield place
+        if place.exists():
+            place.replace(output)
 
 
 @contextmanager
@@ -166,7 +184,6 @@ def _export(
     material: Material,
     output: Path,
     to: str,
-    overwrite: bool,
     watch: Callable[[int], None] | None,
     action: str | None,
     task: str,
@@ -181,7 +198,7 @@ def _export(
     done = Exported(watch=watch)
     match to:
         case "mcap":
-            export_own(material, output, done, overwrite=overwrite)
+            export_own(material, output, done)
         case "foxglove":
             export_foxglove(material, output, done)
         case "ros2":

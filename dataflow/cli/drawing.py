@@ -140,7 +140,8 @@ class Announcer:
         return announced
 
 
-def report(sink: ViewerSink, complete: bool) -> None:
+def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
+    """Says how much was drawn, and where it is: in `file`, if it was moved there."""
     from dataflow.view import Save
 
     drawn = sink.statistics()
@@ -150,7 +151,7 @@ def report(sink: ViewerSink, complete: bool) -> None:
     if drawn.failed:
         parts.append(f"{drawn.failed:,} could not be drawn")
     if isinstance(sink.target, Save):
-        path = sink.target.path
+        path = file or sink.target.path
         out.print(f"wrote {escape(str(path))} ({', '.join(parts)}, {size(path.stat().st_size)})", soft_wrap=True)
     else:
         out.print(f"shown: {', '.join(parts)}")
@@ -158,13 +159,10 @@ def report(sink: ViewerSink, complete: bool) -> None:
         raise typer.Exit(DIFFERENT)
 
 
-def drawn_as_json(sink: ViewerSink) -> dict[str, Any]:
-    """What was written to a viewer file, as JSON values."""
-    from dataflow.view import Save
-
+def drawn_as_json(sink: ViewerSink, file: Path) -> dict[str, Any]:
+    """Returns JSON values that say how much a viewer file holds."""
     counts = sink.statistics()
-    files = [str(sink.target.path)] if isinstance(sink.target, Save) else []
-    return {"files": files, "messages": counts.drawn, "not_drawn": counts.failed}
+    return {"files": [str(file)], "messages": counts.drawn, "not_drawn": counts.failed}
 
 
 def until_interrupted() -> None:

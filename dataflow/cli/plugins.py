@@ -29,7 +29,7 @@ GROUP = "dataflow.commands"
 PANEL = "Commands of other packages"
 BROKEN_PANEL = "Commands that do not load"
 NAMES = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
-"""What stands for a value of each type in the help."""
+"""The name of a value in the help, by its type."""
 
 
 @cache
@@ -115,7 +115,7 @@ def tidy(command: Any, ctx: Any) -> None:
 
 
 def _metavar(param: Any) -> str | None:
-    """What stands for a parameter's value in the help, where its declaration does not say it."""
+    """The name of a parameter's value in the help, where its declaration has none."""
     if getattr(param, "is_bool_flag", False):
         return FLAG
     if param.param_type_name == "argument":

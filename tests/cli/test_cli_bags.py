@@ -76,3 +76,30 @@ def test_the_former_name_of_the_choice_of_streams_works_and_says_so(dataflow, re
     told = dataflow("filter", recorded[0], "--streams", "left/*", "-o", tmp_path / "part.mcap").stderr
 
     assert "--streams is now --stream" in told
+
+
+@pytest.mark.parametrize("to", ["csv", "tum", "ros2"])
+def test_a_conversion_that_fails_or_is_interrupted_leaves_nothing(
+    dataflow, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str
+) -> None:
+    from dataflow.interop.export.report import Exported
+
+    def interrupted(self: Exported, name: str) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Exported, "count", interrupted)
+        dataflow("convert", bag, tmp_path / "out", "--to", to, "--stream", "/truth", code=130)
+    assert not list(tmp_path.iterdir())
+
+    dataflow("convert", bag, tmp_path / "out", "--to", to, "--stream", "/truth")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_recording_may_be_converted_in_its_place(dataflow, recorded, tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    file.write_bytes(recorded[0].read_bytes())
+
+    dataflow("convert", file, file, "--to", "mcap", "--overwrite")
+
+    assert json.loads(dataflow("info", file, "--json").stdout)["messages"] > 0
