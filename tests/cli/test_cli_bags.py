@@ -103,3 +103,23 @@ def test_a_recording_may_be_converted_in_its_place(dataflow, recorded, tmp_path:
     dataflow("convert", file, file, "--to", "mcap", "--overwrite")
 
     assert json.loads(dataflow("info", file, "--json").stdout)["messages"] > 0
+
+
+@pytest.mark.parametrize("command", ["latency", "verify", "diff"])
+def test_a_ros_1_bag_where_a_recording_is_expected_is_answered_with_what_makes_one(
+    dataflow, tmp_path: Path, command: str
+) -> None:
+    from made_bags import ROS1
+
+    file = write_ros1(tmp_path / "old.bag", [("/said", START, ros("std_msgs/String", ROS1, data="hello"))])
+    words = (command, file, file) if command == "diff" else (command, file)
+
+    assert f"`dataflow convert {file} OUT.mcap --to mcap`" in dataflow(*words, code=2).stderr
+
+
+def test_latencies_of_a_file_without_firing_records_are_refused_with_the_reason(
+    dataflow, bag: Path, tmp_path: Path
+) -> None:
+    dataflow("convert", bag, tmp_path / "drive.mcap", "--to", "mcap")
+
+    assert "holds no firing records" in dataflow("latency", tmp_path / "drive.mcap", code=2).stderr

@@ -111,7 +111,7 @@ def test_a_view_that_cannot_be_is_refused(
 
 
 def test_a_recording_that_nothing_can_be_drawn_of_is_refused(dataflow, data_dir: Path, tmp_path: Path) -> None:
-    foreign = data_dir / "bags" / "nav2_turtlebot.mcap"
+    foreign = data_dir / "bags" / "ros2_cdr_test.mcap"
 
     told = dataflow("view", foreign, "--to", tmp_path / "x.rrd", code=2)
 
