@@ -59,11 +59,38 @@ Clock = Annotated[
     ),
 ]
 RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
+
+
+def offset(word: str) -> float:
+    """Seconds of a number of them, or of a duration with its unit, for `typer.Option(parser=...)`."""
+    from dataflow.sync.stamps import parse_duration
+
+    try:
+        return float(word)
+    except ValueError:
+        try:
+            return parse_duration(word) * 1e-9
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+
+
 Start = Annotated[
-    float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the recording's first message.")
+    float | None,
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        parser=offset,
+        help="Begin so long after the recording's first message: seconds, or 500ms, 2min.",
+    ),
 ]
 End = Annotated[
-    float | None, typer.Option("--end", metavar="SECONDS", help="End so long after the recording's first message.")
+    float | None,
+    typer.Option(
+        "--end",
+        metavar="TIME",
+        parser=offset,
+        help="End so long after the recording's first message: seconds, or 500ms, 2min.",
+    ),
 ]
 Without = Annotated[
     list[str] | None, typer.Option("--without", metavar="STREAM", help="Leave these streams out. May be repeated.")

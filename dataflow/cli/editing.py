@@ -44,8 +44,8 @@ def cut(
 ) -> None:
     """Cut a span out of a recording.
 
-    A TIME is seconds after the first message (12.5), a duration (500ms, 2m), or a date in ISO 8601 with its time zone.
-    Messages go over byte for byte, static streams always.
+    A TIME is seconds after the first message (12.5), a duration (500ms, 2min), or a date in ISO 8601 with its time
+    zone. Messages go over byte for byte, static streams always.
 
     The part replays from there with the states that operators had, and verifies: every operator is taken up after its
     last recorded state at or before --from, and what its firings took since then goes along. For that, record with
@@ -60,7 +60,7 @@ def cut(
     Examples:
 
       dataflow cut run.mcap --from 30 --to 45 -o part.mcap
-      dataflow cut run.mcap --from 2m --duration 10s -o part.mcap
+      dataflow cut run.mcap --from 2min --duration 10s -o part.mcap
       dataflow cut run.mcap --from 2026-03-01T12:00:00Z -o end.mcap
       dataflow cut bag.mcap --to 10 --bare -o beginning.mcap
     """
@@ -124,7 +124,7 @@ def filter_(
 def split(
     recording: Material,
     every: Annotated[
-        Word, typer.Option("--every", metavar="TIME", help="Event time of a part: 60s, 5m, or a number of seconds.")
+        Word, typer.Option("--every", metavar="TIME", help="Event time of a part: 60s, 5min, or a number of seconds.")
     ] = None,
     nbytes: Annotated[
         Word, typer.Option("--size", metavar="SIZE", help="Size of a part, about: 500MB, 2GB, 100MiB.")
