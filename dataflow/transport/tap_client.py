@@ -8,7 +8,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Self
 
@@ -21,7 +21,7 @@ from dataflow.transport.codec import TypeOf, decode, decode_head
 from dataflow.transport.envelope import DEFAULT_LIMITS, Envelope, Head, Limits
 from dataflow.transport.keys import runtime_key, statics_key, stream_of_tap
 from dataflow.transport.publisher import undeclare
-from dataflow.transport.taps import ACKNOWLEDGEMENT, ATTACHMENT, MAX_EXPRESSIONS, TapWindow, process_text
+from dataflow.transport.taps import ATTACHMENT, MAX_EXPRESSIONS, TapWindow, process_text, write_acknowledgement
 
 MAX_PROCESSES = 1024
 
@@ -51,7 +51,25 @@ class _Origin:
     received: tuple[int, int] = (0, 0)
     taken: tuple[int, int] = (0, 0)
     acked: tuple[int, int] = (0, 0)
+    lost: deque[int] = field(default_factory=deque)
     skipped: int = 0
+
+    def receive(self, counts: tuple[int, int], skipped: int, window: int, *, sync: bool) -> None:
+        """Notes the counts of a sample, and which messages before it never came, as far as a window back.
+
+        The process sends nothing beyond a window that was not acknowledged, so an older loss has been reported.
+        """
+        messages = counts[0]
+        end = messages + 1 if sync else messages
+        self.lost.extend(range(max(self.received[0] + 1, end - window), end))
+        self.received, self.skipped = counts, skipped
+
+    def acknowledgement(self, window: int) -> bytes:
+        """Acknowledges what was taken, with the numbers of those that were lost before it."""
+        self.acked = self.taken
+        while self.lost and self.lost[0] <= self.taken[0] - window:
+            self.lost.popleft()
+        return write_acknowledgement(self.epoch, *self.taken, [n for n in self.lost if n <= self.taken[0]])
 
 
 class TapClient:
@@ -183,11 +201,11 @@ class TapClient:
                 return
             origin = self._origins.setdefault(process, _Origin())
             if epoch != origin.epoch:
-                origin.epoch, origin.received, origin.taken, origin.acked = epoch, (0, 0), (0, 0), (0, 0)
+                origin = self._origins[process] = _Origin(epoch)
             if payload and not self._fits(origin, messages, nbytes):
                 self.refused += 1
                 return
-            origin.received, origin.skipped = (messages, nbytes), skipped
+            origin.receive((messages, nbytes), skipped, self.window.messages, sync=not payload)
             stream = stream_of_tap(self._namespace, self.id, key) if payload else ""
             self._queue.append((stream, payload, process, (messages, nbytes), epoch))
             self._arrived.notify()
@@ -209,9 +227,8 @@ class TapClient:
             sync = counts == state.acked and other == process
             enough = messages * 4 >= self.window.messages or nbytes * 4 >= self.window.bytes
             if sync or (messages and (enough or not self._queue)):
-                state.acked = state.taken
                 key = runtime_key(self._namespace, "ack", process_text(other), self.id)
-                due.append((key, ACKNOWLEDGEMENT.pack(state.epoch, *state.taken)))
+                due.append((key, state.acknowledgement(self.window.messages)))
         return due
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import struct
 import threading
 import time
 from collections import deque
@@ -19,7 +18,7 @@ from dataflow.transport.codec import encode
 from dataflow.transport.envelope import Envelope
 from dataflow.transport.keys import runtime_key, statics_key, tap_key
 from dataflow.transport.publisher import undeclare
-from dataflow.transport.taps import ACKNOWLEDGEMENT, ATTACHMENT, TapWindow, process_bytes, read_spec
+from dataflow.transport.taps import ATTACHMENT, TapWindow, process_bytes, read_acknowledgement, read_spec
 
 SYNC_EVERY = 0.5
 SPEC_WITHIN = 10.0
@@ -61,6 +60,8 @@ class _Tap:
     acked_bytes: int = 0
     skipped: int = 0
     quiet_since: float = field(default_factory=time.monotonic)
+    under_way: dict[str, tuple[int, _Copy]] = field(default_factory=dict)
+    """The newest copy sent of each stream, with its number, until it is acknowledged."""
     pending: dict[str, deque[_Copy]] = field(default_factory=dict)
     pending_count: int = 0
     matches: dict[str, bool] = field(default_factory=dict)
@@ -94,14 +95,33 @@ class _Tap:
                 self.pending[stream] = self.pending.pop(stream)  # to the end: its turn is over
                 self.sent_messages += 1
                 self.sent_bytes += copy.size
+                self.under_way[stream] = self.sent_messages, copy
                 return stream, copy
         return None
 
-    def acknowledge(self, messages: int, nbytes: int) -> None:
-        """Takes a cumulative acknowledgement; one that was never sent, or is older than the last, changes nothing."""
-        if self.acked_messages <= messages <= self.sent_messages and self.acked_bytes <= nbytes <= self.sent_bytes:
-            self.acked_messages, self.acked_bytes = messages, nbytes
-            self.quiet_since = time.monotonic()
+    def acknowledge(self, messages: int, nbytes: int, lost: frozenset[int]) -> int:
+        """Takes a cumulative acknowledgement; returns how many copies were `lost` that were believed to be sent.
+
+        The newest of each stream is queued again when it was lost; the other lost copies count as skipped. An
+        acknowledgement of what was never sent, or one that is older than the last, changes nothing.
+        """
+        if not self.acked_messages <= messages <= self.sent_messages:
+            return 0
+        if not self.acked_bytes <= nbytes <= self.sent_bytes:
+            return 0
+        lost = frozenset(number for number in lost if self.acked_messages < number <= messages)
+        self.acked_messages, self.acked_bytes = messages, nbytes
+        self.quiet_since = time.monotonic()
+        self.skipped += len(lost)
+        for stream, (number, copy) in list(self.under_way.items()):
+            if number > messages:
+                continue
+            del self.under_way[stream]
+            if number in lost and not self.pending.get(stream):
+                self.pending.setdefault(stream, deque()).append(copy)
+                self.pending_count += 1
+                self.skipped -= 1
+        return len(lost)
 
     def attachment(self, process: bytes) -> bytes:
         return ATTACHMENT.pack(process, self.epoch, self.sent_messages, self.sent_bytes, self.skipped)
@@ -147,7 +167,7 @@ class TapServer:
                 self._wake.notify()
 
     def counters(self) -> dict[str, int]:
-        """Taps now, and copies sent and skipped since the start."""
+        """Taps now, and copies sent (those known to be lost not counted) and skipped since the start."""
         with self._wake:
             skipped = self._skipped_before + sum(t.skipped for t in self._taps.values())
             return {"taps": len(self._taps), "sent": self._sent, "skipped": skipped, "malformed": self.malformed}
@@ -217,15 +237,17 @@ class TapServer:
 
     def _on_ack(self, sample: zenoh.Sample) -> None:
         tap_id = str(sample.key_expr).rpartition("/")[2]
-        try:
-            epoch, messages, nbytes = ACKNOWLEDGEMENT.unpack(bytes(sample.payload))
-        except struct.error:
-            self.malformed += 1
-            return
         with self._wake:
             tap = self._taps.get(tap_id)
-            if tap is not None and tap.epoch == epoch:
-                tap.acknowledge(messages, nbytes)
+            if tap is None:
+                return
+            try:
+                epoch, messages, nbytes, lost = read_acknowledgement(bytes(sample.payload), tap.window.messages)
+            except ValueError:
+                self.malformed += 1
+                return
+            if tap.epoch == epoch:
+                self._sent -= tap.acknowledge(messages, nbytes, lost)
                 self._wake.notify()
 
     def _drop(self, tap_id: str) -> None:

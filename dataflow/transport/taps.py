@@ -1,14 +1,16 @@
 """Taps: lossy, credit-limited copies of streams for viewers and tools, which can therefore never slow a producer.
 
 A tap names the streams it wants and a window. A process sends it copies only while what it has not yet acknowledged
-fits the window; beyond that the newest message of each stream waits, and older ones are skipped and counted. Copies are
-encoded and sent by a thread of their own. Here is what both sides share of the protocol; `docs/wire-format.md`
-specifies it.
+fits the window; beyond that the newest message of each stream waits, and older ones are skipped and counted. Copies
+that Zenoh drops, for a full socket, are named by the acknowledgement; one that is still the newest of its stream is
+sent again. Copies are encoded and sent by a thread of their own. Here is what both sides share of the protocol;
+`docs/wire-format.md` specifies it.
 """
 
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -21,7 +23,8 @@ MAX_WINDOW_BYTES: Final = 1 << 30
 SPEC_BYTES: Final = 1 << 16
 
 ATTACHMENT: Final = struct.Struct("<16sIQQQ")  # process, epoch, messages, bytes, skipped
-ACKNOWLEDGEMENT: Final = struct.Struct("<IQQ")  # epoch, messages, bytes
+ACKNOWLEDGEMENT: Final = struct.Struct("<IQQ")  # epoch, messages, bytes; numbers of lost messages follow, a u64 each
+NUMBER_BYTES: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +52,23 @@ def read_spec(data: bytes) -> tuple[tuple[zenoh.KeyExpr, ...], TapWindow]:
         return expressions, TapWindow(int(spec["messages"]), int(spec["bytes"]))
     except Exception as error:  # msgpack, Zenoh and the wrong types raise a dozen kinds
         raise ValueError(f"tap request: {error}") from None
+
+
+def write_acknowledgement(epoch: int, messages: int, nbytes: int, lost: Sequence[int] = ()) -> bytes:
+    """Returns the acknowledgement of all that was taken up to message number `messages`, without those `lost`."""
+    return ACKNOWLEDGEMENT.pack(epoch, messages, nbytes) + struct.pack(f"<{len(lost)}Q", *lost)
+
+
+def read_acknowledgement(data: bytes, window: int) -> tuple[int, int, int, frozenset[int]]:
+    """Returns epoch, messages, bytes and the lost numbers, at most `window` of them; raises `ValueError`."""
+    count, rest = divmod(len(data) - ACKNOWLEDGEMENT.size, NUMBER_BYTES)
+    if rest or not 0 <= count <= window:
+        raise ValueError(
+            f"acknowledgement of {len(data)} bytes: expected {ACKNOWLEDGEMENT.size}, "
+            f"and {NUMBER_BYTES} for each of at most {window} lost messages"
+        )
+    epoch, messages, nbytes = ACKNOWLEDGEMENT.unpack_from(data)
+    return epoch, messages, nbytes, frozenset(struct.unpack_from(f"<{count}Q", data, ACKNOWLEDGEMENT.size))
 
 
 def process_bytes(bus_id: str) -> bytes:

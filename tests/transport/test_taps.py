@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
 from collections import deque
 from collections.abc import Callable
@@ -163,6 +164,54 @@ def test_what_zenoh_drops_does_not_use_up_the_window(
         arrived = client.take(timeout=5.0)
         assert arrived is not None
         assert arrived.head().seq == 2
+
+
+def test_the_newest_of_a_stream_is_sent_again_when_zenoh_dropped_it(
+    pair: tuple[Bus, Bus], server: TapServer, eventually: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("dataflow.transport.tap_server.SYNC_EVERY", 0.05)
+    with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(messages=4)) as client:
+        eventually(lambda: server.active)
+        put, server._put = server._put, lambda *_: None  # type: ignore[method-assign]
+        server.offer(SCAN, envelope(0, SCAN))
+        server.offer(DEPTH, envelope(0))
+        server.offer(DEPTH, envelope(1))
+        eventually(lambda: server.counters()["sent"] == 3)
+        server._put = put  # type: ignore[method-assign]
+        assert sorted(taken(client)) == [(DEPTH, 1), (SCAN, 0)]
+        counters = server.counters()
+        assert (counters["sent"], counters["skipped"]) == (2, 1)
+        assert client.refused == 0
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_whatever_is_dropped_streams_stay_in_order_and_end_with_their_last_message(
+    pair: tuple[Bus, Bus],
+    server: TapServer,
+    eventually: Callable[..., None],
+    monkeypatch: pytest.MonkeyPatch,
+    seed: int,
+) -> None:
+    monkeypatch.setattr("dataflow.transport.tap_server.SYNC_EVERY", 0.02)
+    chance = random.Random(seed)
+    put = server._put
+    server._put = lambda *a: None if chance.random() < 0.4 else put(*a)  # type: ignore[method-assign]
+    with TapClient(pair[1], "robot1", ["robot1/**"], TapWindow(messages=4)) as client:
+        eventually(lambda: server.active)
+        got: dict[str, list[int]] = {DEPTH: [], SCAN: []}
+        for seq in range(40):
+            server.offer(DEPTH, envelope(seq))
+            server.offer(SCAN, envelope(seq, SCAN))
+            if chance.random() < 0.5 and (message := client.take(0.01)) is not None:
+                got[message.stream].append(message.decode().seq)
+        while any(seqs[-1:] != [39] for seqs in got.values()):
+            message = client.take(timeout=10.0)
+            assert message is not None
+            got[message.stream].append(message.decode().seq)
+        assert all(seqs == sorted(set(seqs)) for seqs in got.values())
+        eventually(lambda: server.counters()["sent"] == len(got[DEPTH]) + len(got[SCAN]))
+        assert server.counters()["sent"] + server.counters()["skipped"] == 80
+        assert client.refused == 0
 
 
 def test_malformed_requests_and_acknowledgements_are_counted_and_ignored(
