@@ -2,8 +2,8 @@
 
     python benchmarks/sensed_people.py CACHE OUT --seeds 42000 42001 ...
 
-Drives through worlds as sensed_worlds.py does, which keeps what the networks gave in CACHE, and writes the tracks of each
-to OUT: features, what the agent did, whether it was in view. `dataflow train activity --sensed OUT` takes them.
+Drives through worlds as sensed_worlds.py does, which keeps what the networks gave in CACHE, and writes the tracks of
+each to OUT: features, what the agent did, whether it was in view. `dataflow train activity --sensed OUT` takes them.
 """
 
 from __future__ import annotations

@@ -1,10 +1,11 @@
-"""Tracks of people as the sensors gave them, with what they did: what the activity network is trained on besides boxes."""
+"""Tracks of people as the sensors gave them, with what they did: the activity network is trained on them too."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ _HALF = 0.5  # seconds
 class SensedTrack:
     """One node while it was in the map: features (T, F), what its agent did `LAG` before (T,), -1 where it is of none.
 
-    `now` (T,) is what it does, `right` (T, C) what is true within half a second, and `plain` (T,) whether it is in view.
+    `now` (T,) is what it does, `right` (T, C) what is true within half a second, `plain` (T,) whether it is in view.
     """
 
     features: NDArray[np.float32]
@@ -83,7 +84,8 @@ def nearest_agents(graph: SceneGraph, truth: SceneGraph) -> dict[int, int]:
 
 def write_tracks(file: Path, tracks: Sequence[SensedTrack]) -> None:
     """Writes the tracks of one world."""
-    parts = {name: np.concatenate([getattr(t, name) for t in tracks]) for name in SensedTrack.__dataclass_fields__}
+    names = SensedTrack.__dataclass_fields__
+    parts: dict[str, Any] = {name: np.concatenate([getattr(t, name) for t in tracks]) for name in names}
     np.savez_compressed(file, lengths=np.array([len(t.labels) for t in tracks]), **parts)
 
 

@@ -27,7 +27,7 @@ class Kinds:
         carriers: Iterable[int] = (),
         portable: Iterable[int] = (),
     ) -> None:
-        """`telling` says how much a label counts, where that is not 1; `carriers` may have in hand what is `portable`."""
+        """`telling` says how much a label counts, where that is not 1; `carriers` may hold what is `portable`."""
         self.carriers, self.portable = frozenset(carriers), frozenset(portable)
         self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
 

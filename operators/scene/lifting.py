@@ -201,8 +201,8 @@ def _divided(
             same = alike >= _SAME
             ratio = float(np.prod(sides[k]) / np.prod(sides[other]))
             nearer = away < distance[points] if 1 / _SMALLER < ratio < _SMALLER else ratio <= 1 / _SMALLER
-            shared = np.count_nonzero(before == rival) if {k, other} <= set(bodies) else 0
-            same |= shared >= 0.5 * len(points) and alike >= _SAME_BODY
+            shared = int(np.count_nonzero(before == rival)) if {k, other} <= set(bodies) else 0
+            same = same or (alike >= _SAME_BODY and shared >= len(points) // 2)
             wins |= (before == rival) & np.asarray(nearer & (not same))
         owner[points[wins]], distance[points[wins]] = c, away[wins]
     return [points[owner[points] == c] for c, (_, points, _) in enumerate(candidates)]

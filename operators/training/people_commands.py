@@ -54,8 +54,8 @@ def train_activity(
     """Train the activity network, two LSTM layers, on people of simulated worlds.
 
     No image is rendered: true boxes go through a seeded model of a tracker in space. Tracks that came from sensors may
-    be added. The score is the macro-F1 at 0.5 s tolerance, the mean of true, tracked and sensed boxes. `operators.recognition:ActivityRecognizer` takes the file as
-    `weights`.
+    be added. The score is the macro-F1 at 0.5 s tolerance, the mean of true, tracked and sensed boxes.
+    `operators.recognition:ActivityRecognizer` takes the file as `weights`.
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
