@@ -1,6 +1,9 @@
 """Objects learned from five images: found again in other places, and what that does to the classes known before.
 
-    python benchmarks/learn_object.py FOLDER [--objects cone suitcase teapot helmet] [--views 30]
+    python benchmarks/learn_object.py FOLDER [--objects cone teapot helmet] [--views 30]
+    python benchmarks/learn_object.py FOLDER --thresholds 0.2 0.25 0.3 0.4 0.5 [--objects suitcase bucket vase drum]
+
+The second chooses the threshold: by other objects in other worlds than those that judge.
 
 Each object is a shape that no network was trained on. It stands on floors or tables of simulated worlds; five images of
 one world are labelled, `dataflow learn object` learns from them, and images of other worlds judge: an object counts
@@ -38,6 +41,8 @@ from operators.training.learning import learn as command
 OPTICS = Optics(640, 480, 544.0, 544.0, 319.5, 239.5)
 LEARNED, HELD_OUT = 71_000, 72_000
 """First seeds of the worlds to learn in and to judge by."""
+OF_CHOICE = 10_000
+"""Added to both for the worlds by which the threshold is chosen."""
 KINDS, WITH_TABLES = ("office", "table_top", "corridor"), ("office", "table_top", "office")
 VISIBLE, PIXELS, IOU = 0.5, 300, 0.5
 
@@ -83,8 +88,46 @@ def helmet() -> Shape:
     )
 
 
-SHAPES: dict[str, Callable[[], Shape]] = {"cone": cone, "suitcase": suitcase, "teapot": teapot, "helmet": helmet}
-ON_FLOOR = ("cone", "suitcase")
+def bucket() -> Shape:
+    """A red bucket, 30 cm high, with a white rim and a handle."""
+    red, white = Material("plain", (0.75, 0.1, 0.12), tile=0.3), Material("plain", (0.9, 0.9, 0.9), tile=0.3)
+    shape = at(lathe([(0.1, 0.0), (0.14, 0.28)], red), z=0.005)
+    shape += at(lathe([(0.14, 0.0), (0.15, 0.015), (0.14, 0.03)], white), z=0.27)
+    return (
+        shape
+        + box((0.02, 0.24, 0.015), white, center=(0, 0, 0.36))
+        + box((0.02, 0.015, 0.08), white, center=(0, 0.12, 0.32))
+    )
+
+
+def vase() -> Shape:
+    """A blue and white vase with a narrow neck, 34 cm high."""
+    blue, white = Material("plain", (0.12, 0.2, 0.6), tile=0.2), Material("plain", (0.93, 0.93, 0.95), tile=0.2)
+    foot = lathe([(0.05, 0.0), (0.1, 0.1)], white)
+    belly = at(lathe([(0.1, 0.0), (0.09, 0.06), (0.04, 0.12)], blue), z=0.1)
+    return foot + belly + at(lathe([(0.04, 0.0), (0.035, 0.08), (0.06, 0.12)], white), z=0.22)
+
+
+def drum() -> Shape:
+    """A toy drum, 26 cm wide: blue with golden hoops and a white skin."""
+    blue, gold = Material("plain", (0.15, 0.35, 0.7), tile=0.3), Material("plain", (0.8, 0.65, 0.2), tile=0.3)
+    skin = Material("plain", (0.95, 0.93, 0.88), tile=0.3)
+    hoop = lathe([(0.135, 0.0), (0.135, 0.025)], gold)
+    top = at(lathe([(0.13, 0.0), (0.0, 0.002)], skin), z=0.2)
+    return hoop + at(lathe([(0.125, 0.0), (0.125, 0.16)], blue), z=0.02) + at(hoop, z=0.175) + top
+
+
+SHAPES: dict[str, Callable[[], Shape]] = {
+    "cone": cone,
+    "teapot": teapot,
+    "helmet": helmet,
+    "suitcase": suitcase,
+    "bucket": bucket,
+    "vase": vase,
+    "drum": drum,
+}
+JUDGED, CHOOSING = ("cone", "teapot", "helmet"), ("suitcase", "bucket", "vase", "drum")
+ON_FLOOR = ("cone", "suitcase", "bucket", "drum")
 
 
 @dataclass(eq=False)
@@ -161,8 +204,11 @@ def looking(world: World, T: Array, rng: np.random.Generator) -> Array | None:
     return None
 
 
-def written(folder: Path, name: str, count: int) -> tuple[Path, Path]:
-    """Returns the folders to learn from and to judge by, in COCO format; they are made where they are lacking."""
+def written(folder: Path, name: str, count: int, shift: int = 0) -> tuple[Path, Path]:
+    """Returns the folders to learn from and to judge by, in COCO format; they are made where they are lacking.
+
+    `shift` is added to the seeds of their worlds.
+    """
     made = []
     for part, first, worlds, each in (("learn", LEARNED, 1, 5), ("held_out", HELD_OUT, 3, (count + 2) // 3)):
         place = folder / name / part
@@ -175,7 +221,7 @@ def written(folder: Path, name: str, count: int) -> tuple[Path, Path]:
         for k in range(worlds):
             kinds = KINDS if name in ON_FLOOR else WITH_TABLES
             kind = kinds[k] if part == "held_out" else "office"
-            for pixels, truth in views(name, kind, first + k, each):
+            for pixels, truth in views(name, kind, shift + first + k, each):
                 file = f"{len(images):03d}.png"
                 cv2.imwrite(str(place / file), pixels[..., ::-1])
                 images.append({"id": len(images), "file_name": file, "width": 640, "height": 480})
@@ -195,8 +241,8 @@ def written(folder: Path, name: str, count: int) -> tuple[Path, Path]:
     return made[0], made[1]
 
 
-def judged(folder: Path, detector: CustomDetector | LearnedDetector, name: str) -> tuple[dict[str, Any], float]:
-    """Returns the score of the new class, and the mean AP50 of the known ones."""
+def detected(folder: Path, detector: CustomDetector | LearnedDetector) -> list[ScoredFrame]:
+    """Returns what is in the images of a folder, and what the detector finds in them."""
     content = json.loads((folder / "annotations.json").read_text())
     names = {c["id"]: c["name"] for c in content["categories"]}
     frames = []
@@ -215,7 +261,12 @@ def judged(folder: Path, detector: CustomDetector | LearnedDetector, name: str) 
                 found.scores,
             )
         )
-    scores = score_frames(frames, (*THINGS, name), max_detections=100, iou=IOU, score_threshold=0.3)
+    return frames
+
+
+def judged(frames: Sequence[ScoredFrame], name: str, threshold: float = 0.3) -> tuple[dict[str, Any], float]:
+    """Returns the score of the new class from a threshold on, and the mean AP50 of the known ones."""
+    scores = score_frames(frames, (*THINGS, name), max_detections=100, iou=IOU, score_threshold=threshold)
     new = scores[name]
     known = [s.ap50 for n, s in scores.items() if n != name and s.ap50 is not None]
     found_there = new.hits + new.false_alarms
@@ -235,17 +286,42 @@ def started(detector: CustomDetector | LearnedDetector) -> CustomDetector | Lear
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--objects", nargs="+", choices=list(SHAPES), default=list(SHAPES))
-    parser.add_argument("--views", type=int, default=30, help="held-out images of each object")
+    parser.add_argument("--objects", nargs="+", choices=list(SHAPES), help=f"default: {' '.join(JUDGED)}")
+    parser.add_argument("--views", type=int, default=30, help="images of each object to judge by")
+    parser.add_argument("--thresholds", nargs="+", type=float, help="compare these, in the worlds that serve for that")
     options = parser.parse_args(arguments)
-    for name in options.objects:
-        learn, held_out = written(options.folder, name, options.views)
-        out = options.folder / f"{name}.object.npz"
-        command(["object", name, str(learn), "--out", str(out), "--overwrite"], standalone_mode=False)
-        _, before = judged(held_out, started(CustomDetector(score_threshold=0.01)), name)
-        new, after = judged(held_out, started(LearnedDetector(objects=[str(out)], score_threshold=0.01)), name)
+    if options.thresholds:
+        _compare(options.folder / "choice", options.objects or CHOOSING, options.views, options.thresholds)
+        return
+    for name in options.objects or JUDGED:
+        held_out, file = _learned(options.folder, name, options.views)
+        _, before = judged(detected(held_out, started(CustomDetector(score_threshold=0.01))), name)
+        detector = LearnedDetector(objects=[str(file)], score_threshold=0.01)
+        new, after = judged(detected(held_out, started(detector)), name, detector.learned_threshold)
         told = {k: round(v, 3) for k, v in new.items() if v is not None}
         print(f"{name}: {told}, known classes AP50 {before:.4f} -> {after:.4f}", flush=True)
+
+
+def _learned(folder: Path, name: str, views: int, shift: int = 0) -> tuple[Path, Path]:
+    """Learns an object; returns the folder of images to judge by, and the object's file."""
+    learn, held_out = written(folder, name, views, shift)
+    file = folder / f"{name}.object.npz"
+    command(["object", name, str(learn), "--out", str(file), "--overwrite"], standalone_mode=False)
+    return held_out, file
+
+
+def _compare(folder: Path, objects: Sequence[str], views: int, thresholds: Sequence[float]) -> None:
+    found = {}
+    for name in objects:
+        held_out, file = _learned(folder, name, views, OF_CHOICE)
+        detector = LearnedDetector(objects=[str(file)], score_threshold=0.01, learned_threshold=min(thresholds))
+        found[name] = detected(held_out, started(detector))
+    print(f"| threshold | {' | '.join(objects)} | mean: recall, precision |\n|{' --- |' * (len(objects) + 2)}")
+    for threshold in thresholds:
+        scores = [judged(found[name], name, threshold)[0] for name in objects]
+        pairs = [(score["recall"], score["precision"]) for score in scores]
+        cells = " | ".join(f"{recall:.2f}, {precision:.2f}" for recall, precision in [*pairs, np.mean(pairs, axis=0)])
+        print(f"| {threshold:g} | {cells} |", flush=True)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ import torchvision  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from torch import Tensor, nn  # noqa: E402
 
-from operators.detection.custom.dataset import read_detection_data  # noqa: E402
+from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.recognition.dataset import ClassificationData, LabelledImage  # noqa: E402
 from operators.recognition.training import ClassifierTask  # noqa: E402
 from operators.segmentation.dataset import MaskedImage, SegmentationData  # noqa: E402

@@ -10,6 +10,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from dataflow.arguments import checked
 from dataflow.firing.runner import OperatorRunner
 from dataflow.firing.source import SourceRunner
 from dataflow.graph.model import Live, Node
@@ -55,6 +56,7 @@ class _Collector:
         self.played.records.append(record)
 
 
+@checked
 def play(
     operator: Operator,
     streams: Mapping[str, Sequence[Message] | Mapping[str, Sequence[Message]]] | None = None,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from dataflow.arguments import checked, require
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph as ResolvedGraph
 from dataflow.graph.problems import did_you_mean
@@ -32,6 +33,7 @@ class Graph:
     lie in `folder`, the current one unless it is given.
     """
 
+    @checked
     def __init__(
         self,
         name: str = "graph",
@@ -55,11 +57,13 @@ class Graph:
         A class may stand in a notebook's cell; then it exists in this process alone. Raises `ValueError` for a name
         that is taken, and for a class that stands inside a function or another class.
         """
+        require("Graph.add", [("name", name, str)])
         if name in self._operators:
             raise ValueError(f"there is an operator {name!r} already")
         self._operators[name] = {"use": _path(operator)} | ({"params": _plain(name, params)} if params else {})
         return self
 
+    @checked
     def connect(self, name: str, /, **inputs: str | list[str]) -> Self:
         """Connects inputs of an operator to streams: `connect("cloud", depth="camera/depth", info="camera/info")`.
 
@@ -68,6 +72,7 @@ class Graph:
         self._operator(name).setdefault("inputs", {}).update(inputs)
         return self
 
+    @checked
     def configure(self, name: str, /, **sections: Any) -> Self:
         """Sets sections of an operator: `process="cameras"`, `live={"queue": "newest"}`, `sync={"tolerance": "20ms"}`.
 
@@ -76,6 +81,7 @@ class Graph:
         self._operator(name).update(_plain(name, sections))
         return self
 
+    @checked
     def record(self, *topics: str, exclude: list[str] | None = None, **settings: Any) -> Self:
         """Chooses the streams that recordings hold, by names or patterns; without this, all."""
         section = ({"topics": list(topics)} if topics else {}) | ({"exclude": exclude} if exclude else {})
@@ -102,12 +108,14 @@ class Graph:
         lines += [f"{key}: {_json(value)}" for key, value in self._tail.items()]
         return "\n".join(lines) + "\n"
 
+    @checked
     def save(self, path: str | Path) -> Path:
         """Writes the YAML text, for `dataflow run` and version control. Returns the path."""
         file = Path(path)
         file.write_text(self.yaml(), encoding="utf-8")
         return file
 
+    @checked
     def build(self, settings: Mapping[str, Any] | None = None) -> ResolvedGraph:
         """The graph, checked wholly. `settings` change parameters of operators inside nested graphs, as `--set` does.
         Raises `GraphError` with everything that is wrong."""
@@ -133,7 +141,10 @@ def _path(operator: type[Operator] | str) -> str:
     if isinstance(operator, str):
         return operator
     if not (isinstance(operator, type) and issubclass(operator, Operator)):
-        raise TypeError(f"expected an operator's class or import path, got {operator!r}; parameters are keywords")
+        raise TypeError(
+            f"Graph.add(): operator: expected an operator's class or import path, got {operator!r}; "
+            "parameters are keywords"
+        )
     if "." in operator.__qualname__:
         raise ValueError(
             f"{operator.__qualname__} stands inside a function or class, where no graph finds it: move it to the top "

@@ -11,12 +11,14 @@ from dataflow.api.asof import Direction, asof
 from dataflow.api.join import Joined
 from dataflow.api.names import StreamNameError, stream_named, streams_named
 from dataflow.api.stream import RecordedStream
+from dataflow.arguments import checked
 from dataflow.graph.model import Graph
 from dataflow.recording import Event, Recorded, Recording
 from dataflow.recording.layout import RECORDING
 from dataflow.reexecution.recorded_run import resolved_graph
 
 
+@checked
 def open(path: str | Path) -> RecordedStreams:
     """Opens a recording: one of this project's, or any MCAP file, also one whose writer was killed.
 
@@ -90,6 +92,7 @@ class RecordedStreams(Mapping[str, RecordedStream]):
 
     # ------------------------------------------------------------------------------------------------- streams
 
+    @checked
     def __getitem__(self, name: str) -> RecordedStream:
         found = stream_named(name, self._names, self.namespace)
         if found not in self._streams:
@@ -110,6 +113,7 @@ class RecordedStreams(Mapping[str, RecordedStream]):
         except StreamNameError:
             return False
 
+    @checked
     def select(self, *names: str) -> RecordedStreams:
         """Some of the streams, by names or patterns: `*` stands for one part of a name, `**` for any number.
 
@@ -119,12 +123,14 @@ class RecordedStreams(Mapping[str, RecordedStream]):
         chosen = tuple(name for name in self._names if name in found)
         return RecordedStreams(self._recording, chosen, self._origin, self._first, self._last)
 
+    @checked
     def between(self, start: float | None = None, end: float | None = None) -> RecordedStreams:
         """The recording from `start` to `end`, both included, in seconds from its first message."""
         first = None if start is None else self._origin + round(start * 1e9)
         last = None if end is None else self._origin + round(end * 1e9)
         return self.within(first, last)
 
+    @checked
     def within(self, first: int | None = None, last: int | None = None) -> RecordedStreams:
         """The recording with first ≤ stamp ≤ last (nanoseconds since the epoch). Static streams stay whole."""
         firsts = [stamp for stamp in (self._first, first) if stamp is not None]
@@ -147,6 +153,7 @@ class RecordedStreams(Mapping[str, RecordedStream]):
         """Reads the events of the run: restarts, gaps, planned faults."""
         return self._recording.events()
 
+    @checked
     def join(
         self, anchor: str, *others: str, direction: Direction = "backward", tolerance: float | None = None
     ) -> Joined:

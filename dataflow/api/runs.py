@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import os
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +14,12 @@ from dataflow.api.builder import Graph
 from dataflow.api.html import run_html, verify_html
 from dataflow.api.local import LocalRun, Watch
 from dataflow.api.recordings import RecordedStreams, open
+from dataflow.arguments import checked, evaluated, require
 from dataflow.editing.untouched import keep_untouched
 from dataflow.firing import seeding
 from dataflow.graph import Graph as ResolvedGraph
 from dataflow.graph import load_graph
+from dataflow.graph.problems import did_you_mean
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign
 from dataflow.interop.playing import play
@@ -25,12 +27,15 @@ from dataflow.recording import Recording
 from dataflow.recording.facts import machine_facts
 from dataflow.recording.layout import BAG, RUN
 from dataflow.reexecution.recorded_run import graph_metadata, recorded_graph
+from dataflow.supervision import plan
+from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
 from dataflow.supervision.report import RunReport
 from dataflow.verification.report import VerifyReport
 
 NOTEBOOK = "__main__:"
 """The beginning of import paths of operators in a notebook or script: no other process finds them."""
+_SET_BY_LAUNCH = ("graph", "log", "record", "live", "overwrite", "faults")
 GraphLike = Graph | ResolvedGraph | str | Path
 
 
@@ -94,6 +99,7 @@ class Verified:
         return verify_html(self.report)
 
 
+@checked
 def run(
     graph: GraphLike,
     *,
@@ -118,6 +124,7 @@ def run(
     return RunResult(report, file)
 
 
+@checked
 def replay(
     recording: str | Path,
     *,
@@ -162,6 +169,7 @@ def replay(
     return RunResult(report, file)
 
 
+@checked
 def launch(
     graph: GraphLike,
     *,
@@ -179,27 +187,31 @@ def launch(
     """
     from dataflow.supervision.run import run as run_in_processes
 
+    chosen = _plan_options(options)
     built = resolved(graph, settings)
     if here := _defined_here(built):
         raise ValueError(f"{', '.join(here)}: defined in this program, where no other process finds them; use run()")
     file = None if record is None else Path(record)
-    report = run_in_processes(built, watch=watch, live=live, record=file, overwrite=overwrite, **options)
+    report = run_in_processes(built, watch=watch, live=live, record=file, overwrite=overwrite, **chosen)
     return RunResult(report, file)
 
 
+@checked
 def verify(
     recording: str | Path,
     *,
     graph: GraphLike | None = None,
     tolerance: float | None = None,
     start: float | None = None,
-    only: str | None = None,
+    first: str | None = None,
+    only: str | Sequence[str] | None = None,
     jobs: int | None = None,
 ) -> Verified:
     """Re-executes a recording by its firing records and compares every output with what was recorded.
 
-    `tolerance`: absolute, for floating-point fields; `start`: seconds from the first message; `only`: one operator;
-    `jobs`: worker processes. Operators of a notebook are re-executed in this process. Raises `ReplayError`,
+    `tolerance`: absolute, for floating-point fields; `start`: seconds from the first message; `first`: an operator, to
+    verify it and what follows from it; `only`: one operator or several, to verify those alone; `jobs`: worker
+    processes. Operators of a notebook are re-executed in this process. Raises `ReplayError`,
     `RunFailed`.
     """
     from dataflow.api.here import call_here
@@ -210,8 +222,9 @@ def verify(
     with Recording(path) as opened:
         built = recorded_graph(opened) if graph is None else resolved(graph)
     workers = call_here if _defined_here(built) else call_workers
+    chosen = [only] if isinstance(only, str) else only
     report = verify_recording(
-        path, graph=built, tolerance=tolerance, start=start, only=only, jobs=jobs, workers=workers
+        path, graph=built, tolerance=tolerance, start=start, first=first, only=chosen, jobs=jobs, workers=workers
     )
     return Verified(report)
 
@@ -225,6 +238,18 @@ def resolved(graph: GraphLike, settings: Mapping[str, Any] | None = None) -> Res
     if settings:
         raise ValueError("settings change a graph file; give parameters to Graph.add()")
     return graph.build() if isinstance(graph, Graph) else graph
+
+
+def _plan_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The further options of `launch`, held to the fields of `RunPlan`. Raises `TypeError`."""
+    able = {f.name: f.type for f in fields(RunPlan) if f.name not in _SET_BY_LAUNCH}
+    hints = evaluated(able, vars(plan))
+    for name in options:
+        if name not in able:
+            raise TypeError(f"launch(): no option {name!r}: {did_you_mean(name, able, 'there are')}")
+    made = {n: Path(v) if isinstance(v, str) and n in ("view_file", "flight") else v for n, v in options.items()}
+    require("launch", ((name, value, hints[name]) for name, value in made.items()))
+    return made
 
 
 def _defined_here(graph: ResolvedGraph) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any, Self
 from dataflow.api.handed import HandedFeed
 from dataflow.api.local import Emitting, Recorder, config_of, make_here, step_each
 from dataflow.api.runs import GraphLike, metadata_of, resolved
+from dataflow.arguments import checked
 from dataflow.firing.calls import summary_of
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.threads import limited_threads
@@ -33,6 +34,7 @@ class Session:
     comes later (joins with a tolerance, ports with a lag) come with the step that decides them.
     """
 
+    @checked
     def __init__(
         self,
         graph: GraphLike,
@@ -93,6 +95,7 @@ class Session:
             chosen[stream] = name
         return chosen
 
+    @checked
     def put(self, stamp: int, messages: Mapping[str, Message]) -> Made:
         """Hands in the messages of one stamp, by stream, and returns what the graph makes of them.
 

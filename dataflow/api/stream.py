@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, SupportsIndex, overload
 
 import numpy as np
 import numpy.typing as npt
 
 from dataflow.api import frames
 from dataflow.api.columns import Column, column, elements, is_narrow, parallel_fields
+from dataflow.arguments import checked
 from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Field, Message
 from dataflow.recording import Recorded, Recording, StreamInfo
@@ -93,20 +94,25 @@ class RecordedStream(Sequence[Message]):
 
     def recorded(self, place: int) -> Recorded:
         """The message at a place with its number and incarnation. Raises `IndexError`, `RecordingError`."""
+        if not isinstance(place, SupportsIndex):
+            raise TypeError(f"{self.name}: expected a place, a slice, or a field's name, got {place!r}")
         if not -len(self) <= place < len(self):
             raise IndexError(f"message {place} of {self.name}, which has {len(self)}")
         return self._index.read(int(self._places[place]))
 
+    @checked
     def at(self, seconds: float) -> Message | None:
         """The newest message at or before a moment, in seconds from the recording's first message; None before the
         first."""
         earlier = np.flatnonzero(self.stamps <= self._origin + round(seconds * 1e9))
         return self[int(earlier[-1])] if len(earlier) else None
 
+    @checked
     def between(self, start: float | None = None, end: float | None = None) -> RecordedStream:
         """The part from `start` to `end`, both included, in seconds from the recording's first message."""
         return self.within(_stamp(start, self._origin), _stamp(end, self._origin))
 
+    @checked
     def within(self, first: int | None = None, last: int | None = None) -> RecordedStream:
         """The part with first ≤ stamp ≤ last (nanoseconds since the epoch). A static stream stays whole."""
         if self.info.static:
@@ -125,6 +131,7 @@ class RecordedStream(Sequence[Message]):
 
     # ------------------------------------------------------------------------------------------------- columns
 
+    @checked
     def column(self, field: str) -> Column:
         """A field of all messages: (N,) of a scalar, (N, ...) of an array.
 
@@ -135,12 +142,14 @@ class RecordedStream(Sequence[Message]):
             return self.stamps
         return self.columns(field)[field]
 
+    @checked
     def columns(self, *fields: str) -> dict[str, Column]:
         """Several fields, read in one pass; without names, the scalars and the vectors of fixed length."""
         chosen = self._fields(fields) or tuple(f for f in self.message_type.FIELDS if is_narrow(f))
         values = self._values(chosen)
         return {f.name: column(f, values[f.name]) for f in chosen}
 
+    @checked
     def frame(self, *fields: str) -> pd.DataFrame:
         """A pandas table with a row for each message, by time (UTC).
 
@@ -149,6 +158,7 @@ class RecordedStream(Sequence[Message]):
         """
         return frames.frame(self.stamps, self.seconds, self.columns(*fields), asked=bool(fields))
 
+    @checked
     def elements(self, *fields: str) -> pd.DataFrame:
         """A pandas table with a row for each element of parallel arrays: each detection, point or joint.
 

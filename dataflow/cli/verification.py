@@ -55,7 +55,10 @@ def verify(
     first: Annotated[
         str | None, typer.Option("--from", metavar="OPERATOR", help="Only this operator and what follows from it.")
     ] = None,
-    only: Annotated[str | None, typer.Option("--only", metavar="OPERATOR", help="Only this operator.")] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option("--only", metavar="OPERATOR", help="Only this operator; may be given several times."),
+    ] = None,
     tolerance: Annotated[
         float | None,
         typer.Option(
@@ -131,6 +134,7 @@ def verify(
 
       dataflow verify run.mcap
       dataflow verify run.mcap --only odometry --json
+      dataflow verify run.mcap --only odometry --only mapper
       dataflow verify run.mcap --from odometry --graph changed.yaml
       dataflow verify run.mcap --tolerance 1e-5
       dataflow verify run.mcap --start 60
@@ -148,6 +152,7 @@ def verify(
         if one_process or process_each:
             instead = "--jobs 1" if one_process else "nothing: each operator is fed from the recording"
             say(f"[yellow]note:[/] {'--one-process' if one_process else '--process-each'} is deprecated; use {instead}")
+        only = only or None  # typer gives an empty list where there is none
         if first is not None and only is not None:
             raise fail("--from and --only exclude each other")
         if graph is None and settings:

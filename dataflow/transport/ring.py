@@ -8,6 +8,9 @@ is about to wait, `blocked` by a writer that found no room,
 last; so a writer that is killed leaves whole frames, and its successor goes on with the same ring. A reader that takes
 the place of another skips what was meant for that one.
 
+The writer goes back to the beginning of a ring that is empty once it has come `_AGAIN` bytes far, so one whose reader
+keeps up touches few pages, which stay in the cache; the others cost no memory.
+
 Neither side waits here: `put` returns False when there is no room, `take` returns what is there.
 
 On x86-64 other cores see stores in the order in which they were made. Elsewhere fences see to it that a frame's content
@@ -31,6 +34,7 @@ _ROUNDED = _FRAME.size + 7
 """A frame takes its content and this of the ring, without the last three bits: whole words, so that a head
 never wraps."""
 _SKIP = 0xFFFFFFFF
+_AGAIN = 1 << 16
 _REORDERS = platform.machine() not in ("x86_64", "AMD64")
 
 Bytes = bytes | bytearray | memoryview
@@ -102,8 +106,10 @@ class RingWriter(_End):
             raise RingError(f"a frame of {size} bytes does not fit a ring of {self.capacity} bytes")
         needed, head, words, memory = (size + _ROUNDED) & ~7, self._head, self._words, self._memory
         at = head & (self.capacity - 1)
-        skipped = self.capacity - at if at + needed > self.capacity else 0
-        if head - words[_TAIL] + skipped + needed > self.capacity and not self._has_room(skipped + needed):
+        tail = words[_TAIL]
+        again = head == tail and at >= _AGAIN and at >= needed  # what is skipped and the frame fit together
+        skipped = self.capacity - at if again or at + needed > self.capacity else 0
+        if head - tail + skipped + needed > self.capacity and not self._has_room(skipped + needed):
             return False
         if skipped:
             _FRAME.pack_into(memory, _HEADER + at, _SKIP, 0)

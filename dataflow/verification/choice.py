@@ -14,23 +14,31 @@ from dataflow.reexecution.recorded_run import NotRecorded, ReplayError
 from dataflow.verification.ledger import COMPLETE
 
 
-def chosen_operators(graph: Graph, first: str | None, only: str | None) -> set[str]:
-    """The operators to verify: all that are neither sources nor external, or those asked for."""
+def chosen_operators(graph: Graph, first: str | None, only: Collection[str] | None) -> set[str]:
+    """The operators to verify: all that are neither sources nor external, or those asked for.
+
+    `first`: that one and what follows from it; `only`: those alone. Raises `ReplayError` for both, for an empty `only`,
+    and for operators that cannot be verified.
+    """
+    if first is not None and only is not None:
+        raise ReplayError("first and only exclude each other: an operator and what follows from it, or operators alone")
+    if only is not None and not only:
+        raise ReplayError("only: expected at least one operator; without it, all are verified")
     able = {name for name, node in graph.nodes.items() if not node.source and not node.external}
     if not able:
         raise ReplayError(
             f"graph {graph.name!r} holds nothing to verify: all its operators ({', '.join(graph.nodes)}) are sources "
             "or external, whose recorded output is taken as it is; name a graph with further operators with --graph"
         )
-    for asked in (first, only):
-        if asked is not None and asked not in able:
+    for asked in [first] if first is not None else (only or ()):
+        if asked not in able:
             raise ReplayError(
                 f"{asked!r} cannot be verified: it is "
                 + ("a source or external" if asked in graph.nodes else "no operator of the graph")
                 + f"; those that can: {', '.join(sorted(able))}"
             )
     if only is not None:
-        return {only}
+        return set(only)
     if first is None:
         return able
     following, edges = {first}, list(graph.edges())

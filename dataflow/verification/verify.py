@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -70,7 +70,7 @@ def verify(
     *,
     graph: Graph | None = None,
     first: str | None = None,
-    only: str | None = None,
+    only: Collection[str] | None = None,
     tolerance: float | None = None,
     start: float | None = None,
     jobs: int | None = None,
@@ -80,7 +80,7 @@ def verify(
 ) -> VerifyReport:
     """Re-executes a recording by its firing records and compares.
 
-    `first`: verify that operator and what follows from it; `only`: that one alone. Every operator is fed from the
+    `first`: verify that operator and what follows from it; `only`: those alone. Every operator is fed from the
     recording; where its inputs were not recorded, or not wholly, those that made them run with it. Operators marked
     `external` are always taken from it. Stored messages are compared with the digests in the firing records, too.
     `tolerance`: absolute, in the unit of each floating-point field. Culprits are run a second time, to see whether they
@@ -125,7 +125,12 @@ def verify(
 
 
 def _prepare(
-    path: Path, graph: Graph | None, first: str | None, only: str | None, start: float | None, jobs: int | None
+    path: Path,
+    graph: Graph | None,
+    first: str | None,
+    only: Collection[str] | None,
+    start: float | None,
+    jobs: int | None,
 ) -> _Task:
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)

@@ -30,12 +30,13 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import Duration, In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.localization.dead_reckoning import DeadReckoning, vertical_rate
+from operators.localization.estimate import Estimate, flat, planar
 from operators.localization.likelihood_field import LikelihoodField
 from operators.localization.map_file import read_map
 from operators.localization.monte_carlo import CloudConfig
 from operators.localization.motion import DriveNoise
-from operators.localization.output import Estimate, flat, planar, status_of
 from operators.localization.reading import MODALITIES, Surroundings, Unusable, observation
+from operators.localization.status import status_of
 from operators.localization.vote import Vote
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.localization.estimate import Estimate
 from operators.localization.monte_carlo import CloudConfig, MonteCarlo
 from operators.localization.observations import Observation
-from operators.localization.output import Estimate
 from operators.localization.rival import Rival
 from operators.localization.says import Says
 

@@ -35,7 +35,7 @@ class LearnedDetector(Operator):
     objects: list[str] = Param(doc="files of `dataflow learn object`, made with these weights")
     weights: str | None = Param(None, doc="network file of `dataflow train detector`; none means the shipped one")
     score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes of known classes below are dropped")
-    learned_threshold: float = Param(0.5, ge=0, le=1, live=True, doc="and those of learned ones")
+    learned_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="and those of learned ones")
     nms_iou: float = Param(0.5, ge=0, le=1, live=True, doc="overlap above which the weaker box of a class is dropped")
     max_detections: int = Param(100, ge=1, live=True, doc="keep the best so many")
 

@@ -122,7 +122,9 @@ def shown_in(trunk: Trunk, pixels: NDArray[np.uint8], boxes: F32, rng: np.random
         glance = trunk.look(view)
         within = _fitted(known, glance.fit.apply(np.zeros(view.shape, np.uint8)).shape, view.shape)
         proposed = trunk.propose(glance, LEAST, PROPOSALS)
-        overlap = np.array([intersection_over_union(box, proposed) for box in within]).reshape(len(within), -1)
+        overlap = np.zeros((len(within), len(proposed)), np.float32)
+        for row, box in zip(overlap, within, strict=True):
+            row[:] = intersection_over_union(box, proposed)
         best = overlap.max(axis=0, initial=0.0)
         near = np.concatenate([proposed[best >= _ALIKE], *(_jittered(box, rng) for box in within)])
         objects.append(trunk.describe(glance, near.astype(np.float32)))
@@ -212,7 +214,8 @@ def _variants(pixels: NDArray[np.uint8], boxes: F32) -> Iterator[tuple[NDArray[n
         half_x, half_y = min(side * width / height / 2, width / 2), min(side / 2, height / 2)
         x = float(np.clip((box[0] + box[2]) / 2, half_x, width - half_x))
         y = float(np.clip((box[1] + box[3]) / 2, half_y, height - half_y))
-        left, top, right, bottom = int(x - half_x), int(y - half_y), int(x + half_x), int(y + half_y)
+        left, top = max(0, int(x - half_x)), max(0, int(y - half_y))
+        right, bottom = min(width, int(np.ceil(x + half_x))), min(height, int(np.ceil(y + half_y)))
         corner = np.array([left, top, left, top], np.float32)
         inside = (boxes[:, 0] >= left) & (boxes[:, 2] <= right) & (boxes[:, 1] >= top) & (boxes[:, 3] <= bottom)
         yield np.ascontiguousarray(pixels[top:bottom, left:right]), boxes[inside] - corner

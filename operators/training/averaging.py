@@ -13,7 +13,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from operators.detection.custom.dataset import read_detection_data
+from operators.detection.custom.folder import read_detection_data
 from operators.segmentation.dataset import read_segmentation_data
 from operators.training.backbone import start_from
 from operators.training.files import save_atomically

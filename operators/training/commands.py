@@ -85,7 +85,7 @@ def train_detector(
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
-        from operators.detection.custom.dataset import read_detection_data
+        from operators.detection.custom.folder import read_detection_data
         from operators.detection.custom.training import DetectorTask
         from operators.training.augmentation import Variation
         from operators.training.loop import Settings
@@ -245,7 +245,7 @@ def train_pair(
     with friendly():
         file = out / "pair.onnx"
         keep_earlier(file, resume, overwrite)
-        from operators.detection.custom.dataset import read_detection_data
+        from operators.detection.custom.folder import read_detection_data
         from operators.segmentation.dataset import read_segmentation_data
         from operators.training.augmentation import Variation
         from operators.training.loop import Settings

@@ -37,7 +37,7 @@ def evaluate_detector(
     """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format."""
     with friendly():
         from operators.detection.custom.assessment import assess
-        from operators.detection.custom.dataset import read_detection_data
+        from operators.detection.custom.folder import read_detection_data
         from operators.weights import training_seed
 
         read = read_detection_data(data, training_seed(weights) if seed is None else seed)

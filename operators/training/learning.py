@@ -49,7 +49,8 @@ def learn_object(
 
         import numpy as np
 
-        from operators.detection.custom.dataset import IMAGE_SUFFIXES, LabelledImage, read_detection_data
+        from operators.detection.custom.dataset import IMAGE_SUFFIXES, LabelledImage
+        from operators.detection.custom.folder import read_detection_data
         from operators.recognition.learned_object import learn as fitted
         from operators.recognition.learned_object import shown_in
         from operators.recognition.proposals import Trunk, inner_maps

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.detection.custom.assessment import assess as assess_detector
-from operators.detection.custom.dataset import read_detection_data
+from operators.detection.custom.folder import read_detection_data
 from operators.detection.custom.training import KIND as DETECTOR
 from operators.segmentation.assessment import assess as assess_segmenter
 from operators.segmentation.dataset import read_segmentation_data

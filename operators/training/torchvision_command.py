@@ -98,7 +98,7 @@ def train_torchvision(
 def _detector(
     name: str, data: Path, size: str | None, seed: int, variation: Variation, quiet: bool
 ) -> TorchvisionDetectorTask:
-    from operators.detection.custom.dataset import read_detection_data
+    from operators.detection.custom.folder import read_detection_data
     from operators.training.torchvision_tasks import TorchvisionDetectorTask
 
     read = read_detection_data(data, seed)

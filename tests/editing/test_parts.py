@@ -119,13 +119,13 @@ def test_a_changed_message_of_a_part_is_found_and_a_lost_record_too(recorded: Pa
     def without(record: FiringRecord) -> bool:
         return not (record.operator == "tuned" and record.kind in CALLS and record.index % 7 == 0)
 
-    lacking = verify(tampered(part, tmp_path / "lacking.mcap", records=without), only="tuned").operators[0]
+    lacking = verify(tampered(part, tmp_path / "lacking.mcap", records=without), only=["tuned"]).operators[0]
     assert lacking.lost_records
     assert lacking.verdict == "unverifiable"
 
 
 def test_a_state_in_the_part_is_taken_up_where_there_was_none_at_the_cut(recorded: Path, tmp_path: Path) -> None:
-    report = verify(cut(recorded, tmp_path / "part.mcap", 0.1, None), only="tuned")
+    report = verify(cut(recorded, tmp_path / "part.mcap", 0.1, None), only=["tuned"])
 
     (tuned,) = report.operators
     assert tuned.unknown > 0  # up to its first state, at 0.2 s

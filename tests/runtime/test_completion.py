@@ -65,7 +65,7 @@ def test_the_completed_recording_of_a_live_run_is_equal_to_the_full_one_and_veri
         assert b.metadata["dataflow:completed"]["from"] == "thin.mcap"
     verified = verify(out, jobs=1)
     assert verified.identical
-    assert verify(out, only="smooth", jobs=1).identical  # its input stands in from the new file
+    assert verify(out, only=["smooth"], jobs=1).identical  # its input stands in from the new file
     assert [p.name for p in tmp_path.iterdir() if p.name.endswith(".part")] == []
 
 

@@ -85,7 +85,7 @@ def test_messages_that_no_record_made_show_that_the_last_records_are_lost(
         stored=lambda stream, seq: not thin or stream.startswith(sources),
     )
 
-    report = verify(path, jobs=1, only=None if thin else "smooth")
+    report = verify(path, jobs=1, only=None if thin else ["smooth"])
 
     smooth = of(report, "smooth")
     assert not report.identical
@@ -95,7 +95,7 @@ def test_messages_that_no_record_made_show_that_the_last_records_are_lost(
 
 
 def test_a_sink_whose_last_records_are_lost_is_not_identical(recorded: Path, tmp_path: Path) -> None:
-    report = verify(rewritten(recorded, tmp_path / "sink.mcap", records=early("sum", 10)), only="sum")
+    report = verify(rewritten(recorded, tmp_path / "sink.mcap", records=early("sum", 10)), only=["sum"])
 
     assert of(report, "sum").verdict == "unverifiable"
     assert of(report, "sum").unfinished
@@ -104,7 +104,7 @@ def test_a_sink_whose_last_records_are_lost_is_not_identical(recorded: Path, tmp
 def test_up_to_a_cut_a_failed_run_can_be_verified_but_is_not_identical(recorded: Path, tmp_path: Path) -> None:
     failed = rewritten(recorded, tmp_path / "failed.mcap", records=early("smooth", 10), outcome="failed: on fire")
 
-    report = verify(failed, only="smooth")
+    report = verify(failed, only=["smooth"])
 
     smooth = of(report, "smooth")
     assert smooth.verdict == "identical"
@@ -117,7 +117,7 @@ def test_up_to_a_cut_a_failed_run_can_be_verified_but_is_not_identical(recorded:
 def test_an_operator_of_which_nothing_lies_before_the_cut_is_not_verified(recorded: Path, tmp_path: Path) -> None:
     failed = rewritten(recorded, tmp_path / "failed.mcap", records=early("smooth", 1), outcome="failed: on fire")
 
-    assert of(verify(failed, only="smooth"), "smooth").verdict == "unverifiable"
+    assert of(verify(failed, only=["smooth"]), "smooth").verdict == "unverifiable"
 
 
 def test_firings_that_need_what_lies_after_the_cut_are_counted_apart(recorded: Path, tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_firings_that_need_what_lies_after_the_cut_are_counted_apart(recorded: P
         outcome="failed: on fire",
     )
 
-    smooth = of(verify(half, only="smooth"), "smooth")
+    smooth = of(verify(half, only=["smooth"]), "smooth")
 
     assert smooth.verdict == "identical"
     assert smooth.verified > 10
@@ -145,7 +145,7 @@ def test_a_hole_before_the_cut_is_no_cut(recorded: Path, tmp_path: Path) -> None
         outcome="failed: on fire",
     )
 
-    mix = of(verify(hole, only="mix"), "mix")
+    mix = of(verify(hole, only=["mix"]), "mix")
 
     assert mix.verdict == "unverifiable"
     assert mix.missing == "test/left/fast #15"
@@ -154,7 +154,7 @@ def test_a_hole_before_the_cut_is_no_cut(recorded: Path, tmp_path: Path) -> None
 def test_made_messages_that_the_recording_lacks_are_counted(recorded: Path, tmp_path: Path) -> None:
     path = rewritten(recorded, tmp_path / "gap.mcap", stored=lambda s, seq: s != "test/smooth/mean" or seq % 10 != 3)
 
-    report = verify(path, only="smooth")
+    report = verify(path, only=["smooth"])
 
     assert report.identical
     assert of(report, "smooth").not_stored > 3
@@ -248,7 +248,7 @@ def test_an_operator_with_other_ports_than_recorded_is_named(recorded: Path) -> 
 def test_what_was_not_recorded_for_one_operator_is_made_again(recorded: Path, tmp_path: Path) -> None:
     path = rewritten(recorded, tmp_path / "thin.mcap", stored=lambda stream, seq: stream != "test/mix/mixed")
 
-    report = verify(path, only="smooth")
+    report = verify(path, only=["smooth"])
 
     assert report.identical
     assert {v.operator for v in report.operators} == {"mix", "smooth"}

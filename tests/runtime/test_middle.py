@@ -67,7 +67,7 @@ def test_a_state_that_restores_to_something_else_is_found(recorded: Path, tmp_pa
     changed = tmp_path / "changed.yaml"
     changed.write_text(text)
 
-    report = verify(recorded, graph=load_graph(changed, settings=["count=120"]), start=0.5, only="tuned")
+    report = verify(recorded, graph=load_graph(changed, settings=["count=120"]), start=0.5, only=["tuned"])
 
     assert report.culprits == ("tuned",)
 
@@ -86,7 +86,7 @@ def test_a_middle_after_a_restart_has_the_parameters_with_which_it_was_started_a
     }
     run(graph, live=True, placement="one_process", record=path, faults=plan_of(plan, graph), rate=1.0)
 
-    report = verify(path, start=1.2, only="tuned")
+    report = verify(path, start=1.2, only=["tuned"])
 
     with Recording(path) as recording:
         kinds = [r.kind for r in recorded_firings(recording, "tuned") if r.kind in ("setup", "param")]
@@ -101,7 +101,7 @@ def test_a_tolerance_for_messages_is_none_for_the_states_between_them(recorded: 
     changed.write_text(text)
 
     graph = load_graph(changed, settings=["count=120"])
-    exact, tolerant = (verify(recorded, graph=graph, only="tuned", tolerance=t) for t in (None, 0.01))
+    exact, tolerant = (verify(recorded, graph=graph, only=["tuned"], tolerance=t) for t in (None, 0.01))
 
     assert exact.culprits == ("tuned",)
     assert exact.operators[0].states > 0

@@ -41,7 +41,7 @@ def test_a_recorded_run_is_identical_with_any_number_of_workers(recorded: Path, 
 
 
 def test_one_operator_is_verified_alone_with_its_inputs_taken_from_the_recording(recorded: Path) -> None:
-    report = verify(recorded, only="smooth")
+    report = verify(recorded, only=["smooth"])
 
     assert verdicts(report) == {"smooth": "identical"}
     assert report.stood_in == ("mix",)
@@ -117,6 +117,6 @@ def test_a_torn_recording_is_never_called_wholly_identical(recorded: Path, tmp_p
 
 def test_a_recording_without_what_is_needed_is_refused(recorded: Path) -> None:
     with pytest.raises(ReplayError, match="'left' cannot be verified: it is a source"):
-        verify(recorded, only="left")
+        verify(recorded, only=["left"])
     with pytest.raises(ReplayError, match="no operator of the graph; those that can: merge, mix, smooth, sum"):
-        verify(recorded, only="nobody")
+        verify(recorded, only=["nobody"])

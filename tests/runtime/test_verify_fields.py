@@ -139,7 +139,7 @@ def test_facts_that_differ_from_the_recording_are_named_with_both_values(
 
     monkeypatch.setattr(verification, "machine_facts", elsewhere)
 
-    found = {fact: (then, here) for fact, then, here in verify(recorded, only="sum", jobs=1).facts}
+    found = {fact: (then, here) for fact, then, here in verify(recorded, only=["sum"], jobs=1).facts}
 
     assert found["machine cpu_features"][1] == "sse4_2"
     assert found["packages numpy"][1] == "1.0"

@@ -80,6 +80,25 @@ def test_a_frame_that_never_fits_is_refused(ends: Ends) -> None:
         ends.writer.put(0, [bytes(2000)])
 
 
+def test_a_ring_whose_reader_keeps_up_uses_little_of_its_memory() -> None:
+    ends = Ends(1 << 20)
+    for number in range(5000):
+        content = number.to_bytes(4, "little") * (1 + number % 500)
+        assert ends.writer.put(number % 3, [content])
+        assert ends.reader.take(10) == [(number % 3, content)]
+    assert os.fstat(ends.descriptor).st_blocks * 512 <= 100_000
+    ends.close()
+
+
+@given(st.lists(st.integers(1, (1 << 18) - 8), min_size=1, max_size=20))
+def test_an_empty_ring_takes_every_frame_that_can_fit(sizes: list[int]) -> None:
+    ends = Ends(1 << 20)
+    for size in sizes:
+        assert ends.writer.put(0, [bytes(size)])
+        assert ends.reader.take(2) == [(0, bytes(size))]
+    ends.close()
+
+
 def test_a_writer_goes_on_where_its_predecessor_was_killed(ends: Ends) -> None:
     ends.writer.put(0, [b"before"])
     successor = RingWriter(ends.descriptor, ends.to_reader)

@@ -15,8 +15,10 @@ from dataflow.messages import Image
 from dataflow.testing import play
 from operators.detection import CustomDetector
 from operators.recognition import LearnedDetector
-from operators.recognition.learned_object import LearnedObject, LearnedObjectError, Shown, learn
+from operators.recognition.learned_object import LearnedObject, LearnedObjectError, Shown, learn, shown_in
+from operators.recognition.proposals import Trunk, inner_maps
 from operators.training.learning import learn as command
+from operators.weights import shipped
 
 pytest.importorskip("onnx", reason="learning needs the extra [train]")
 
@@ -139,6 +141,18 @@ def test_what_varies_everywhere_does_not_tell_an_object() -> None:
     assert abs(found.direction[1]) > 3 * abs(found.direction[0])
     assert (found.probability(vectors(50, 1.0)) > 0.5).mean() > 0.9
     assert (found.probability(vectors(50, 0.0)) < 0.5).mean() > 0.9
+
+
+@pytest.mark.parametrize("box", [(280.3, 190.4, 320.0, 239.7), (0.0, 0.0, 320.0, 240.0), None], ids=str)
+def test_objects_at_the_edge_and_images_without_one_are_learned_from(box: tuple[float, ...] | None) -> None:
+    network = shipped("detector.onnx")
+    trunk = Trunk(network, inner_maps(network))
+    pixels, _ = scenery(0, sign=False)
+    boxes = np.array([] if box is None else [box], np.float32).reshape(-1, 4)
+    shown = shown_in(trunk, pixels, boxes, np.random.default_rng(0))
+    assert (len(shown.object) > 0) == (box is not None)
+    assert len(shown.touching) == len(shown.changes)
+    assert len(shown.others) or box is not None
 
 
 def test_no_example_is_an_error() -> None:

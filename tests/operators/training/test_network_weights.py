@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from torch import nn  # noqa: E402
 
-from operators.detection.custom.dataset import read_detection_data  # noqa: E402
+from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.detection.custom.network import FINE_STRIDES, GridHead  # noqa: E402
 from operators.detection.custom.training import DetectorTask  # noqa: E402
 from operators.segmentation.dataset import read_segmentation_data  # noqa: E402

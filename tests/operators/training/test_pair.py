@@ -10,7 +10,8 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from operators.detection import CustomDetector  # noqa: E402
-from operators.detection.custom.dataset import DataError, read_detection_data  # noqa: E402
+from operators.detection.custom.dataset import DataError  # noqa: E402
+from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.segmentation import Segmenter  # noqa: E402
 from operators.segmentation.dataset import VOID, read_segmentation_data  # noqa: E402
 from operators.sources.simulator.classes import CLASSES  # noqa: E402

@@ -14,7 +14,7 @@ pytest.importorskip("torch", reason="training needs the extra [train]")
 
 from dataflow.cli.main import app
 from dataflow.messages import Image
-from operators.detection.custom.dataset import read_detection_data
+from operators.detection.custom.folder import read_detection_data
 from operators.segmentation import Segmenter
 from operators.segmentation.dataset import read_segmentation_data
 from operators.training.loop import Settings, train

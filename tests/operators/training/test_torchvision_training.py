@@ -16,7 +16,7 @@ pytest.importorskip("torchvision", reason="needs the extra [torch]")
 
 from dataflow.messages import Image  # noqa: E402
 from operators.detection import TorchvisionDetector  # noqa: E402
-from operators.detection.custom.dataset import read_detection_data  # noqa: E402
+from operators.detection.custom.folder import read_detection_data  # noqa: E402
 from operators.segmentation import TorchvisionSegmenter  # noqa: E402
 from operators.torch_models import family_of, new_model  # noqa: E402
 from operators.training.augmentation import NONE  # noqa: E402

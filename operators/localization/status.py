@@ -1,25 +1,19 @@
-"""Output of the localisation: estimates, planar motions, and the status of filter and sensors."""
+"""The status of the localisation: of its filter, its sensors, and each modality beside the fused estimate."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Diagnostics, Odometry
+from dataflow.messages import Diagnostics
 from dataflow.messages.diagnostics import Level
-from dataflow.messages.geometry import quaternion_from_yaw, transform_matrix, yaw_of
-from operators.localization.particles import wrapped
+from operators.localization.estimate import Estimate, apart
 from operators.localization.says import CONSISTENT
-
-if TYPE_CHECKING:
-    from operators.localization.vote import Vote
+from operators.localization.vote import Vote
 
 Array = NDArray[np.float64]
-Word = Literal["waiting", "searching", "ambiguous", "localised", "lost"]
 _LEVELS = {
     "localised": Level.OK,
     "ambiguous": Level.WARN,
@@ -27,42 +21,6 @@ _LEVELS = {
     "waiting": Level.WARN,
     "lost": Level.ERROR,
 }
-_APART = 16.27
-"""Chi-square with 3 degrees of freedom, 99.9 %."""
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """A pose (3,) with covariance (3, 3), the share of the weight that it has, and whether it is to be believed.
-
-    `other`: another place (3,) that explains what was observed about as well.
-    """
-
-    word: Word
-    mean: Array
-    covariance: Array
-    share: float
-    other: Array | None = None
-
-
-def planar(pose: Array) -> Array:
-    """Returns the rigid motion (4, 4) of a pose (x, y, yaw)."""
-    return transform_matrix([pose[0], pose[1], 0.0], quaternion_from_yaw(pose[2]))
-
-
-def flat(odometry: Odometry) -> Array:
-    """Returns the pose in the plane, as a rigid motion (4, 4)."""
-    return planar(np.array([*odometry.position[:2], float(yaw_of(odometry.orientation))]))
-
-
-def apart(first: Estimate, second: Estimate) -> bool:
-    """Says whether two estimates, both to be believed, contradict each other."""
-    if first.word != "localised" or second.word != "localised":
-        return False
-    off = first.mean - second.mean
-    off[2:] = wrapped(off[2:])
-    spread = first.covariance + second.covariance + np.diag([0.03**2, 0.03**2, 0.02**2])
-    return float(off @ np.linalg.solve(spread, off)) > _APART
 
 
 def written(pose: Array) -> str:
