@@ -72,11 +72,11 @@ class FoxgloveServer:
         self.address = f"ws://{host}:{self._server.port}"
 
     def show(self, stream: str, message: Message) -> None:
-        """Sends a message, with the transforms that it implies, to whoever looks at its topic."""
+        """Sends a message, with the transforms that it implies, to whoever looks at its topic. One thread calls it."""
         for topic, shown in self._topics.of(stream, message):
             key = (topic, type(shown), drawing_of(shown))
-            with self._guard:
-                channel = self._channels.get(key) or self._open(key, shown)
+            channel = self._channels.get(key) or self._open(key, shown)
+            with self._guard:  # never around what may wait for the server, whose threads take it too
                 self._newest[channel.id()] = (channel, shown)
             if channel.has_sinks():
                 channel.log(data_of(shown), log_time=max(shown.stamp, 0))
@@ -131,6 +131,9 @@ class _Listener:
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
         self._subscribed(channel.id)
+
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:
+        """Does nothing: the server asks for it all the same, and reports where it is lacking."""
 
     def on_playback_control_request(self, request: Any) -> Any:
         if self._controls is None:

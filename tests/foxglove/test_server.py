@@ -50,7 +50,9 @@ class Client:
         with contextlib.suppress(ConnectionClosed):  # this server cuts the connection instead of closing it
             for message in self._socket:
                 if isinstance(message, str):
-                    self.said.put(json.loads(message))
+                    self.said.put(said := json.loads(message))
+                    if "unknown channel" in said.get("message", ""):  # it was advertised a moment too early
+                        self._socket.send(json.dumps(self._asked))
                 elif message[0] == 1:
                     subscription, stamp = struct.unpack_from("<IQ", message, 1)
                     self.data.put((subscription, stamp, message[13:]))
@@ -67,7 +69,8 @@ class Client:
 
     def subscribe(self, topic: str, subscription: int) -> None:
         wanted = {"id": subscription, "channelId": self.channel(topic)["id"]}
-        self._socket.send(json.dumps({"op": "subscribe", "subscriptions": [wanted]}))
+        self._asked = {"op": "subscribe", "subscriptions": [wanted]}
+        self._socket.send(json.dumps(self._asked))
 
     def request(self, *, playing: bool, speed: float, seek: int | None) -> None:
         head = struct.pack("<BBfBQI", 3, 0 if playing else 1, speed, seek is not None, seek or 0, 2)
