@@ -12,7 +12,7 @@ from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import KeyframeGraph, Node
-from operators.slam.sights import Added, Eyes, Index, Moved, PlaceSettings, Sighting, Surprise, V
+from operators.slam.sights import Added, Eyes, Index, Moved, PlaceSettings, Sighting, Surprise, V, alike
 
 UNKNOWN = np.diag([1.0] * 3 + [1.0] * 3)  # covariance (6, 6) of a motion that nothing measured, m² and rad²
 WINDOW = 10  # newest keyframes, which are settled at every new one
@@ -135,7 +135,10 @@ class PlaceGraph(Generic[V]):
         new.covariance = moved_covariance(known.covariance, np.eye(4), T) + covariance
 
     def _beside(self, number: int, eyes: Eyes[V]) -> int:
-        """Measures a new node against nodes a little before it, beyond its neighbour; returns how many it could."""
+        """Measures a new node against nodes a little before it, beyond its neighbour; returns how many it could.
+
+        Odometry errs little from there to here, so a sight that says otherwise is of a pattern that repeats.
+        """
         new, found = self.nodes[number], 0
         recent = [k for k in self.nodes if k < number and self.nodes[k].island == new.island][-WINDOW:-1]
         ranked = [
@@ -146,7 +149,7 @@ class PlaceGraph(Generic[V]):
         ]
         for _, k in sorted(ranked)[: self._settings.beside]:
             seen = eyes.sight(self.nodes, k, number, True)
-            if not isinstance(seen, str):
+            if not isinstance(seen, str) and alike(self.nodes[k].T_odom @ seen.T_known_seen, new.T_odom):
                 self.graph.join(k, number, seen.T_known_seen, seen.covariance, loop=True)
                 found += 1
         return found
