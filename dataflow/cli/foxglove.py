@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,10 +16,14 @@ from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
 
 if TYPE_CHECKING:
+    from dataflow.client.playback import ReplayControls
     from dataflow.foxglove.server import FoxgloveServer
     from dataflow.recording import Recorded
+    from dataflow.transport.registry import RunningGraph
 
 PORT = 8765
+TAKE_WITHIN, LOOK_EVERY = 0.1, 0.5
+"""Seconds until a client's request is seen at the latest, and between two looks at how a replay stands."""
 
 
 def foxglove(
@@ -45,8 +51,9 @@ def foxglove(
     """Serve a running graph or a recording to Foxglove.
 
     In Foxglove: Open connection, Foxglove WebSocket, and the address that is printed. Its playback bar plays the
-    recording: pause, speed, any place. Images, clouds, boxes, masks, tracks, trajectories, maps and the scene graph are
-    sent as Foxglove's own schemas; a client can never slow the graph.
+    recording: pause, speed, any place. Of a replay through a graph it moves the replay itself: pause, speed, and
+    forward to a place; operators cannot be taken back. Images, clouds, boxes, masks, tracks, trajectories, maps and the
+    scene graph are sent as Foxglove's own schemas; a client can never slow the graph.
 
     Examples:
 
@@ -120,25 +127,50 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
     found = running_graph(name, wait)
     running = graph_of(found)
     chosen = chosen_streams(words, running.streams, running.namespace)
-    with FoxgloveServer(running.name, namespace=running.namespace, host=host, port=port) as server:
+    with contextlib.ExitStack() as held:
+        controls = _controls(found, held)
+        span = None if controls is None else (controls.first, controls.last)
+        server = FoxgloveServer(
+            running.name, namespace=running.namespace, host=host, port=port, controls=controls, span=span
+        )
+        held.enter_context(server)
         _say_where(server)
         say(f"following {escape(running.name)} (process {found.pid})")
-        clock = 0
+        clock, looked = 0, time.monotonic()
         try:
             with tap(found, [f"/{stream}" for stream in chosen] if words else ["**"]) as client:
-                while (taken := client.take(timeout=0.5)) is not None or still_runs(found):
+                while (taken := client.take(timeout=TAKE_WITHIN)) is not None or still_runs(found):
                     message = None if taken is None else taken.decode().message
-                    if taken is None or message is None:
-                        continue
-                    server.show(taken.stream, message)
-                    if message.stamp > clock:
-                        clock = message.stamp
-                        server.time(clock)
+                    if taken is not None and message is not None:
+                        server.show(taken.stream, message)
+                        if message.stamp > clock:
+                            clock = message.stamp
+                            server.time(clock)
+                    if controls is not None:
+                        controls.carry_out()
+                        if time.monotonic() - looked >= LOOK_EVERY:
+                            looked = time.monotonic()
+                            if controls.look(clock) or controls.state()[0]:
+                                server.playback(controls)
+            if controls is not None:
+                server.playback(controls, ended=True)
         except KeyboardInterrupt:
             say("ended")
         else:
             say("the graph has ended")
     out.print(f"shown: {plural(server.shown, 'message')}")
+
+
+def _controls(found: RunningGraph, held: contextlib.ExitStack) -> ReplayControls | None:
+    """Returns what moves the graph's sources, where they come from a recording."""
+    from dataflow.client.attach import NotRunning
+    from dataflow.client.playback import ReplayControls, steering
+
+    steered = held.enter_context(steering(found))
+    try:
+        return ReplayControls(steered)
+    except NotRunning:
+        return None
 
 
 def _say_where(server: FoxgloveServer) -> None:

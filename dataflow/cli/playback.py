@@ -1,8 +1,9 @@
-"""Pauses and steps a replay: by keys in its terminal, and by `dataflow playback` from another."""
+"""Pauses and steps a replay or a plain run: by keys in its terminal, and by `dataflow playback` from another."""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import sys
@@ -84,39 +85,53 @@ def _steered(supervisor: Supervisor) -> Iterator[None]:
 
 def playback(
     action: Annotated[
-        str, typer.Argument(metavar="pause|resume|step|status", help="What to do; status says how it stands.")
+        str, typer.Argument(metavar="pause|resume|step|rate|to|status", help="What to do; status says how it stands.")
     ],
-    steps: Annotated[int, typer.Argument(metavar="N", help="Of step: all messages of so many timestamps.")] = 1,
+    value: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[VALUE]",
+            help="Of step: all messages of so many timestamps (1). Of rate: a factor of real time, or max. "
+            "Of to: seconds from the recording's first message.",
+        ),
+    ] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Json = False,
 ) -> None:
-    """Pause, resume or step a replay that runs in another terminal, or in a script.
+    """Pause, resume, step or hurry a replay that runs in another terminal, or in a script.
 
     In a replay's own terminal, keys do the same: space pauses and goes on, the right arrow or n makes one step, q ends
-    it. Results do not depend on it: a replay makes the same messages however it is paused.
+    it. Results do not depend on it: a replay makes the same messages however it is paused. A plain run (not --live) can
+    be steered as well; where its sources are in several processes, each of them makes the step. Devices cannot be
+    paused.
 
     Exit codes:
 
       0    done
-      2    no replay runs, or nobody answers
+      2    nothing runs that can be paused, or it cannot go there: sources go only forward
 
     Examples:
 
       dataflow playback pause
       dataflow playback step 10
       dataflow playback resume --graph kitchen
+      dataflow playback rate 0.5
+      dataflow playback to 12.5
       dataflow playback status --json
     """
-    from dataflow.client.playback import ask
+    from dataflow.client.playback import steering
 
-    if action not in ("pause", "resume", "step", "status"):
-        raise fail(f"{action!r}: expected pause, resume, step or status")
-    if steps < 1:
-        raise fail(f"{steps} steps: expected 1 or more")
-    with friendly_errors():
-        found = running_graph(graph, wait)
-        answer = ask(found, None if action == "status" else action, steps)
+    if action not in ("pause", "resume", "step", "rate", "to", "status"):
+        raise fail(f"{action!r}: expected pause, resume, step, rate, to or status")
+    wanted = _wanted(action, value)
+    with friendly_errors(), steering(running_graph(graph, wait)) as steered:
+        if action == "to":
+            span = steered.ask(None)["span"]
+            if span is None:
+                raise fail("to: the sources do not come from a recording; pause, resume, step and rate can be had")
+            wanted = {"stamp": span[0] + round(wanted["seconds"] * 1e9)}
+        answer = steered.ask(None if action == "status" else action, **wanted)
     if json:
         print_json(answer)
         return
@@ -125,7 +140,35 @@ def playback(
     stamp = answer["stamp"]
     where = "" if stamp is None else f" at {format_stamp(stamp)} ({stamp})"
     state = "ended" if answer["ended"] else "paused" if answer["paused"] else "playing"
-    out.print(Text.assemble((state, "bold"), where))
+    pace = "as fast as it goes" if answer["rate"] is None else f"{answer['rate']:g} times real time"
+    out.print(Text.assemble((state, "bold"), where, f", {pace}"))
+
+
+def _wanted(action: str, value: str | None) -> dict[str, Any]:
+    """Returns what goes with an action. Raises `Exit` for a value that it does not take."""
+    match action:
+        case "step":
+            try:
+                steps = int(value or "1")
+            except ValueError:
+                steps = 0
+            if steps < 1:
+                raise fail(f"step {value}: expected how many, 1 or more")
+            return {"steps": steps}
+        case "rate" if value == "max":
+            return {"rate": None}
+        case "rate" | "to":
+            try:
+                number = float(value or "nan")
+            except ValueError:
+                number = math.nan
+            if not 0 <= number < math.inf:
+                what = "a factor of real time, or max" if action == "rate" else "seconds from the first message"
+                raise fail(f"{action} {value or ''}: expected {what}")
+            return {"rate": number} if action == "rate" else {"seconds": number}
+    if value is not None:
+        raise fail(f"{action} takes no value, got {value!r}")
+    return {}
 
 
 def same_digests(passes: list[dict[str, Any]]) -> bool:

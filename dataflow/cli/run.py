@@ -19,6 +19,7 @@ from dataflow.cli.arguments import (
 )
 from dataflow.cli.execution import checked_outputs, execute, plan_options
 from dataflow.cli.output import fail, friendly_errors
+from dataflow.cli.playback import keys
 from dataflow.cli.run_options import (
     Json,
     Live,
@@ -104,6 +105,7 @@ def run(
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
         options["live"] = live
+        options["controls"] = None if live else keys(quiet or json)
         if loaded.record.flight is not None and record is None:
             options["flight"] = Path(loaded.record.flight.folder)
             options["flight"].mkdir(parents=True, exist_ok=True)

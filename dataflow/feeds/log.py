@@ -76,11 +76,21 @@ class LogFeed:
         self._messages = iter(numbered(recording.messages(streams=list(streams), start=start, end=end)))
         self._step: list[Recorded] = []
         self._following: Recorded | None = None
+        self.span = self._span(start, end)
+        """The first and the last stamp that are played; None where there are none."""
         self.last = NEVER
         self.firings = self.emitted = 0
         self.ended = False
         self.work = Work()
         self.static_digests: dict[str, StreamDigest] = {}
+
+    def _span(self, start: int | None, end: int | None) -> tuple[int, int] | None:
+        infos = [self.recording.streams[name] for name in self._streams]
+        ends = [(info.first, info.last) for info in infos if info.first is not None and info.last is not None]
+        if not ends:
+            return None
+        first, last = min(first for first, _ in ends), max(last for _, last in ends)
+        return first if start is None else max(first, start), last if end is None else min(last, end)
 
     def _final(self, name: str, finals: Mapping[str, int], end: int | None) -> int:
         last = self.recording.streams[name].last

@@ -1,4 +1,4 @@
-"""The playback of a recording: paused, stepped, resumed. It decides when messages are given, never which meet."""
+"""The playback of sources that need not keep up with the world: when messages are given, never which meet."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ class Playback:
     def __init__(self, *, paused: bool = False) -> None:
         self.paused = paused
         self._steps = 0
+        self._hurried_to: int | None = None
 
     def do(self, action: Action, steps: int = 1) -> None:
         """Pauses, resumes, or lets so many steps pass while paused: a step of what plays pauses it.
@@ -35,17 +36,33 @@ class Playback:
             case _:
                 raise ValueError(f"{action!r}: expected one of {', '.join(ACTIONS)}")
 
+    def hurry_to(self, stamp: int) -> None:
+        """Lets everything up to a stamp pass, paused or not, without waiting for the clock."""
+        self._hurried_to = stamp
+
+    @property
+    def hurrying(self) -> bool:
+        """Tells whether somebody asked to go to a stamp that is not reached yet."""
+        return self._hurried_to is not None
+
+    def arrives(self, stamp: int) -> bool:
+        """Tells whether the next step, of this stamp, lies beyond where it was asked to go; it then hurries no more."""
+        if self._hurried_to is None or stamp <= self._hurried_to:
+            return False
+        self._hurried_to = None
+        return True
+
     @property
     def holds(self) -> bool:
         """Tells whether the next step has to wait for somebody to let it pass."""
-        return self.paused and not self._steps
+        return self.paused and not self._steps and not self.hurrying
 
     @property
     def stepping(self) -> bool:
         """Tells whether the next step was asked for, so that it does not wait for the clock."""
-        return self.paused and self._steps > 0
+        return self.hurrying or (self.paused and self._steps > 0)
 
     def passed(self) -> None:
         """A step was given."""
-        if self.paused and self._steps:
+        if self.paused and self._steps and not self.hurrying:
             self._steps -= 1

@@ -23,8 +23,8 @@ class FoxgloveError(RuntimeError):
 class Controls(Protocol):
     """Is moved by the playback bar of Foxglove."""
 
-    def request(self, *, playing: bool, speed: float, seek: int | None) -> None:
-        """The state that a client asks for; `seek`: the stamp to go to."""
+    def request(self, *, playing: bool, speed: float, seek: int | None) -> bool:
+        """Takes the state that a client asks for; tells whether it goes to the stamp `seek`."""
 
     def state(self) -> tuple[bool, int, float]:
         """Tells whether it plays, the stamp it is at, and its speed."""
@@ -72,11 +72,11 @@ class FoxgloveServer:
         self.address = f"ws://{host}:{self._server.port}"
 
     def show(self, stream: str, message: Message) -> None:
-        """Sends a message, with the transforms that it implies, to whoever looks at its topic."""
+        """Sends a message, with the transforms that it implies, to whoever looks at its topic. One thread calls it."""
         for topic, shown in self._topics.of(stream, message):
             key = (topic, type(shown), drawing_of(shown))
-            with self._guard:
-                channel = self._channels.get(key) or self._open(key, shown)
+            channel = self._channels.get(key) or self._open(key, shown)
+            with self._guard:  # never around what may wait for the server, whose threads take it too
                 self._newest[channel.id()] = (channel, shown)
             if channel.has_sinks():
                 channel.log(data_of(shown), log_time=max(shown.stamp, 0))
@@ -126,12 +126,15 @@ class _Listener:
     def on_subscribe(self, client: Any, channel: Any) -> None:
         self._subscribed(channel.id)
 
+    def on_unsubscribe(self, client: Any, channel: Any) -> None:
+        """Does nothing: the server asks for it all the same."""
+
     def on_playback_control_request(self, request: Any) -> Any:
         if self._controls is None:
             return None
         playing = request.playback_command == self._sdk.websocket.PlaybackCommand.Play
-        self._controls.request(playing=playing, speed=request.playback_speed, seek=request.seek_time)
-        return _state(self._sdk, self._controls, request.seek_time is not None, False, request.request_id)
+        did_seek = self._controls.request(playing=playing, speed=request.playback_speed, seek=request.seek_time)
+        return _state(self._sdk, self._controls, did_seek, False, request.request_id)
 
 
 def _state(sdk: Any, controls: Controls, did_seek: bool, ended: bool, request: str) -> Any:

@@ -41,6 +41,8 @@ class Feeding:
     def admit(self) -> bool:
         """Emits the next step; False when there is none, or it has to wait."""
         due = self._oldest()
+        if due is not None and self.playback.arrives(due[0]):
+            self._pace.put(due[0])
         if due is None or self._window.full or self.playback.holds:
             return False
         if self._pace.due_in(due[0]) > 0 and not self.playback.stepping:
@@ -62,6 +64,29 @@ class Feeding:
         if was_paused and not self.playback.paused and (due := self._oldest()) is not None:
             self._pace.put(due[0])
 
+    @property
+    def rate(self) -> float | None:
+        """The factor of real time at which steps are given; None: as fast as they are taken."""
+        return self._pace.rate
+
+    def set_rate(self, rate: float | None) -> None:
+        """Goes on at another rate."""
+        due = self._oldest()
+        self._pace.change(rate, None if due is None else due[0])
+
+    def go_to(self, stamp: int) -> None:
+        """Gives what comes up to a stamp as fast as it is taken. Raises `ValueError` where that was given already."""
+        due = self._oldest()
+        if due is not None and stamp < due[0]:
+            raise ValueError(f"{stamp} lies before {due[0]}, which comes next: this goes only forward; start it again")
+        self.playback.hurry_to(stamp)
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """The first and the last stamp of the recordings among the feeds; None where there are none."""
+        spans = [span for log in self.logs if (span := log.span) is not None]
+        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+
     def promise(self) -> None:
         """Sends the frontiers of streams which had no message of late."""
         self._since_promise = 0
@@ -71,7 +96,7 @@ class Feeding:
 
     def next_due(self) -> float | None:
         """Seconds until the next paced step; None when nothing waits for the clock."""
-        if not self._pace.held or self._window.full or self.playback.paused:
+        if not self._pace.held or self._window.full or self.playback.paused or self.playback.hurrying:
             return None
         stamps = [s for feed in self.feeds if not feed.ended and (s := feed.look_ahead()) is not None]
         return self._pace.due_in(min(stamps)) if stamps else None

@@ -18,6 +18,16 @@ class Pace:
             self._began = (first, at)
 
     @property
+    def rate(self) -> float | None:
+        """The factor of real time; None: nothing waits for the clock."""
+        return self._rate
+
+    def change(self, rate: float | None, stamp: int | None) -> None:
+        """Goes on at another rate from event time `stamp`, which is now."""
+        self._rate = rate
+        self._began = None if rate is None or stamp is None else (stamp, time.time())
+
+    @property
     def held(self) -> bool:
         """Tells whether steps wait for the clock."""
         return self._began is not None

@@ -26,6 +26,9 @@ from dataflow.transport.codec import decode
 from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import runtime_key
 
+SLOWEST, FASTEST = 0.01, 100.0
+"""Rates at which a replay may be made to go on, as factors of real time."""
+
 
 class Requests:
     """Takes requests on Zenoh's thread; changes parameters on the main thread, between two firings."""
@@ -55,7 +58,7 @@ class Requests:
                 bus.serve(runtime_key(namespace, "pub", name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
         bus.serve(runtime_key(namespace, "trigger", self._config.label), self._answer_trigger)
-        if self._config.replay is not None:
+        if self._feeding.feeds:
             bus.serve(runtime_key(namespace, "playback"), _to_inbox(inbox, "", "playback"))
 
     def answer_parameter(self, name: str, query: Any) -> None:
@@ -73,14 +76,19 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def answer_playback(self, query: Any) -> None:
-        """Answers a request to pause, resume or step what is replayed; one without an action asks how it stands."""
+        """Answers a request to pause, resume, step, go at another rate or to a stamp; `{}` asks how it stands."""
         with query:
             feeding = self._feeding
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
-                if "action" in asked:
-                    feeding.play(asked["action"], int(asked.get("steps", 1)))
-                answer: dict[str, Any] = {"ok": True, "paused": feeding.playback.paused, "ended": feeding.ended}
+                _steer(feeding, asked)
+                answer: dict[str, Any] = {
+                    "ok": True,
+                    "paused": feeding.playback.paused,
+                    "ended": feeding.ended,
+                    "rate": feeding.rate,
+                    "span": feeding.span,
+                }
             except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
                 answer = {"ok": False, "error": str(error)}
             stamps = [log.last for log in feeding.logs if log.last != NEVER]
@@ -163,6 +171,22 @@ class Requests:
         """Tells how often an operator was restarted, by this process and in the processes before it."""
         here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
         return self._config.resumed(maker.node.name).restarts + here
+
+
+def _steer(feeding: Feeding, asked: dict[str, Any]) -> None:
+    """Does what was asked. Raises `KeyError`, `TypeError`, `ValueError`."""
+    match asked.get("action"):
+        case None:
+            pass
+        case "rate":
+            rate = None if asked["rate"] is None else float(asked["rate"])
+            if rate is not None and not SLOWEST <= rate <= FASTEST:
+                raise ValueError(f"a rate of {rate:g}: expected {SLOWEST:g} to {FASTEST:g}, or none")
+            feeding.set_rate(rate)
+        case "to":
+            feeding.go_to(int(asked["stamp"]))
+        case action:
+            feeding.play(action, int(asked.get("steps", 1)))
 
 
 def _asks_for_firings(query: Any) -> bool:

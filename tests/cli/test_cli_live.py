@@ -177,9 +177,12 @@ def test_a_running_graph_is_recorded_by_pattern_and_what_it_lacks_is_said(datafl
 
 @pytest.mark.usefixtures("running")
 def test_what_plays_no_recording_and_has_no_flight_recorder_says_so(dataflow) -> None:
-    assert "plays no recording" in dataflow("playback", "pause", code=2).stderr
+    assert "its sources are live" in dataflow("playback", "pause", code=2).stderr
     assert "has no flight recorder" in dataflow("trigger", code=2).stderr
-    assert "expected pause, resume, step or status" in dataflow("playback", "rewind", code=2).stderr
+    assert "expected pause, resume, step, rate, to or status" in dataflow("playback", "rewind", code=2).stderr
+    assert "expected how many" in dataflow("playback", "step", "none", code=2).stderr
+    assert "expected a factor of real time" in dataflow("playback", "rate", code=2).stderr
+    assert "takes no value" in dataflow("playback", "pause", "3", code=2).stderr
 
 
 def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:

@@ -35,15 +35,31 @@ def test_steps_pass_one_by_one_without_the_clock() -> None:
     assert playback.holds
 
 
-@given(st.lists(st.sampled_from([*ACTIONS, "passed"])))
-def test_it_holds_or_plays_and_steps_are_only_made_while_paused(actions: list[str]) -> None:
-    playback = Playback()
+def test_on_the_way_to_a_stamp_nothing_waits_and_then_it_is_as_before() -> None:
+    playback = Playback(paused=True)
+    playback.hurry_to(20)
+    for stamp in (10, 20):
+        assert not playback.arrives(stamp)
+        assert not playback.holds
+        assert playback.stepping
+        playback.passed()
+    assert playback.arrives(21)
+    assert playback.holds
+    assert not playback.arrives(21)
+
+
+@given(st.lists(st.sampled_from([*ACTIONS, "passed", "hurry"])))
+def test_it_holds_or_plays_and_steps_are_only_made_while_paused_or_on_the_way(actions: list[str]) -> None:
+    playback, stamp = Playback(), 0
     for action in actions:
-        if action != "passed":
+        if action == "hurry":
+            playback.hurry_to(stamp + 3)
+        elif action != "passed":
             playback.do(action)  # type: ignore[arg-type]
-        elif not playback.holds:
+        elif not playback.arrives(stamp) and not playback.holds:
             playback.passed()
-        assert not (playback.stepping and not playback.paused)
+            stamp += 1
+        assert not (playback.stepping and not playback.paused and not playback.hurrying)
         assert playback.holds == (playback.paused and not playback.stepping)
 
 
