@@ -33,9 +33,9 @@ class MapObject:
     """One object of the map, in an upright box. Times in nanoseconds.
 
     `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
-    of voxels that it had; `images` are the views that its box is fitted to, `form` which of
-    the ways in which its class stands, -1 while that is open; `held` whether it was last seen in a hand. `beside` counts by id in how many views another one was
-    seen too, in a place of its own in the image.
+    of voxels that it had; `images` are the views that its box is fitted to, `form` which of the ways in which its class
+    stands, -1 while that is open; `held` whether it was last seen in a hand. `beside` counts by id in how many views
+    another one was seen too, in a place of its own in the image.
     """
 
     id: int
