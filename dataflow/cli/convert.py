@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -19,6 +20,7 @@ from dataflow.cli.arguments import (
     Json,
     Overwrite,
     Start,
+    Without,
     chosen_streams,
     existing_recording,
     output_file,
@@ -30,10 +32,24 @@ if TYPE_CHECKING:
     from dataflow.interop.export.report import Exported
 
 Format = Literal[
-    "mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "kitti-raw", "lerobot", "csv", "parquet"
+    "mcap",
+    "ros2",
+    "foxglove",
+    "rrd",
+    "tum",
+    "7scenes",
+    "euroc",
+    "kitti",
+    "kitti-raw",
+    "lerobot",
+    "lerobot-v3",
+    "csv",
+    "parquet",
 ]
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 """Of formats that are one file; the others are folders."""
+_MCAP = ("mcap", "foxglove", "ros2")
+"""Formats that have places for attachments and metadata records."""
 
 
 def convert(
@@ -44,6 +60,7 @@ def convert(
         list[str] | None,
         typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
     ] = None,
+    without: Without = None,
     start: Start = None,
     end: End = None,
     clock: Clock = "auto",
@@ -59,8 +76,11 @@ def convert(
 
     Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
-    kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --stream chooses among
-    several. Into lerobot, every image of the first camera is a frame, with the newest message of every other stream.
+    kept as they are. Into mcap, ros2 and foxglove, attachments and metadata records of an MCAP file go along; other
+    formats have no place for them, which is said. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a
+    kind: --without leaves out others, --stream names all that are taken. Into lerobot (format 2.1) and lerobot-v3
+    (3.0), every image of the first camera is a frame, with the newest message of every other stream; images stay
+    images, lossless, since no video encoder is among the dependencies.
 
     Exit codes:
 
@@ -76,9 +96,10 @@ def convert(
       dataflow convert run.mcap folder --to tum
       dataflow convert run.mcap folder --to 7scenes
       dataflow convert run.mcap folder --to euroc
-      dataflow convert run.mcap folder --to kitti --stream camera/*
+      dataflow convert run.mcap folder --to kitti --stream "camera/*"
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
+      dataflow convert run.mcap folder --to lerobot-v3 --task "pick up cups"
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
@@ -86,14 +107,26 @@ def convert(
         existing_recording(recording)
         _check_output(output, to, overwrite)
         if to == "rrd":
-            from dataflow.cli.viewing import view
+            from dataflow.cli.drawing import draw_recording, drawn_as_json, report
+            from dataflow.view import Save
 
-            view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
+            with _complete(output) as place:
+                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock)
+            if json:
+                print_json(drawn_as_json(drawn[0], output))
+            else:
+                report(*drawn, output)
+                _tell_rrd(recording)
             return
-        with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            if to != "lerobot" and (action is not None or task):
-                raise fail("--action and --task are of --to lerobot")
-            done = _export(material, output, to, overwrite, watch, action, task)
+        if not to.startswith("lerobot") and (action is not None or task):
+            raise fail("--action and --task are of --to lerobot and lerobot-v3")
+        with (
+            _opened(recording, streams, without, start, end, clock) as material,
+            _progress(quiet or json) as watch,
+            _complete(output) as place,
+        ):
+            done = _export(material, place, to, watch, action, task)
+        done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
     if json:
         print_json(done.as_json())
         return
@@ -101,11 +134,28 @@ def convert(
     for name, number in done.written.items():
         made.add_row(Text(name), count(number))
     out.print(made)
-    for name, reason in done.left_out.items():
-        say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
+    if done.attachments or done.metadata:
+        out.print(f"carried over: {plural(done.attachments, 'attachment')}, {count(done.metadata)} metadata records")
+    _print_left_out(done)
     shown = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
     for file in shown:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
+
+
+def _tell_rrd(recording: Path) -> None:
+    from dataflow.interop.export.extras import tell_left_out
+    from dataflow.interop.export.material import Material
+    from dataflow.interop.export.report import Exported
+
+    done = Exported()
+    with Material(recording) as material:
+        tell_left_out(material, "rrd", done)
+    _print_left_out(done)
+
+
+def _print_left_out(done: Exported) -> None:
+    for name, reason in done.left_out.items():
+        say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
 
 
 def _check_output(output: Path, to: str, overwrite: bool) -> None:
@@ -119,8 +169,24 @@ def _check_output(output: Path, to: str, overwrite: bool) -> None:
 
 
 @contextmanager
+def _complete(output: Path) -> Iterator[Path]:
+    """Gives a place to write to, of the same name; what is written there appears as `output` when it is complete."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
+        place = Path(folder) / output.name
+        yield place
+        if place.exists():
+            place.replace(output)
+
+
+@contextmanager
 def _opened(
-    path: Path, words: list[str] | None, start: float | None, end: float | None, clock: Literal["auto", "header", "log"]
+    path: Path,
+    words: list[str] | None,
+    without: list[str] | None,
+    start: float | None,
+    end: float | None,
+    clock: Literal["auto", "header", "log"],
 ) -> Iterator[Material]:
     from dataflow.interop.export.material import Material
     from dataflow.recording.cutting import cut_of
@@ -136,7 +202,7 @@ def _opened(
             with Recording(path) as opened:
                 metadata = opened.metadata
                 namespace = metadata.get(RECORDING, {}).get("namespace", "")
-        chosen = chosen_streams(words, names, namespace) if words else None
+        chosen = chosen_streams(words, names, namespace, without) if words or without else None
         firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
         firsts += [t.first for t in whole.untouched if t.first is not None]
         part = None if whole.foreign else cut_of(metadata)
@@ -153,12 +219,12 @@ def _export(
     material: Material,
     output: Path,
     to: str,
-    overwrite: bool,
     watch: Callable[[int], None] | None,
     action: str | None,
     task: str,
 ) -> Exported:
     from dataflow.interop.export.datasets import DATASETS
+    from dataflow.interop.export.extras import tell_left_out
     from dataflow.interop.export.foxglove import export_foxglove
     from dataflow.interop.export.own import export_own
     from dataflow.interop.export.report import Exported
@@ -168,21 +234,25 @@ def _export(
     done = Exported(watch=watch)
     match to:
         case "mcap":
-            export_own(material, output, done, overwrite=overwrite)
+            export_own(material, output, done)
         case "foxglove":
             export_foxglove(material, output, done)
         case "ros2":
             export_ros2(material, output, done)
-        case "lerobot":
+        case "lerobot" | "lerobot-v3":
             from dataflow.interop.export.lerobot import export_lerobot
+            from dataflow.interop.export.lerobot_layouts import Layout21, Layout30
 
-            export_lerobot(material, output, done, action=action, task=task)
+            layout = Layout21() if to == "lerobot" else Layout30()
+            export_lerobot(material, output, done, layout=layout, action=action, task=task)
         case "csv":
             export_csv(material, output, done)
         case "parquet":
             export_parquet(material, output, done)
         case _:
             DATASETS[to](material, output, done)
+    if to not in _MCAP:
+        tell_left_out(material, to, done)
     return done
 
 

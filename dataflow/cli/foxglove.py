@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import time
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,14 +17,12 @@ from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
 
 if TYPE_CHECKING:
-    from dataflow.client.playback import ReplayControls
+    from dataflow.client.playback import Steering
+    from dataflow.client.replay_bar import ReplayBar
     from dataflow.foxglove.server import FoxgloveServer
     from dataflow.recording import Recorded
-    from dataflow.transport.registry import RunningGraph
 
 PORT = 8765
-TAKE_WITHIN, LOOK_EVERY = 0.1, 0.5
-"""Seconds until a client's request is seen at the latest, and between two looks at how a replay stands."""
 
 
 def foxglove(
@@ -51,15 +50,17 @@ def foxglove(
     """Serve a running graph or a recording to Foxglove.
 
     In Foxglove: Open connection, Foxglove WebSocket, and the address that is printed. Its playback bar plays the
-    recording: pause, speed, any place. Of a replay through a graph it moves the replay itself: pause, speed, and
-    forward to a place; operators cannot be taken back. Images, clouds, boxes, masks, tracks, trajectories, maps and the
-    scene graph are sent as Foxglove's own schemas; a client can never slow the graph.
+    recording: pause, speed, any place. Where the running graph is a replay (`dataflow replay`), the bar pauses it and
+    changes its speed; a jump is refused with the option that begins there, since operators hold what came before.
+    Images, clouds, boxes, masks, tracks, trajectories, maps and the scene graph are
+    sent as Foxglove's own schemas; a client can never slow the graph.
 
     Examples:
 
       dataflow foxglove
       dataflow foxglove run.mcap --start 5 --speed 0.5
       dataflow foxglove --stream "camera/*" --port 9000
+      dataflow foxglove --wait 10
     """
     from dataflow.foxglove.server import FoxgloveError
 
@@ -122,38 +123,40 @@ def _play(
 
 def _follow(host: str, port: int, words: list[str] | None, name: str | None, wait: float) -> None:
     from dataflow.client.attach import graph_of, still_runs, tap
+    from dataflow.client.playback import steering
     from dataflow.foxglove.server import FoxgloveServer
 
     found = running_graph(name, wait)
     running = graph_of(found)
     chosen = chosen_streams(words, running.streams, running.namespace)
-    with contextlib.ExitStack() as held:
-        controls = _controls(found, held)
-        span = None if controls is None else (controls.first, controls.last)
-        server = FoxgloveServer(
-            running.name, namespace=running.namespace, host=host, port=port, controls=controls, span=span
+    with ExitStack() as stack:
+        bar = _bar(stack.enter_context(steering(found)))
+        server = stack.enter_context(
+            FoxgloveServer(
+                running.name,
+                namespace=running.namespace,
+                host=host,
+                port=port,
+                controls=bar,
+                span=None if bar is None else bar.span,
+            )
         )
-        held.enter_context(server)
         _say_where(server)
         say(f"following {escape(running.name)} (process {found.pid})")
-        clock, looked = 0, time.monotonic()
+        if bar is not None:
+            say("a replay: the playback bar of Foxglove pauses it and changes its speed")
+            stack.enter_context(_told(server, bar))
+        clock = 0
         try:
             with tap(found, [f"/{stream}" for stream in chosen] if words else ["**"]) as client:
-                while (taken := client.take(timeout=TAKE_WITHIN)) is not None or still_runs(found):
+                while (taken := client.take(timeout=0.5)) is not None or still_runs(found):
                     message = None if taken is None else taken.decode().message
-                    if taken is not None and message is not None:
-                        server.show(taken.stream, message)
-                        if message.stamp > clock:
-                            clock = message.stamp
-                            server.time(clock)
-                    if controls is not None:
-                        controls.carry_out()
-                        if time.monotonic() - looked >= LOOK_EVERY:
-                            looked = time.monotonic()
-                            if controls.look(clock) or controls.state()[0]:
-                                server.playback(controls)
-            if controls is not None:
-                server.playback(controls, ended=True)
+                    if taken is None or message is None:
+                        continue
+                    server.show(taken.stream, message)
+                    if message.stamp > clock:
+                        clock = message.stamp
+                        server.time(clock)
         except KeyboardInterrupt:
             say("ended")
         else:
@@ -161,16 +164,35 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
     out.print(f"shown: {plural(server.shown, 'message')}")
 
 
-def _controls(found: RunningGraph, held: contextlib.ExitStack) -> ReplayControls | None:
-    """Returns what moves the graph's sources, where they come from a recording."""
+def _bar(steering: Steering) -> ReplayBar | None:
+    """What a playback bar moves, where a recording is played through the graph; None elsewhere."""
     from dataflow.client.attach import NotRunning
-    from dataflow.client.playback import ReplayControls, steering
+    from dataflow.client.replay_bar import ReplayBar
 
-    steered = held.enter_context(steering(found))
     try:
-        return ReplayControls(steered)
-    except NotRunning:
+        standing = steering.ask(None)
+    except NotRunning:  # a live run has nothing to move
         return None
+    return None if standing["replay"] is None else ReplayBar(steering, standing)
+
+
+@contextmanager
+def _told(server: FoxgloveServer, bar: ReplayBar) -> Iterator[None]:
+    """Tells the clients meanwhile where the replay stands, about twice a second."""
+    over = threading.Event()
+
+    def tell() -> None:
+        while not over.wait(0.5):
+            bar.refresh()
+            server.playback(bar, ended=bar.ended)
+
+    teller = threading.Thread(target=tell, name="playback", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        over.set()
+        teller.join(5.0)
 
 
 def _say_where(server: FoxgloveServer) -> None:

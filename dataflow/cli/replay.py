@@ -11,7 +11,6 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.arguments import (
-    FLAG,
     AnyRecording,
     Clock,
     End,
@@ -20,7 +19,6 @@ from dataflow.cli.arguments import (
     Network,
     Settings,
     Start,
-    existing,
     existing_recording,
     find_modules_in,
     graph_file,
@@ -43,6 +41,7 @@ from dataflow.cli.run_options import (
     Rate,
     Record,
     Replace,
+    Step,
     Timeout,
     View,
 )
@@ -65,9 +64,7 @@ def replay(
     start: Start = None,
     end: End = None,
     rate: Rate = None,
-    step: Annotated[
-        bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
-    ] = False,
+    step: Step = False,
     loop: Annotated[
         int, typer.Option("--loop", metavar="N", help="Replay N times, and compare the passes; 0: until Ctrl-C.")
     ] = 1,
@@ -105,7 +102,8 @@ def replay(
     with the time of their recording; which, and why, is printed.
 
     In a terminal, space pauses it and lets it go on, the right arrow or n makes one step (all messages of one
-    timestamp), q ends it; `dataflow playback` does the same from elsewhere. Results do not depend on that.
+    timestamp), + and - double and halve its speed, q ends it; `dataflow playback` does the same from elsewhere. Results
+    do not depend on that.
 
     With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
     nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded
@@ -161,7 +159,7 @@ def replay(
                 raise fail(f"{recording} does not hold the graph that made it: name one with --graph")
             if complete is not None:
                 raise fail("--complete needs the firing records of a run, which bags do not hold")
-            loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+            loaded = load_graph(graph_file(graph), settings=settings or ())
             outputs = checked_outputs(record, view, open_view, overwrite)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
             options |= {"early": early, "paused": step, "controls": keys(quiet or json)}

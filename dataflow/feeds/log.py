@@ -63,7 +63,7 @@ class LogFeed:
     ) -> None:
         """`numbered` gives the messages their numbers; they keep those that were recorded unless it says otherwise."""
         self.recording, self.emitter = recording, emitter
-        self._ports = ports
+        self._ports, self._start = ports, start
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
         self._streams = {
@@ -76,21 +76,19 @@ class LogFeed:
         self._messages = iter(numbered(recording.messages(streams=list(streams), start=start, end=end)))
         self._step: list[Recorded] = []
         self._following: Recorded | None = None
-        self.span = self._span(start, end)
-        """The first and the last stamp that are played; None where there are none."""
         self.last = NEVER
         self.firings = self.emitted = 0
         self.ended = False
         self.work = Work()
         self.static_digests: dict[str, StreamDigest] = {}
 
-    def _span(self, start: int | None, end: int | None) -> tuple[int, int] | None:
-        infos = [self.recording.streams[name] for name in self._streams]
-        ends = [(info.first, info.last) for info in infos if info.first is not None and info.last is not None]
-        if not ends:
+    def span(self) -> tuple[int, int] | None:
+        """The stamps between which it plays; None where it holds none."""
+        firsts = [s.first for name in self._streams if (s := self.recording.streams[name]).first is not None]
+        if not firsts:
             return None
-        first, last = min(first for first, _ in ends), max(last for _, last in ends)
-        return first if start is None else max(first, start), last if end is None else min(last, end)
+        begin = max(min(firsts), min(firsts) if self._start is None else self._start)
+        return begin, max(begin, *(stream.final for stream in self._streams.values()))
 
     def _final(self, name: str, finals: Mapping[str, int], end: int | None) -> int:
         last = self.recording.streams[name].last

@@ -28,11 +28,8 @@ class Clock:
         self._jumps = 0
         self._closed = False
 
-    def request(self, *, playing: bool, speed: float, seek: int | None) -> bool:
-        """Goes on, stops, changes the speed (which must be above 0; else it stays), goes to the stamp `seek`.
-
-        Tells whether it has gone there.
-        """
+    def request(self, *, playing: bool, speed: float, seek: int | None) -> None:
+        """Goes on, stops, changes the speed (which must be above 0; else it stays), goes to the stamp `seek`."""
         with self._changed:
             self._stamp, self._since = self._place(), self._now()
             self._playing = playing
@@ -43,7 +40,6 @@ class Clock:
                 self._standing = True
                 self._jumps += 1
             self._changed.notify_all()
-        return seek is not None
 
     def state(self) -> tuple[bool, int, float]:
         """Tells whether it plays, the stamp it is at, and its speed."""

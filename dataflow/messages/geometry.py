@@ -36,6 +36,9 @@ def matrix_to_quaternion(matrix: npt.ArrayLike) -> F64:
     ill-conditioned.
     """
     m = np.asarray(matrix, np.float64)[..., :3, :3]
+    if m.ndim == 2:
+        quaternion = normalize(_four_components(*m.ravel().tolist()))
+        return -quaternion if quaternion[3] < 0 else quaternion
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
     squares = np.stack([1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz], axis=-1)
     symmetric_xy, symmetric_xz, symmetric_yz = (m[..., i, j] + m[..., j, i] for i, j in ((0, 1), (0, 2), (1, 2)))
@@ -52,6 +55,21 @@ def matrix_to_quaternion(matrix: npt.ArrayLike) -> F64:
     best = squares.argmax(axis=-1)[..., None, None]
     quaternion = normalize(np.take_along_axis(candidates, best, axis=-2)[..., 0, :])
     return np.where(quaternion[..., 3:] < 0, -quaternion, quaternion)
+
+
+def _four_components(
+    xx: float, xy: float, xz: float, yx: float, yy: float, yz: float, zx: float, zy: float, zz: float
+) -> tuple[float, float, float, float]:
+    """Returns the quaternion of one rotation, times four of its largest component: numbers are faster than arrays."""
+    squares = [1 + xx - yy - zz, 1 - xx + yy - zz, 1 - xx - yy + zz, 1 + xx + yy + zz]
+    best = squares.index(max(squares))
+    if best == 0:
+        return squares[0], xy + yx, xz + zx, zy - yz
+    if best == 1:
+        return xy + yx, squares[1], yz + zy, xz - zx
+    if best == 2:
+        return xz + zx, yz + zy, squares[2], yx - xy
+    return zy - yz, xz - zx, yx - xy, squares[3]
 
 
 def normalize(quaternion: npt.ArrayLike) -> F64:

@@ -6,6 +6,7 @@ from dataflow.feeds.log import LogFeed
 from dataflow.feeds.playback import Action, Playback
 from dataflow.feeds.window import Feed, Window
 from dataflow.process.pace import Pace
+from dataflow.sync import NEVER
 
 PROMISE_EVERY = 8
 """Steps after which a frontier is sent on streams that had no message."""
@@ -14,9 +15,9 @@ PROMISE_EVERY = 8
 class Feeding:
     """Of several feeds, the oldest step first, as far as the window and the pace allow."""
 
-    def __init__(self, window: Window, pace: Pace) -> None:
+    def __init__(self, window: Window, pace: Pace, *, paused: bool = False, speed: float | None = None) -> None:
         self.feeds: list[Feed] = []
-        self.playback = Playback()
+        self.playback = Playback(paused=paused, speed=speed)
         self._window, self._pace = window, pace
         self._since_promise = 0
 
@@ -41,8 +42,6 @@ class Feeding:
     def admit(self) -> bool:
         """Emits the next step; False when there is none, or it has to wait."""
         due = self._oldest()
-        if due is not None and self.playback.arrives(due[0]):
-            self._pace.put(due[0])
         if due is None or self._window.full or self.playback.holds:
             return False
         if self._pace.due_in(due[0]) > 0 and not self.playback.stepping:
@@ -57,35 +56,24 @@ class Feeding:
             feed.finish("end of source")
         return True
 
-    def play(self, action: Action, steps: int = 1) -> None:
-        """Pauses, resumes or steps; the clock goes on from where it stopped. Raises `ValueError`."""
-        was_paused = self.playback.paused
-        self.playback.do(action, steps)
-        if was_paused and not self.playback.paused and (due := self._oldest()) is not None:
-            self._pace.put(due[0])
+    def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
+        """Pauses, resumes, steps, changes the speed; the clock goes on from where it stopped. Raises `ValueError`."""
+        was_paused, was_speed = self.playback.paused, self.playback.speed
+        self.playback.do(action, steps, speed)
+        resumed = was_paused and not self.playback.paused
+        if not resumed and self.playback.speed == was_speed:
+            return
+        if (due := self._oldest()) is not None:
+            if self.playback.speed != was_speed:
+                self._pace.change(self.playback.speed, due[0])
+            if resumed:
+                self._pace.put(due[0])
 
     @property
-    def rate(self) -> float | None:
-        """The factor of real time at which steps are given; None: as fast as they are taken."""
-        return self._pace.rate
-
-    def set_rate(self, rate: float | None) -> None:
-        """Goes on at another rate."""
-        due = self._oldest()
-        self._pace.change(rate, None if due is None else due[0])
-
-    def go_to(self, stamp: int) -> None:
-        """Gives what comes up to a stamp as fast as it is taken. Raises `ValueError` where that was given already."""
-        due = self._oldest()
-        if due is not None and stamp < due[0]:
-            raise ValueError(f"{stamp} lies before {due[0]}, which comes next: this goes only forward; start it again")
-        self.playback.hurry_to(stamp)
-
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """The first and the last stamp of the recordings among the feeds; None where there are none."""
-        spans = [span for log in self.logs if (span := log.span) is not None]
-        return (min(first for first, _ in spans), max(last for _, last in spans)) if spans else None
+    def last(self) -> int | None:
+        """The stamp that was given last; None before the first."""
+        last = max((feed.last for feed in self.feeds), default=NEVER)
+        return None if last == NEVER else last
 
     def promise(self) -> None:
         """Sends the frontiers of streams which had no message of late."""
@@ -96,7 +84,7 @@ class Feeding:
 
     def next_due(self) -> float | None:
         """Seconds until the next paced step; None when nothing waits for the clock."""
-        if not self._pace.held or self._window.full or self.playback.paused or self.playback.hurrying:
+        if not self._pace.held or self._window.full or self.playback.paused:
             return None
         stamps = [s for feed in self.feeds if not feed.ended and (s := feed.look_ahead()) is not None]
         return self._pace.due_in(min(stamps)) if stamps else None

@@ -18,16 +18,6 @@ class Pace:
             self._began = (first, at)
 
     @property
-    def rate(self) -> float | None:
-        """The factor of real time; None: nothing waits for the clock."""
-        return self._rate
-
-    def change(self, rate: float | None, stamp: int | None) -> None:
-        """Goes on at another rate from event time `stamp`, which is now."""
-        self._rate = rate
-        self._began = None if rate is None or stamp is None else (stamp, time.time())
-
-    @property
     def held(self) -> bool:
         """Tells whether steps wait for the clock."""
         return self._began is not None
@@ -43,6 +33,13 @@ class Pace:
         """Event time `stamp` is now: what was paused goes on from there."""
         if self._began is not None:
             self._began = (stamp, time.time())
+
+    def change(self, rate: float | None, due: int) -> None:
+        """Goes on at another rate, from the event time of now, at the latest that of the next step, `due` (ns); from
+        there where nothing waited for the clock so far."""
+        place = due if self._began is None else min(self.event_time(), due)
+        self._rate, self._began = rate, None
+        self.begin(place, time.time())
 
     def event_time(self) -> int:
         """Event time now: the clock's own, or, where sources are held to the clock, as far as they have been let."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgpack
 
+from dataflow.feeds.playback import Action
 from dataflow.firing.source import SourceRunner
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
@@ -20,14 +21,12 @@ from dataflow.process.progress import Progress
 from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
 from dataflow.remote import Remote
-from dataflow.sync import NEVER
 from dataflow.transport import Bus
 from dataflow.transport.codec import decode
 from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import runtime_key
 
-SLOWEST, FASTEST = 0.01, 100.0
-"""Rates at which a replay may be made to go on, as factors of real time."""
+LIVE = "it is a live run: devices and the clock wait for nobody; what runs without --live, and replays, can be paused"
 
 
 class Requests:
@@ -58,8 +57,16 @@ class Requests:
                 bus.serve(runtime_key(namespace, "pub", name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
         bus.serve(runtime_key(namespace, "trigger", self._config.label), self._answer_trigger)
-        if self._feeding.feeds:
+        if self._feeding.feeds or self._runners.sources:
             bus.serve(runtime_key(namespace, "playback"), _to_inbox(inbox, "", "playback"))
+
+    def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
+        """Pauses, resumes, steps, or changes the speed, and tells the supervisor. Raises `ValueError`."""
+        if not self._feeding.feeds:
+            return
+        self._feeding.play(action, steps, speed)
+        playback = self._feeding.playback
+        self._channel.send("playback", paused=playback.paused, speed=playback.speed)
 
     def answer_parameter(self, name: str, query: Any) -> None:
         """Answers a request to change a parameter with the value as validated, or with an error.
@@ -76,23 +83,30 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def answer_playback(self, query: Any) -> None:
-        """Answers a request to pause, resume, step, go at another rate or to a stamp; `{}` asks how it stands."""
+        """Answers a request to pause, resume, step, or change the speed of what this process reads; one without an
+        action asks how it stands."""
         with query:
             feeding = self._feeding
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
-                _steer(feeding, asked)
-                answer: dict[str, Any] = {
-                    "ok": True,
-                    "paused": feeding.playback.paused,
-                    "ended": feeding.ended,
-                    "rate": feeding.rate,
-                    "span": feeding.span,
-                }
+                if self._config.live:
+                    raise ValueError(LIVE)
+                if "action" in asked:
+                    speed = asked.get("speed")
+                    self.play(asked["action"], int(asked.get("steps", 1)), None if speed is None else float(speed))
+                playback = feeding.playback
+                answer: dict[str, Any] = {"ok": True, "paused": playback.paused, "ended": feeding.ended}
+                answer |= {"speed": playback.speed, "stamp": feeding.last, "replay": self._replayed()}
             except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
                 answer = {"ok": False, "error": str(error)}
-            stamps = [log.last for log in feeding.logs if log.last != NEVER]
-            query.reply(query.key_expr, msgpack.packb(answer | {"stamp": max(stamps, default=None)}))
+            query.reply(query.key_expr, msgpack.packb(answer))
+
+    def _replayed(self) -> dict[str, Any] | None:
+        """Tells from when to when a recording is played, and the stamp that `--start` counts from."""
+        spans = [span for log in self._feeding.logs if (span := log.span()) is not None]
+        if self._config.replay is None or not spans:
+            return None
+        return {"span": list(spans[0]), "first": self._config.replay["first"]}
 
     def answer_publication(self, maker: SourceRunner, query: Any) -> None:
         """Takes an envelope from outside for a source that is made for it; on Zenoh's thread.
@@ -171,22 +185,6 @@ class Requests:
         """Tells how often an operator was restarted, by this process and in the processes before it."""
         here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
         return self._config.resumed(maker.node.name).restarts + here
-
-
-def _steer(feeding: Feeding, asked: dict[str, Any]) -> None:
-    """Does what was asked. Raises `KeyError`, `TypeError`, `ValueError`."""
-    match asked.get("action"):
-        case None:
-            pass
-        case "rate":
-            rate = None if asked["rate"] is None else float(asked["rate"])
-            if rate is not None and not SLOWEST <= rate <= FASTEST:
-                raise ValueError(f"a rate of {rate:g}: expected {SLOWEST:g} to {FASTEST:g}, or none")
-            feeding.set_rate(rate)
-        case "to":
-            feeding.go_to(int(asked["stamp"]))
-        case action:
-            feeding.play(action, int(asked.get("steps", 1)))
 
 
 def _asks_for_firings(query: Any) -> bool:

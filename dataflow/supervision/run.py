@@ -37,10 +37,8 @@ def run(
     controls: Controls | None = None,
     **options: Any,
 ) -> RunReport:
-    """Runs a graph's own sources. `controls` may pause and step those that are not live.
-
-    Further options are the fields of `RunPlan`. Raises `RunFailed`.
-    """
+    """Runs a graph's own sources. `controls` may pause and step them, unless the run is live. Further options are the
+    fields of `RunPlan`. Raises `RunFailed`."""
     return execute(RunPlan(graph, **options), mode="run", watch=watch, early=early, controls=controls)
 
 

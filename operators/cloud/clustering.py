@@ -107,18 +107,25 @@ def shape_of(points: Array, up: Array) -> Shape:
 def upright_box(points: Array, up: Array) -> tuple[Array, Array]:
     """Returns the axes and place T (4, 4), z along up, and the size (3,) of the upright box of least area."""
     helper = np.eye(3)[int(np.argmin(np.abs(up)))]
-    x = np.cross(helper, up)
+    x = _cross(helper, up)
     x /= np.linalg.norm(x)
-    level = np.stack([x, np.cross(up, x)])
+    level = np.stack([x, _cross(up, x)])
     origin = points[0]
     flat = ((points - origin) @ level.T).astype(np.float32)
     (u, v), (width, depth), angle = cv2.minAreaRect(flat)
     heights = (points - origin) @ up
     c, s = np.cos(np.radians(angle)), np.sin(np.radians(angle))
+    low, high = heights.min(), heights.max()
     T = np.eye(4)
-    T[:3, :3] = np.stack([*(np.array([[c, s], [-s, c]]) @ level), up], axis=1)
-    T[:3, 3] = origin + np.array([u, v]) @ level + (heights.min() + heights.max()) / 2 * up
-    return T, np.array([width, depth, heights.max() - heights.min()])
+    T[:3, :2], T[:3, 2] = (np.array([[c, s], [-s, c]]) @ level).T, up
+    T[:3, 3] = origin + np.array([u, v]) @ level + (low + high) / 2 * up
+    return T, np.array([width, depth, high - low])
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Returns the cross product (3,) of two vectors, in a tenth of the time that `np.cross` takes for a single one."""
+    (a0, a1, a2), (b0, b1, b2) = a.tolist(), b.tolist()
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
 
 
 def _volume(points: Array) -> float:

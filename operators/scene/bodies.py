@@ -34,6 +34,11 @@ class Body:
         return float(self.center[2] + self.size[2] / 2)
 
     @cached_property
+    def volume(self) -> float:
+        width, depth, height = self.size.tolist()
+        return float(width * depth * height)
+
+    @cached_property
     def outline(self) -> NDArray[np.float32]:
         """The corners (4, 2) as OpenCV takes them."""
         return self._corners.astype(np.float32)

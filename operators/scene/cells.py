@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
@@ -56,15 +57,21 @@ class Cells:
 
     def add(self, other: Cells) -> None:
         """Takes in the voxels of another view, or of another object that is the same."""
-        keys, of = np.unique(np.concatenate([self._keys, other._keys]), return_inverse=True)
-        hits = np.concatenate([self.hits, other.hits])
-        weighted = np.concatenate([self.points, other.points]) * hits[:, None]
-        self.hits = np.asarray(np.bincount(of, hits, len(keys)))
-        sums = np.stack([np.bincount(of, column, len(keys)) for column in weighted.T], axis=1)
-        self.points = np.asarray(sums / np.maximum(self.hits, 1e-9)[:, None], np.float64)
-        # a voxel that is seen again was not free after all
-        self.free = np.asarray(np.bincount(of, np.concatenate([self.free, -other.hits]), len(keys)).clip(min=0))
-        self.other = np.asarray(np.bincount(of, np.concatenate([self.other, other.other]), len(keys)))
+        place = np.searchsorted(self._keys, other._keys)
+        known = np.zeros(len(place), np.bool_)
+        if len(self):
+            known = self._keys[np.minimum(place, len(self) - 1)] == other._keys
+        keys = np.insert(self._keys, place[~known], other._keys[~known]) if not known.all() else self._keys
+        own, new = np.searchsorted(keys, self._keys), np.searchsorted(keys, other._keys)
+        values = np.zeros((6, len(keys)))  # weighted coordinates, hits, free, other
+        values[:3, own], values[3, own] = (self.points * self.hits[:, None]).T, self.hits
+        values[4, own], values[5, own] = self.free, self.other
+        values[:3, new] += (other.points * other.hits[:, None]).T
+        values[3, new] += other.hits
+        values[4, new] -= other.hits  # a voxel that is seen again was not free after all
+        values[5, new] += other.other
+        self.hits, self.free, self.other = values[3], values[4].clip(min=0), values[5]
+        self.points = np.ascontiguousarray((values[:3] / np.maximum(self.hits, 1e-9)).T)
         self._keys, self._tree, self._bounds, self._middle = keys, None, None, None
 
     def carve(self, free: NDArray[np.bool_]) -> None:
@@ -102,7 +109,8 @@ class Cells:
     def bounds(self) -> tuple[Array, Array]:
         """Least and greatest coordinates (3,) of the voxels."""
         if self._bounds is None:
-            self._bounds = self.points.min(axis=0), self.points.max(axis=0)
+            columns = np.ascontiguousarray(self.points.T)  # along which extremes are found many times as fast
+            self._bounds = columns.min(axis=1), columns.max(axis=1)
         return self._bounds
 
     @property
@@ -124,12 +132,15 @@ class Cells:
         apart, _ = self.tree().query(points[:: -(-len(points) // 100)], distance_upper_bound=distance)
         return float(np.isfinite(apart).mean())
 
-    def touches(self, other: Cells, distance: float) -> bool:
-        """Tells whether the axis-parallel bounds of two sets come so near."""
+    def apart(self, other: Cells) -> float:
+        """Returns how far the axis-parallel bounds of two sets are apart along the axis along which they are most.
+
+        Negative where they overlap; infinite where one is empty.
+        """
         if not len(self) or not len(other):
-            return False
-        low = np.maximum(self.bounds[0], other.bounds[0])
-        return bool((low - np.minimum(self.bounds[1], other.bounds[1]) <= distance).all())
+            return math.inf
+        (a, b), (c, d) = self.bounds, other.bounds
+        return float((np.maximum(a, c) - np.minimum(b, d)).max())
 
     def snapshot(self) -> dict[str, Any]:
         return {"keys": self._keys, "points": self.points, "hits": self.hits, "free": self.free, "other": self.other}

@@ -199,8 +199,8 @@ def _images(rows: Array, P: Array, outline: Array) -> Array:
     corners += rows[:, None, :3]
     seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), len(outline), -1, 3)
     depth = np.maximum(seen[..., 2], 1e-6)
-    u, v = seen[..., 0] / depth, seen[..., 1] / depth
-    image = np.stack([u.min(axis=1), v.min(axis=1), u.max(axis=1), v.max(axis=1)], axis=-1)
+    uv = seen[..., :2] / depth[..., None]
+    image = np.concatenate([uv.min(axis=1), uv.max(axis=1)], axis=-1)
     image[depth.min(axis=1) < _NEAREST] = np.nan
     return np.asarray(image)
 
@@ -216,13 +216,23 @@ def _surface(rows: Array, points: Array, eyes: Array, noise: float, inset: float
     x, y = places[None, :, 0] - rows[:, :1], places[None, :, 1] - rows[:, 1:2]
     local = np.stack([c * x + s * y, c * y - s * x, places[None, :, 2] - rows[:, 2:3]], axis=1)
     cut = count // 40
-    ranked = np.partition(local[..., :count], (cut, count - 1 - cut), axis=2)
-    residual = np.concatenate([ranked[..., cut] + half, half - ranked[..., count - 1 - cut]], axis=1)
+    low, high = _extents(local[..., :count], cut)
+    residual = np.concatenate([low + half, half - high], axis=1)
     eye = local[..., count:]
-    way = np.abs(eye).mean(axis=2)
+    way = np.abs(eye).sum(axis=2) / len(eyes)
     distance = np.sqrt((way * way).sum(axis=1, keepdims=True))
     stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
     residual = residual + np.concatenate([stray, stray], axis=1) - inset * np.concatenate([half, half], axis=1)
-    shown = np.concatenate([(eye < -half[..., None]).mean(axis=2), (eye > half[..., None]).mean(axis=2)], axis=1) > 0.3
+    beyond = [np.count_nonzero(eye < -half[..., None], axis=2), np.count_nonzero(eye > half[..., None], axis=2)]
+    shown = np.concatenate(beyond, axis=1) / len(eyes) > 0.3
     # positive: the side is beyond the points
     return np.asarray(np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE)
+
+
+def _extents(values: Array, cut: int) -> tuple[Array, Array]:
+    """Returns the least and the greatest (K, 3) of values (K, 3, N) without the outermost `cut` on each side."""
+    if not cut:
+        return values.min(axis=2), values.max(axis=2)
+    last = values.shape[2] - 1 - cut
+    ranked = np.partition(values, (cut, last), axis=2)
+    return ranked[..., cut], ranked[..., last]

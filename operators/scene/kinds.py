@@ -41,10 +41,10 @@ class Kinds:
 
     def is_still(self, object: MapObject) -> bool:
         """Tells whether an object is small and lies still, so that it may be of a class that moves or not."""
-        size = float(object.size.max())
-        if object.class_id in self.movers:
-            size = max([size, *(max(u.size) for u in self.usual.get(object.class_id, ()))])
-        return size <= _SMALL and float(np.abs(object.velocity).max()) <= _STILL
+        size, class_id = object.longest, object.class_id
+        if class_id in self.movers:
+            size = max([size, *(max(u.size) for u in self.usual.get(class_id, ()))])
+        return size <= _SMALL and max(map(abs, object.velocity.tolist())) <= _STILL
 
     def is_large(self, object: MapObject) -> bool:
         """Tells whether things of an object's class are seldom seen whole."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +58,11 @@ class Seen:
     up: Array
     classes: NDArray[np.int32] | None = None
     grain: float = 0.0
+
+    @cached_property
+    def places(self) -> Array:
+        """Pixels and points by coordinate (5, N), so that extents are found along rows."""
+        return np.ascontiguousarray(np.concatenate([self.pixels, self.points], axis=1).T)
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,8 +262,9 @@ def _object(
 
 def _central(seen: Seen, rows: Indices, box: tuple[float, float, float, float]) -> int:
     """Counts the points in the inner half of a box: of a thing; what shows around it has few."""
-    middle, quarter = np.array([box[0] + box[2], box[1] + box[3]]) / 2, np.array([box[2] - box[0], box[3] - box[1]]) / 4
-    return int((np.abs(seen.pixels[rows] - middle) <= quarter).all(axis=1).sum())
+    u, v = seen.places[:2].take(rows, axis=1)
+    wide = np.abs(u - (box[0] + box[2]) / 2) <= (box[2] - box[0]) / 4
+    return int(np.count_nonzero(wide & (np.abs(v - (box[1] + box[3]) / 2) <= (box[3] - box[1]) / 4)))
 
 
 def _linked(places: Array, reach: float) -> NDArray[np.intp]:
@@ -270,26 +277,38 @@ def _linked(places: Array, reach: float) -> NDArray[np.intp]:
     square = np.einsum("ij,ij->i", places, places)
     linked = square[:, None] + square[None, :] - 2 * (places @ places.T) <= reach * reach
     np.fill_diagonal(linked, True)
-    group = np.argmax(linked, axis=1)
-    while True:  # each takes the least number in its reach, then that one's, until nothing changes
-        least = np.where(linked, group, count).min(axis=1)
-        least = least[least]
-        if np.array_equal(least, group):
-            return np.asarray(group, np.intp)
-        group = least
+    return _groups([int.from_bytes(row.tobytes(), "little") for row in np.packbits(linked, axis=1, bitorder="little")])
+
+
+def _groups(linked: Sequence[int]) -> NDArray[np.intp]:
+    """Returns the group of each place (N,), its first place's number; bit j of `linked[i]` says whether i reaches j."""
+    group = np.empty(len(linked), np.intp)
+    left = (1 << len(linked)) - 1
+    while left:
+        first = (left & -left).bit_length() - 1
+        reached = waiting = 1 << first
+        members = []
+        while waiting:
+            place = waiting.bit_length() - 1
+            members.append(place)
+            new = linked[place] & ~reached
+            reached |= new
+            waiting = (waiting ^ (1 << place)) | new
+        group[members] = first
+        left &= ~reached
+    return group
 
 
 def _part(seen: Seen, rows: Indices) -> _Part:
-    points, uv = seen.points[rows], seen.pixels[rows]
+    places = seen.places.take(rows, axis=1)
+    low, high = places.min(axis=1), places.max(axis=1)
+    (left, upper), (right, lower) = low[:2].tolist(), high[:2].tolist()
     cut = len(rows) // 100  # one in a hundred may stray
     if cut:
-        uv = np.partition(uv, (cut, len(rows) - 1 - cut), axis=0)
-        low, high = uv[cut], uv[len(rows) - 1 - cut]
-    else:
-        low, high = uv.min(axis=0), uv.max(axis=0)
+        uv = np.partition(places[:2], (cut, len(rows) - 1 - cut), axis=1)
+        (left, upper), (right, lower) = uv[:, cut].tolist(), uv[:, len(rows) - 1 - cut].tolist()
     g = seen.grain
-    image = float(low[0]) - g, float(low[1]) - g, float(high[0]) + g, float(high[1]) + g
-    return _Part(rows, image, np.stack([points.min(axis=0), points.max(axis=0)]))
+    return _Part(rows, (left - g, upper - g, right + g, lower + g), np.stack([low[2:], high[2:]]))
 
 
 def _overlap(first: tuple[float, float, float, float], second: tuple[float, float, float, float]) -> float:

@@ -67,6 +67,11 @@ class MapObject:
         return 1 / (1 + math.exp(-self.evidence))
 
     @property
+    def longest(self) -> float:
+        """Length of the longest side of the box."""
+        return float(max(self.size.tolist()))
+
+    @property
     def box(self) -> tuple[Array, Array, float]:
         return self.center, self.size, self.yaw
 

@@ -106,7 +106,19 @@ def alike(
     return value + 0.3 * share if share >= s.overlap else 0.0
 
 
-def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> list[list[InImage]] | None:
+@dataclass(frozen=True, eq=False)
+class InImages:
+    """The same of each observation (N) and object (M): `iou` and `within` (N, M)."""
+
+    iou: Array
+    within: Array
+
+    def of(self, observation: int, object: int) -> InImage:
+        """Compares one of each."""
+        return InImage(float(self.iou[observation, object]), float(self.within[observation, object]))
+
+
+def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> InImages | None:
     """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without images."""
     if any(each.image is None for each in seen):
         return None
@@ -122,9 +134,7 @@ def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_
     high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])
     areas = np.maximum(boxes[:, 2:] - boxes[:, :2], 1e-6).prod(axis=1)
     within = np.nan_to_num(np.maximum(high - low, 0).prod(axis=2) / areas[:, None])
-    return [
-        [InImage(*pair) for pair in zip(*row, strict=True)] for row in zip(iou.tolist(), within.tolist(), strict=True)
-    ]
+    return InImages(iou, within)
 
 
 def in_places_of_their_own(images: Sequence[ImageView]) -> NDArray[np.bool_]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from operators.scene.box_overlap import shared_volume, upright_iou
+from operators.scene.box_overlap import shared_volume
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.matching import closeness, tolerance
@@ -13,23 +13,28 @@ _COVERED = 0.25  # share of the smaller of two boxes that both have, from which 
 _APART_COVERED = 0.5  # that share where both are seen beside each other
 _PART = 0.4  # that share where the classes differ
 _LIKE = 6.0  # times smaller, and what is in the other is no part of it
+_NEAR, _NEAR_MOVERS = 0.1, 0.3  # metres that the bounds of two entries of one thing are apart at most
 _SELDOM = 0.15  # share of the views in which both are seen beside each other, from which they are two
 
 
 def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
     """Tells whether two entries are of one thing: they share their place, and are seldom seen beside each other."""
+    apart = a.cells.apart(b.cells)
+    if apart > _NEAR_MOVERS:
+        return False
     movers = kinds.is_mover(a), kinds.is_mover(b)
     if any(movers) and a.class_id != b.class_id and not (kinds.is_still(a) and kinds.is_still(b)):
         return False
-    if not a.cells.touches(b.cells, 0.1 if not any(movers) else 0.3):
+    if not any(movers) and apart > _NEAR:
         return False
     if all(movers):
         return float(np.hypot(*(a.center - b.center)[:2])) < 0.3
     volumes = float(np.prod(a.size)), float(np.prod(b.size))
     beside = max(a.beside[b.id], b.beside[a.id]) > _SELDOM * min(a.views, b.views)
-    shared = shared_volume(a.box, b.box) / max(min(volumes), 1e-9)
+    both = shared_volume(a.box, b.box)
+    shared = both / max(min(volumes), 1e-9)
     if a.class_id != b.class_id:
-        if upright_iou(a.box, b.box) >= 0.5:
+        if both > 0 and both / (sum(volumes) - both) >= 0.5:
             return True
         like = max(volumes) <= _LIKE * min(volumes) and not (kinds.is_large(a) or kinds.is_large(b))
         return like and not beside and shared >= _PART

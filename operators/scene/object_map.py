@@ -137,7 +137,7 @@ class ObjectMap:
             near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
             here = ~moves & (near <= s.reach) & (still if mover else True)
             for j in np.flatnonzero(here).tolist():
-                image = None if images is None else images[k][j]
+                image = None if images is None else images.of(k, j)
                 value[k, j] = alike(each, cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
             if not mover:
                 continue
@@ -239,7 +239,7 @@ class ObjectMap:
         s = self._settings
         if not objects:
             return
-        centers, radii = np.array([o.center for o in objects]), np.array([float(o.size.max()) for o in objects])
+        centers, radii = np.array([o.center for o in objects]), np.array([o.longest for o in objects])
         near = [objects[k] for k in np.flatnonzero(view.may_show(centers, radii + s.margin)).tolist()]
         sights = dict(zip((o.id for o in near), view.of_each([o.cells.points for o in near], s.margin), strict=True))
         for object in objects:
@@ -270,10 +270,7 @@ class ObjectMap:
         distance = float(np.linalg.norm(object.center - eye))
         if np.count_nonzero(sight.free) >= 0.6 * looked:
             object.evidence -= s.vacated * (3 if mover else 1)
-        elif (
-            np.count_nonzero(sight.confirmed) >= 0.6 * len(sight.looked)
-            and object.size.max() >= s.miss_angle * distance
-        ):
+        elif np.count_nonzero(sight.confirmed) >= 0.6 * len(sight.looked) and object.longest >= s.miss_angle * distance:
             object.evidence -= s.missed
 
     def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
@@ -284,7 +281,7 @@ class ObjectMap:
             return
         apart = in_places_of_their_own(images)
         centers = np.array([self.objects[i].center for _, i, _ in rows])
-        radii = np.array([float(self.objects[i].size.max()) for _, i, _ in rows]) / 2
+        radii = np.array([self.objects[i].longest for _, i, _ in rows]) / 2
         near = np.linalg.norm(centers[:, None] - centers[None], axis=2) <= radii[:, None] + radii[None]
         for a, b in np.argwhere(apart & near).tolist():
             self.objects[rows[a][1]].beside[rows[b][1]] += 1
@@ -295,13 +292,14 @@ class ObjectMap:
             return
         ids = sorted(self.objects)
         centers = np.array([self.objects[i].center for i in ids])
-        radii = np.array([float(self.objects[i].size.max()) for i in ids])
-        for i in changed:
+        radii = np.array([self.objects[i].longest for i in ids])
+        rows = np.searchsorted(ids, changed)
+        apart = np.linalg.norm(centers[None] - centers[rows, None], axis=2)
+        close = apart <= (radii[None] + radii[rows, None]) / 2 + 0.1
+        for i, near in zip(changed, close, strict=True):
             if i not in self.objects:
                 continue
-            k = ids.index(i)
-            close = np.linalg.norm(centers - centers[k], axis=1) <= (radii + radii[k]) / 2 + 0.1
-            for j in (ids[n] for n in np.flatnonzero(close).tolist()):
+            for j in (ids[n] for n in np.flatnonzero(near).tolist()):
                 if i not in self.objects or j not in self.objects or i == j:
                     continue
                 a, b = self.objects[i], self.objects[j]
@@ -321,8 +319,12 @@ class ObjectMap:
                 del self.objects[i]
                 if object.views >= s.views:
                     self.gone[i] = (stamp, object)
+        there: dict[int, list[MapObject]] = {}  # by class
+        for o in self.confirmed() if self.gone else ():
+            there.setdefault(o.class_id, []).append(o)
         for i, (_, old) in list(self.gone.items()):
-            new = [o for o in self.confirmed() if o.born > old.seen and o.id not in self.gone and _moved(old, o)]
+            alike = there.get(old.class_id, ())
+            new = [o for o in alike if o.born > old.seen and o.id not in self.gone and _moved(old, o)]
             if new:
                 chosen = min(new, key=lambda o: (o.born, o.id))
                 del self.gone[i], self.objects[chosen.id]
@@ -366,9 +368,7 @@ def _log_odds(score: float, least: float) -> float:
 
 
 def _moved(old: MapObject, new: MapObject) -> bool:
-    """Tells whether a new object is an old one in another place: of its class, size and colour."""
-    if old.class_id != new.class_id:
-        return False
+    """Tells whether a new object is an old one of its class in another place: of its size and colour."""
     sizes = np.sort(old.size[:2]), np.sort(new.size[:2])
     fits = np.abs(sizes[0] - sizes[1]).max() <= 0.1 + 0.4 * sizes[0].max()
     fits &= abs(old.size[2] - new.size[2]) <= 0.1 + 0.3 * old.size[2]

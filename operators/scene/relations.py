@@ -110,11 +110,13 @@ def _pairs(things: Sequence[Body], of: Sequence[Body], reach: float, *, flat: bo
     centers = np.array([b.center[:axes] for b in things]).reshape(-1, axes)
     radii = np.array([float(np.linalg.norm(b.size[:axes])) / 2 for b in things])
     row = {b.id: k for k, b in enumerate(things)}
-    close: dict[int, list[Body]] = {}
-    for body in of:
-        k = row[body.id]
-        apart = np.sqrt(((centers - centers[k]) ** 2).sum(axis=1)) - radii - radii[k]
-        close[body.id] = [things[j] for j in np.flatnonzero(apart <= reach).tolist() if j != k]
+    own = np.array([row[b.id] for b in of], np.intp)
+    apart = np.sqrt(((centers[None] - centers[own, None]) ** 2).sum(axis=2)) - radii - radii[own, None]
+    near = apart <= reach
+    near[np.arange(len(own)), own] = False
+    close: dict[int, list[Body]] = {b.id: [] for b in of}
+    for k, j in zip(*(found.tolist() for found in np.nonzero(near)), strict=True):
+        close[of[k].id].append(things[j])
     return close
 
 
@@ -128,7 +130,6 @@ def _placed(
 ) -> None:
     """Finds what a thing is in, or else what it stands or lies on: one thing at most."""
     best: tuple[float, str, int] = (0.0, "", 0)
-    volume = float(np.prod(body.size))
     for other in others:
         if other.agent:
             continue
@@ -137,7 +138,7 @@ def _placed(
         if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
             continue
         share = boxes.share(body, other)
-        if other.label in rules.containers and float(np.prod(other.size)) > 1.5 * volume and share > 0.3:
+        if other.label in rules.containers and other.volume > 1.5 * body.volume and share > 0.3:
             inside = min(body.top, other.top) - max(body.bottom, other.bottom)
             deep = inside / max(float(body.size[2]), 1e-3)
             if deep > 0.5 and body.center[2] < other.top - 0.02:

@@ -139,7 +139,7 @@ def shared(first: MapSurface, second: MapSurface) -> int:
     if large.label == FLOOR:
         return len(small.cells)
     reach = _REACH[large.level]
-    if not large.cells.touches(small.cells, reach):
+    if large.cells.apart(small.cells) > reach:
         return 0
     apart, _ = large.cells.tree().query(small.cells.points, distance_upper_bound=reach)
     near = int(np.count_nonzero(np.isfinite(apart)))

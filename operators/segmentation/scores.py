@@ -19,21 +19,22 @@ def best_classes(scores: NDArray[np.uint8]) -> NDArray[np.uint8]:
     count, height, width = scores.shape
     if count > MOST_CLASSES:
         raise ValueError(f"at most {MOST_CLASSES} classes, got {count}")
-    order = (MOST_CLASSES - 1 - np.arange(count, dtype=np.uint16))[:, None, None]
-    cells = np.empty((count, height + 1, width + 1), np.uint16)
-    np.left_shift(scores, _BITS, out=cells[:, :-1, :-1], dtype=np.uint16)
-    cells[:, -1, :-1], cells[:, :, -1] = cells[:, -2, :-1], cells[:, :, -2]
-    beside = cells[:, :, :-1] + cells[:, :, 1:]
-    found = np.empty((2 * height, 2 * width), np.uint8)
-    for row, column, sums in (
-        (0, 0, cells[:, :-1, :-1]),
-        (0, 1, beside[:, :-1]),
-        (1, 0, cells[:, :-1, :-1] + cells[:, 1:, :-1]),
-        (1, 1, beside[:, :-1] + beside[:, 1:]),
-    ):
-        key = (sums + order).max(axis=0)
-        found[row::2, column::2] = MOST_CLASSES - 1 - (key & (MOST_CLASSES - 1))
-    return found
+    cells = np.empty((height + 1, width + 1), np.uint16)
+    best = np.zeros((2, 2, height, width), np.uint16)  # the greatest keys, by row and column in the cell
+    for k in range(count):  # one class at a time stays in the cache
+        np.left_shift(scores[k], _BITS, out=cells[:-1, :-1], dtype=np.uint16)
+        cells[-1, :-1], cells[:, -1] = cells[-2, :-1], cells[:, -2]
+        beside = cells[:, :-1] + cells[:, 1:]
+        order = np.uint16(MOST_CLASSES - 1 - k)
+        for row, column, sums in (
+            (0, 0, cells[:-1, :-1] + order),
+            (0, 1, beside[:-1] + order),
+            (1, 0, cells[:-1, :-1] + cells[1:, :-1] + order),
+            (1, 1, beside[:-1] + beside[1:] + order),
+        ):
+            np.maximum(best[row, column], sums, out=best[row, column])
+    classes = (MOST_CLASSES - 1 - (best & (MOST_CLASSES - 1))).astype(np.uint8)
+    return np.ascontiguousarray(classes.transpose(2, 0, 3, 1)).reshape(2 * height, 2 * width)
 
 
 def probability(scores: NDArray[np.uint8], step: float) -> NDArray[np.float32]:

@@ -9,7 +9,7 @@ import typer
 from rich.progress import track
 
 from operators.training.console import Json, err_console, friendly
-from operators.training.options import Device, Every, Overwrite, Rate, Resume, Seed, Threads
+from operators.training.options import Every, Overwrite, Rate, Resume, Seed
 from operators.training.running import keep_earlier, report, run_task
 
 if TYPE_CHECKING:
@@ -47,8 +47,8 @@ def train_activity(
     learning_rate: Rate = 3e-3,
     seed: Seed = 0,
     evaluate_every: Every = 1,
-    threads: Threads = 1,
-    device: Device = "cpu",
+    threads: Annotated[int, typer.Option(min=1, help="Threads that compute.")] = 1,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ...")] = "cpu",
     json: Json = False,
 ) -> None:
     """Train the activity network, two LSTM layers, on people of simulated worlds.
@@ -56,6 +56,11 @@ def train_activity(
     No image is rendered: true boxes go through a seeded model of a tracker in space. Tracks that came from sensors may
     be added. The score is the macro-F1 at 0.5 s tolerance, the mean of true, tracked and sensed boxes.
     `operators.recognition:ActivityRecognizer` takes the file as `weights`.
+
+    Examples:
+
+      dataflow train activity out/episodes
+      dataflow train activity out/episodes --worlds 10 --epochs 3 --out out/activity.onnx
     """
     with friendly():
         keep_earlier(out, resume, overwrite)

@@ -21,7 +21,6 @@ CALLED_BY_OTHERS = {
     # click asks a group
     "on_playback_control_request",  # Foxglove's server tells its listener
     "on_subscribe",
-    "on_unsubscribe",
 }
 
 

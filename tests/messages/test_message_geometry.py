@@ -40,6 +40,13 @@ def test_a_quaternion_survives_its_matrix(seed: int) -> None:
     assert np.allclose(again, np.where(q[:, 3:] < 0, -q, q), atol=1e-12)
 
 
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_one_rotation_has_the_quaternion_that_it_has_among_others(seed: int) -> None:
+    matrices = geometry.quaternion_to_matrix(random_quaternions(seed))
+    assert (geometry.matrix_to_quaternion(matrices) == [geometry.matrix_to_quaternion(m) for m in matrices]).all()
+
+
 @pytest.mark.parametrize("angle", [0.0, 1e-12, np.pi - 1e-9, np.pi, np.pi + 1e-9, 2 * np.pi])
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1), (1, -2, 1e-9)])
 def test_no_rotation_is_ill_conditioned(axis: tuple[float, ...], angle: float) -> None:

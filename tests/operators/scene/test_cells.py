@@ -1,0 +1,48 @@
+"""Voxels of an object, as a plain dictionary would keep them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from operators.scene.cells import Cells, keys_of
+
+SIDE = 0.1
+
+
+def view(rng: np.random.Generator) -> np.ndarray:
+    return rng.uniform(-0.3, 0.3, (rng.integers(1, 60), 3))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_views_are_added_as_a_dictionary_of_voxels_would_add_them(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    cells = Cells(SIDE)
+    means: dict[int, tuple[np.ndarray, int, int]] = {}  # by voxel: mean, hits, views that saw through
+    for _ in range(6):
+        points = view(rng)
+        cells.add(Cells.of(points, SIDE))
+        keys = keys_of(points, SIDE)
+        for key in np.unique(keys).tolist():
+            mean, hits, free = means.get(key, (np.zeros(3), 0, 0))
+            own = points[keys == key].mean(axis=0)
+            means[key] = (mean * hits + own) / (hits + 1), hits + 1, max(free - 1, 0)
+        seen_through = rng.random(len(cells)) < 0.2
+        cells.carve(seen_through)
+        for key, through in zip(sorted(means), seen_through.tolist(), strict=True):
+            mean, hits, free = means[key]
+            means[key] = mean, hits, free + through
+        means = {key: row for key, row in means.items() if not (row[2] >= 3 and row[2] > 0.5 * row[1])}
+    rows = [means[key] for key in sorted(means)]
+    np.testing.assert_allclose(cells.points, [mean for mean, _, _ in rows], atol=1e-12)
+    np.testing.assert_array_equal(cells.hits, [hits for _, hits, _ in rows])
+    np.testing.assert_array_equal(cells.free, [free for _, _, free in rows])
+
+
+def test_bounds_are_as_far_apart_as_along_the_axis_of_the_widest_gap() -> None:
+    first = Cells.of(np.array([[0.0, 0, 0], [1, 1, 1]]), SIDE)
+    second = Cells.of(np.array([[1.2, 0.5, 0.5], [2, 2, 2]]), SIDE)
+    assert first.apart(second) == pytest.approx(0.2)
+    assert second.apart(first) == first.apart(second)
+    assert first.apart(first) < 0
+    assert first.apart(Cells(SIDE)) == np.inf
