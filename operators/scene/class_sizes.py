@@ -47,8 +47,8 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     "bin": (Usual((0.32, 0.32, 0.43), (0.15, 0.15, 0.18), True),),
 }
 """By class, each way in which such things stand: medians over the objects of 36 training worlds (seeds 10000 to 10011
-of office, corridor and table_top); of people, where they stand or walk, and where they sit, less deep than they are
-(0.86 m) since their legs are hidden and may be turned any way."""
+of office, corridor and table_top). People who stand or walk come before those who sit, whose depth is less than it is
+(0.86 m), since their legs are hidden and may be turned any way."""
 
 TELLING: dict[str, float] = {"ball": 2.0}
 """Labels of another class that one of this class outweighs, where that is not one.

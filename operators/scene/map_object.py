@@ -33,9 +33,9 @@ class MapObject:
     """One object of the map, in an upright box. Times in nanoseconds.
 
     `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
-    of voxels that it had; `images` are the views that its box is fitted to, `form` which of
-    the ways in which its class stands, -1 while that is open. `beside` counts by id in how many views another one was
-    seen too, in a place of its own in the image.
+    of voxels that it had; `images` are the views that its box is fitted to, `form` which of the ways in which its class
+    stands, -1 while that is open; `held` whether it was last seen in a hand. `beside` counts by id in how many views
+    another one was seen too, in a place of its own in the image.
     """
 
     id: int
@@ -55,6 +55,7 @@ class MapObject:
     images: list[ImageView] = field(default_factory=list)
     form: int = -1
     beside: Counter[int] = field(default_factory=Counter)
+    held: bool = False
 
     @property
     def class_id(self) -> int:
@@ -132,7 +133,8 @@ class MapObject:
         images = [np.stack([getattr(v, name) for v in rows]) for name in ("P", "box", "edges", "eye")] if rows else []
         plain = {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)}
         beside = sorted(self.beside.items())
-        return plain | {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
+        rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
+        return plain | rest | {"held": self.held}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
@@ -141,6 +143,7 @@ class MapObject:
         fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
         made = cls(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
         made.beside = Counter({int(other): int(count) for other, count in state.get("beside", ())})
+        made.held = bool(state.get("held", False))
         for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():
             view = ImageView(np.array(P), np.array(box), np.array(edges, np.bool_), np.array(eye))
             made.images.append(view)

@@ -155,7 +155,7 @@ class ObjectMap:
         """Returns the object's id of each observation that is of none where it lay, but of one in somebody's hand."""
         free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in self._kinds.portable]
         hands = [self.objects[i] for k, i in joined.items() if seen[k].class_id in self._kinds.carriers]
-        if not free or not hands:
+        if not free or not (hands or any(o.held for o in self.objects.values())):
             return {}
         there = set(joined.values())
         things = [
@@ -167,8 +167,10 @@ class ObjectMap:
         found: dict[int, int] = {}
         for k in free:
             id = taken(cells[k].middle, seen[k].class_id, self.objects, usable)
-            if id is not None and in_hand(cells[k].middle, hands):
+            held = in_hand(cells[k].middle, hands)
+            if id is not None and (held or self.objects[id].held):  # what was in a hand may be put anywhere in reach
                 found[k] = id
+                self.objects[id].held = held
                 usable.remove(id)
         return found
 

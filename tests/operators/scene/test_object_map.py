@@ -162,6 +162,19 @@ def test_a_mug_in_a_hand_is_the_mug_that_stood_there() -> None:
     assert left.center[2] < 0.2  # what is in a hand is new, and not yet sure
 
 
+def test_a_mug_that_is_put_down_elsewhere_is_still_that_mug() -> None:
+    known = carrying(portable=True)
+    T = looking(0.0)
+    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 90)), axis=-1).reshape(-1, 3)
+    for k in range(13, 17):
+        each = observation(((1.7, 0.85, 0.1), (0.1, 0.1, 0.1)), MUG, T)
+        points = np.concatenate([wall, each.points])
+        known.update((k + 1) * SECOND // 4, [each], RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
+    (mug,) = [o for o in known.confirmed() if o.class_id == MUG]
+    assert mug.center[1] > 0.75
+    assert not mug.held
+
+
 def test_a_mug_farther_away_than_an_arm_reaches_is_another() -> None:
     known = carrying(portable=True, lifted=0)
     T = looking(0.0)
