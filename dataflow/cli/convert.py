@@ -30,10 +30,24 @@ if TYPE_CHECKING:
     from dataflow.interop.export.report import Exported
 
 Format = Literal[
-    "mcap", "ros2", "foxglove", "rrd", "tum", "7scenes", "euroc", "kitti", "kitti-raw", "lerobot", "csv", "parquet"
+    "mcap",
+    "ros2",
+    "foxglove",
+    "rrd",
+    "tum",
+    "7scenes",
+    "euroc",
+    "kitti",
+    "kitti-raw",
+    "lerobot",
+    "lerobot-v3",
+    "csv",
+    "parquet",
 ]
 SUFFIXES = {"mcap": ".mcap", "foxglove": ".mcap", "rrd": ".rrd"}
 """Of formats that are one file; the others are folders."""
+_MCAP = ("mcap", "foxglove", "ros2")
+"""Formats that have places for attachments and metadata records."""
 
 
 def convert(
@@ -59,8 +73,11 @@ def convert(
 
     Into ros2, ROS topics of a bag go byte for byte, streams of a recording as the ROS types they have a counterpart in;
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
-    kept as they are. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a kind: --stream chooses among
-    several. Into lerobot, every image of the first camera is a frame, with the newest message of every other stream.
+    kept as they are. Into mcap, ros2 and foxglove, attachments and metadata records of an MCAP file go along; other
+    formats have no place for them, which is said. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a
+    kind: --stream chooses among several. Into lerobot (format 2.1) and lerobot-v3 (3.0), every image of the first
+    camera is a frame, with the newest message of every other stream; images stay images, lossless, since no video
+    encoder is among the dependencies.
 
     Exit codes:
 
@@ -79,6 +96,7 @@ def convert(
       dataflow convert run.mcap folder --to kitti --stream camera/*
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
+      dataflow convert run.mcap folder --to lerobot-v3 --task "pick up cups"
       dataflow convert run.mcap folder --to csv --stream imu/imu
       dataflow convert run.mcap folder --to parquet --start 5 --end 10
     """
@@ -89,10 +107,11 @@ def convert(
             from dataflow.cli.viewing import view
 
             view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
+            _tell_rrd(recording)
             return
         with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            if to != "lerobot" and (action is not None or task):
-                raise fail("--action and --task are of --to lerobot")
+            if not to.startswith("lerobot") and (action is not None or task):
+                raise fail("--action and --task are of --to lerobot and lerobot-v3")
             done = _export(material, output, to, overwrite, watch, action, task)
     if json:
         print_json(done.as_json())
@@ -101,11 +120,28 @@ def convert(
     for name, number in done.written.items():
         made.add_row(Text(name), count(number))
     out.print(made)
-    for name, reason in done.left_out.items():
-        say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
+    if done.attachments or done.metadata:
+        out.print(f"carried over: {plural(done.attachments, 'attachment')}, {count(done.metadata)} metadata records")
+    _print_left_out(done)
     shown = done.files if len(done.files) <= 3 else [f"{plural(len(done.files), 'file')} in {output}"]
     for file in shown:
         out.print(f"wrote {escape(file)}", soft_wrap=True)
+
+
+def _tell_rrd(recording: Path) -> None:
+    from dataflow.interop.export.extras import tell_left_out
+    from dataflow.interop.export.material import Material
+    from dataflow.interop.export.report import Exported
+
+    done = Exported()
+    with Material(recording) as material:
+        tell_left_out(material, "rrd", done)
+    _print_left_out(done)
+
+
+def _print_left_out(done: Exported) -> None:
+    for name, reason in done.left_out.items():
+        say(f"[yellow]left out:[/] {escape(name)}: {escape(reason)}")
 
 
 def _check_output(output: Path, to: str, overwrite: bool) -> None:
@@ -159,6 +195,7 @@ def _export(
     task: str,
 ) -> Exported:
     from dataflow.interop.export.datasets import DATASETS
+    from dataflow.interop.export.extras import tell_left_out
     from dataflow.interop.export.foxglove import export_foxglove
     from dataflow.interop.export.own import export_own
     from dataflow.interop.export.report import Exported
@@ -173,16 +210,20 @@ def _export(
             export_foxglove(material, output, done)
         case "ros2":
             export_ros2(material, output, done)
-        case "lerobot":
+        case "lerobot" | "lerobot-v3":
             from dataflow.interop.export.lerobot import export_lerobot
+            from dataflow.interop.export.lerobot_layouts import Layout21, Layout30
 
-            export_lerobot(material, output, done, action=action, task=task)
+            layout = Layout21() if to == "lerobot" else Layout30()
+            export_lerobot(material, output, done, layout=layout, action=action, task=task)
         case "csv":
             export_csv(material, output, done)
         case "parquet":
             export_parquet(material, output, done)
         case _:
             DATASETS[to](material, output, done)
+    if to not in _MCAP:
+        tell_left_out(material, to, done)
     return done
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,6 +17,8 @@ from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
 
 if TYPE_CHECKING:
+    from dataflow.client.playback import Steering
+    from dataflow.client.replay_bar import ReplayBar
     from dataflow.foxglove.server import FoxgloveServer
     from dataflow.recording import Recorded
 
@@ -45,7 +50,9 @@ def foxglove(
     """Serve a running graph or a recording to Foxglove.
 
     In Foxglove: Open connection, Foxglove WebSocket, and the address that is printed. Its playback bar plays the
-    recording: pause, speed, any place. Images, clouds, boxes, masks, tracks, trajectories, maps and the scene graph are
+    recording: pause, speed, any place. Where the running graph is a replay (`dataflow replay`), the bar pauses it and
+    changes its speed; a jump is refused with the option that begins there, since operators hold what came before.
+    Images, clouds, boxes, masks, tracks, trajectories, maps and the scene graph are
     sent as Foxglove's own schemas; a client can never slow the graph.
 
     Examples:
@@ -53,6 +60,7 @@ def foxglove(
       dataflow foxglove
       dataflow foxglove run.mcap --start 5 --speed 0.5
       dataflow foxglove --stream "camera/*" --port 9000
+      dataflow foxglove --wait 10
     """
     from dataflow.foxglove.server import FoxgloveError
 
@@ -115,14 +123,29 @@ def _play(
 
 def _follow(host: str, port: int, words: list[str] | None, name: str | None, wait: float) -> None:
     from dataflow.client.attach import graph_of, still_runs, tap
+    from dataflow.client.playback import steering
     from dataflow.foxglove.server import FoxgloveServer
 
     found = running_graph(name, wait)
     running = graph_of(found)
     chosen = chosen_streams(words, running.streams, running.namespace)
-    with FoxgloveServer(running.name, namespace=running.namespace, host=host, port=port) as server:
+    with ExitStack() as stack:
+        bar = _bar(stack.enter_context(steering(found)))
+        server = stack.enter_context(
+            FoxgloveServer(
+                running.name,
+                namespace=running.namespace,
+                host=host,
+                port=port,
+                controls=bar,
+                span=None if bar is None else bar.span,
+            )
+        )
         _say_where(server)
         say(f"following {escape(running.name)} (process {found.pid})")
+        if bar is not None:
+            say("a replay: the playback bar of Foxglove pauses it and changes its speed")
+            stack.enter_context(_told(server, bar))
         clock = 0
         try:
             with tap(found, [f"/{stream}" for stream in chosen] if words else ["**"]) as client:
@@ -139,6 +162,37 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
         else:
             say("the graph has ended")
     out.print(f"shown: {plural(server.shown, 'message')}")
+
+
+def _bar(steering: Steering) -> ReplayBar | None:
+    """What a playback bar moves, where a recording is played through the graph; None elsewhere."""
+    from dataflow.client.attach import NotRunning
+    from dataflow.client.replay_bar import ReplayBar
+
+    try:
+        standing = steering.ask(None)
+    except NotRunning:  # a live run has nothing to move
+        return None
+    return None if standing["replay"] is None else ReplayBar(steering, standing)
+
+
+@contextmanager
+def _told(server: FoxgloveServer, bar: ReplayBar) -> Iterator[None]:
+    """Tells the clients meanwhile where the replay stands, about twice a second."""
+    over = threading.Event()
+
+    def tell() -> None:
+        while not over.wait(0.5):
+            bar.refresh()
+            server.playback(bar, ended=bar.ended)
+
+    teller = threading.Thread(target=tell, name="playback", daemon=True)
+    teller.start()
+    try:
+        yield
+    finally:
+        over.set()
+        teller.join(5.0)
 
 
 def _say_where(server: FoxgloveServer) -> None:

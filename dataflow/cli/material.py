@@ -106,6 +106,7 @@ def print_edited(done: Edited) -> None:
     print_unknown(done.unknown)
     low, high = done.span or (0, 0)
     what = f"{plural(done.messages, 'message')} in {seconds((high - low) * 1e-9)}, {size(done.bytes)}"
+    what += f", {plural(done.attachments, 'attachment')}" if done.attachments else ""
     out.print(f"wrote {escape(done.path)} ({what})", soft_wrap=True)
 
 

@@ -1,4 +1,4 @@
-"""Pauses and steps a replay: by keys in its terminal, and by `dataflow playback` from another."""
+"""Pauses, steps and paces runs that are not live: by keys in their terminal, by `dataflow playback` from another."""
 
 from __future__ import annotations
 
@@ -14,16 +14,24 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 from rich.text import Text
 
-from dataflow.cli.arguments import Json
+from dataflow.cli.arguments import Json, number
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import err, fail, friendly_errors, out, print_json, say
+from dataflow.cli.quantities import speed_text
 
 if TYPE_CHECKING:
     from dataflow.supervision.supervisor import Supervisor
 
-Pressed = Literal["toggle", "step", "quit"]
-KEYS: dict[bytes, Pressed] = {b" ": "toggle", b"n": "step", b"\x1b[C": "step", b"\x1bOC": "step", b"q": "quit"}
-HELP = "space: pause and go on · → or n: one step · q: end"
+Pressed = Literal["toggle", "step", "faster", "slower", "quit"]
+KEYS: dict[bytes, Pressed] = {
+    b" ": "toggle",
+    b"n": "step", b"\x1b[C": "step", b"\x1bOC": "step",  # →
+    b"+": "faster", b"=": "faster", b"\x1b[A": "faster", b"\x1bOA": "faster",  # ↑
+    b"-": "slower", b"\x1b[B": "slower", b"\x1bOB": "slower",  # ↓
+    b"q": "quit",
+}  # fmt: skip
+HELP = "space: pause and go on · → or n: one step · + and -: twice and half as fast · q: end"
+ACTIONS = ("pause", "resume", "step", "speed", "status")
 
 
 def pressed(typed: bytes) -> Iterator[Pressed]:
@@ -37,15 +45,23 @@ def pressed(typed: bytes) -> Iterator[Pressed]:
 
 
 def keys(quiet: bool) -> Callable[[Supervisor], AbstractContextManager[None]] | None:
-    """Returns what steers a replay by keys, where there is a terminal; None elsewhere."""
+    """Returns what steers a run by keys, where there is a terminal; None elsewhere."""
     if quiet or not err.is_terminal or not sys.stdin.isatty():
         return None
-    return _steered
+    return _steered if _in_foreground(sys.stdin.fileno()) else None
+
+
+def _in_foreground(terminal: int) -> bool:
+    """Tells whether keys come here: a job in the background (`&`) would be stopped if it asked for them."""
+    try:
+        return os.tcgetpgrp(terminal) == os.getpgrp()
+    except OSError:  # the terminal of another session
+        return False
 
 
 @contextmanager
 def _steered(supervisor: Supervisor) -> Iterator[None]:
-    """Reads keys on a thread of its own while a replay lasts; the terminal is as before afterwards."""
+    """Reads keys on a thread of its own while a run lasts; the terminal is as before afterwards."""
     import termios
     import tty
 
@@ -84,39 +100,49 @@ def _steered(supervisor: Supervisor) -> Iterator[None]:
 
 def playback(
     action: Annotated[
-        str, typer.Argument(metavar="pause|resume|step|status", help="What to do; status says how it stands.")
+        str, typer.Argument(metavar="pause|resume|step|speed|status", help="What to do; status says how it stands.")
     ],
-    steps: Annotated[int, typer.Argument(metavar="N", help="Of step: all messages of so many timestamps.")] = 1,
+    value: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="N|FACTOR",
+            help="Of step: all messages of so many timestamps, by default 1. Of speed: 1 is real time, max as fast as "
+            "the graph goes.",
+        ),
+    ] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
     json: Json = False,
 ) -> None:
-    """Pause, resume or step a replay that runs in another terminal, or in a script.
+    """Pause, resume, step or pace what runs in another terminal, or in a script.
 
-    In a replay's own terminal, keys do the same: space pauses and goes on, the right arrow or n makes one step, q ends
-    it. Results do not depend on it: a replay makes the same messages however it is paused.
+    That is a replay, or a run that is not live. In its own terminal, keys do the same: space pauses and goes on, the
+    right arrow or n makes one step, + and - double and halve the speed, q ends it. Results do not depend on it: the
+    same messages are made however it is paused. A step of a run whose sources are in several processes is one step in
+    each of them. A live run cannot be paused: devices and the clock wait for nobody.
 
     Exit codes:
 
       0    done
-      2    no replay runs, or nobody answers
+      2    no graph runs, it is live, or nobody answers
 
     Examples:
 
       dataflow playback pause
       dataflow playback step 10
       dataflow playback resume --graph kitchen
+      dataflow playback speed 0.25
+      dataflow playback speed max
       dataflow playback status --json
     """
     from dataflow.client.playback import ask
 
-    if action not in ("pause", "resume", "step", "status"):
-        raise fail(f"{action!r}: expected pause, resume, step or status")
-    if steps < 1:
-        raise fail(f"{steps} steps: expected 1 or more")
+    if action not in ACTIONS:
+        raise fail(f"{action!r}: expected {', '.join(ACTIONS[:-1])} or {ACTIONS[-1]}")
+    steps, speed = _wanted(action, value)
     with friendly_errors():
         found = running_graph(graph, wait)
-        answer = ask(found, None if action == "status" else action, steps)
+        answer = ask(found, None if action == "status" else action, steps, speed)
     if json:
         print_json(answer)
         return
@@ -125,7 +151,24 @@ def playback(
     stamp = answer["stamp"]
     where = "" if stamp is None else f" at {format_stamp(stamp)} ({stamp})"
     state = "ended" if answer["ended"] else "paused" if answer["paused"] else "playing"
-    out.print(Text.assemble((state, "bold"), where))
+    out.print(Text.assemble((state, "bold"), where, f", {speed_text(answer['speed'])}"))
+
+
+def _wanted(action: str, value: str | None) -> tuple[int, float | None]:
+    """Returns the steps and the speed that the word after an action asks for."""
+    if action == "speed":
+        if value is None:
+            raise fail("speed: expected a factor of real time, or max; for example: dataflow playback speed 0.5")
+        if value == "max":
+            return 1, None
+        return 1, number(0.001, 1000, "1 is real time; or max, as fast as the graph goes")(value)
+    if value is None:
+        return 1, None
+    if action != "step":
+        raise fail(f"{action} takes no {value!r}; only step takes a number, and speed a factor")
+    if not value.isdecimal() or int(value) < 1:
+        raise fail(f"{value} steps: expected a whole number, 1 or more")
+    return int(value), None
 
 
 def same_digests(passes: list[dict[str, Any]]) -> bool:

@@ -13,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dataflow.cli.output import count, seconds
+from dataflow.cli.quantities import speed_text
 from dataflow.supervision.report import OperatorCounts, Status
 from dataflow.supervision.run import Watch
 from dataflow.sync import FOREVER, NEVER
@@ -66,6 +67,7 @@ class RunDisplay:
         parts = (waiting_for(status), self.reached(status), self._clock(total, completed))
         note = " · ".join(part for part in parts if part)
         phase = "paused" if status.paused and status.phase not in ENDING else status.phase
+        note += f" · {speed_text(status.speed)}" if status.speed is not None else ""
         self._bar.update(self._task, description=phase, total=total, completed=completed, note=note)
 
     def fraction(self, status: Status) -> tuple[float | None, float]:

@@ -39,6 +39,11 @@ def parsed_duration(option: str, word: str) -> int:
     return found
 
 
+def speed_text(speed: float | None) -> str:
+    """A pace against the clock, in words."""
+    return "as fast as it goes" if speed is None else f"{speed:g} x real time"
+
+
 UNITS = {"": 1, "B": 1, "kB": 10**3, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12} | {
     "KiB": 2**10,
     "MiB": 2**20,

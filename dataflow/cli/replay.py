@@ -11,7 +11,6 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.arguments import (
-    FLAG,
     AnyRecording,
     Clock,
     End,
@@ -43,6 +42,7 @@ from dataflow.cli.run_options import (
     Rate,
     Record,
     Replace,
+    Step,
     Timeout,
     View,
 )
@@ -65,9 +65,7 @@ def replay(
     start: Start = None,
     end: End = None,
     rate: Rate = None,
-    step: Annotated[
-        bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
-    ] = False,
+    step: Step = False,
     loop: Annotated[
         int, typer.Option("--loop", metavar="N", help="Replay N times, and compare the passes; 0: until Ctrl-C.")
     ] = 1,
@@ -105,7 +103,8 @@ def replay(
     with the time of their recording; which, and why, is printed.
 
     In a terminal, space pauses it and lets it go on, the right arrow or n makes one step (all messages of one
-    timestamp), q ends it; `dataflow playback` does the same from elsewhere. Results do not depend on that.
+    timestamp), + and - double and halve its speed, q ends it; `dataflow playback` does the same from elsewhere. Results
+    do not depend on that.
 
     With --complete, a thin recording (sensors and firing records) becomes the complete recording of the same run:
     nothing is decided anew, so drops and timeouts of a live run are repeated, and every message has the recorded

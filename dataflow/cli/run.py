@@ -19,6 +19,7 @@ from dataflow.cli.arguments import (
 )
 from dataflow.cli.execution import checked_outputs, execute, plan_options
 from dataflow.cli.output import fail, friendly_errors
+from dataflow.cli.playback import keys
 from dataflow.cli.run_options import (
     Json,
     Live,
@@ -32,6 +33,7 @@ from dataflow.cli.run_options import (
     Rate,
     Record,
     Replace,
+    Step,
     Timeout,
     View,
 )
@@ -44,6 +46,7 @@ def run(
     settings: Settings = None,
     path: ModuleFolders = None,
     rate: Rate = None,
+    step: Step = False,
     timeout: Timeout = 120.0,
     live: Live = False,
     paranoid: Paranoid = False,
@@ -70,6 +73,10 @@ def run(
     A table of its operators is shown while it runs, and a summary at the end. Ctrl-C ends it in order: sources stop,
     everything on its way is finished, files are closed; a second Ctrl-C ends it at once.
 
+    In a terminal, space pauses a run that is not live and lets it go on, the right arrow or n makes one step, + and -
+    double and halve its speed, q ends it; `dataflow playback` does the same from elsewhere. Results do not depend on
+    that.
+
     A graph with `record: {keep: 60s}` has a flight recorder, unless --record keeps everything: what was is kept on a
     trigger, or with `dataflow trigger`.
 
@@ -80,6 +87,7 @@ def run(
       dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
+      dataflow run graphs/simulated_robot.yaml --rate 1 --step --view spawn
       dataflow run graphs/simulated_robot.yaml --live --record live.mcap
       dataflow run graphs/chaos/robot.yaml --chaos graphs/chaos/plan.yaml
     """
@@ -100,10 +108,12 @@ def run(
         if log_level is not None:
             os.environ[LEVEL_VARIABLE] = log_level
         live = live or chaos is not None
+        if live and step:
+            raise fail("--step pauses what reads its sources; a live run cannot wait: devices go on by the clock")
         loaded = load_graph(file, settings=settings or (), live=live)
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-        options["live"] = live
+        options |= {"live": live, "paused": step, "controls": None if live else keys(quiet or json)}
         if loaded.record.flight is not None and record is None:
             options["flight"] = Path(loaded.record.flight.folder)
             options["flight"].mkdir(parents=True, exist_ok=True)

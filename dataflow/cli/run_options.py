@@ -71,6 +71,9 @@ Rate = Annotated[
         help="Pace: 1 is real time. Default: as fast as the graph goes.",
     ),
 ]
+Step = Annotated[
+    bool, typer.Option("--step", metavar=FLAG, help="Begin paused: → or n makes a step, space lets it go on.")
+]
 Timeout = Annotated[
     float,
     typer.Option(

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from dataflow.editing.extras import is_fact, take_over
 from dataflow.editing.joins import joined
 from dataflow.editing.part import copy_messages, graph_of, kept_stamps, outputs_of, write_firings
 from dataflow.editing.report import Edited, Watch, unwatched
@@ -39,26 +40,29 @@ def merge(
 
     Parts of one run are joined: what several hold is taken once, and their firing records become one log. Of other
     recordings the run of the first one counts, with its graph and firing records; the others give their streams.
-    `prefixes` are put before the names of the streams of each. Raises `RecordingError` for names that clash.
+    `prefixes` are put before the names of the streams of each. Attachments and metadata of all go along
+    (`editing.extras`). Raises `RecordingError` for names that clash.
     """
     done = Edited(str(out))
     prefixes = [*prefixes, *[""] * (len(origins) - len(prefixes))]
-    if not any(prefixes) and are_of_one_run(origins):
+    one_run = not any(prefixes) and are_of_one_run(origins)
+    if one_run:
         origins = sorted(origins, key=_begin)
         records = _joined_records(origins)
-        metadata = _joined_metadata(origins, records, done)
+        facts = _joined_metadata(origins, records, done)
         kept = _taken_once(origins)
     else:
         _refuse_clashes(origins, prefixes)
         records = {} if prefixes[0] else _records_of(origins[0])
-        metadata = {name: dict(values) for name, values in origins[0].metadata.items()}
+        facts = {name: dict(v) for name, v in origins[0].metadata.items() if is_fact(origins[0], name)}
         kept = [_all_of(origin, run=not k and not prefixes[0]) for k, origin in enumerate(origins)]
         _tell_clocks(origins, done)
         _tell_runs(origins, prefixes, done)
     total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
     with Copy(out, origins[0], overwrite=overwrite) as copy:
-        for name, values in metadata.items():
+        for name, values in facts.items():
             copy.writer.add_metadata(name, values)
+        take_over(copy, origins, [p.rstrip("/") for p in prefixes], done, joined=one_run)
         write_firings(copy, origins, records)
         done.firings = sum(r.kind in CALLS for listed in records.values() for r in listed)
         before = 0
@@ -106,7 +110,7 @@ def _joined_records(origins: Sequence[Origin]) -> Records:
 
 def _joined_metadata(origins: Sequence[Origin], records: Records, done: Edited) -> dict[str, dict[str, str]]:
     """The run's metadata: streams end where they end in the last part; a part stays one unless all of it is there."""
-    metadata = {name: dict(values) for origin in origins for name, values in origin.metadata.items()}
+    metadata = {n: dict(values) for o in origins for n, values in o.metadata.items() if is_fact(o, n)}
     metadata.pop(DIGESTS, None)
     ends: dict[str, dict[str, Any]] = {}
     for origin in origins:

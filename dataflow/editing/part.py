@@ -49,8 +49,9 @@ def write_part(origin: Origin, part: Part, out: Path, *, overwrite: bool = False
     kept = masks_of(origin, part, needed)
     _describe(origin, kept, part, done)
     with Copy(out, origin, overwrite=overwrite) as copy:
-        for name, values in _metadata(origin, kept, part).items():
+        for name, values in _metadata(origin, kept, part):
             copy.writer.add_metadata(name, values)
+        done.attachments = copy.attachments(origin)
         if firings is not None:
             write_firings(copy, [origin], firings.records)
             done.firings = sum(r.kind in CALLS for records in firings.records.values() for r in records)
@@ -61,8 +62,6 @@ def write_part(origin: Origin, part: Part, out: Path, *, overwrite: bool = False
     done.bytes = out.stat().st_size
     if origin.file.torn:
         done.notes.append(f"{origin.path} has no proper end: what its writer had not stored when it died is missing")
-    if not origin.own and (left_out := origin.attachments()):
-        done.notes.append(f"attachments of {origin.path} are left out: {left_out}")
     done.notes += [f"{origin.path}: {note}" for note in origin.file.damage]
     return done
 
@@ -213,11 +212,11 @@ def _describe(origin: Origin, kept: Mapping[int, Mask], part: Part, done: Edited
     done.span = (min(firsts), max(lasts)) if firsts else None
 
 
-def _metadata(origin: Origin, kept: Mapping[int, Mask], part: Part) -> dict[str, dict[str, str]]:
+def _metadata(origin: Origin, kept: Mapping[int, Mask], part: Part) -> list[tuple[str, dict[str, str]]]:
     """The metadata of the part: stream digests only of what is whole, ends within it, and what it was cut from."""
-    metadata = {name: dict(values) for name, values in origin.metadata.items()}
     if not origin.own:
-        return metadata
+        return origin.records()
+    metadata = {name: dict(values) for name, values in origin.metadata.items()}
     before, after = origin.counts(), origin.counts(kept)
     digests = metadata.pop(DIGESTS, {})
     metadata[DIGESTS] = {s: d for s, d in digests.items() if after.get(s) == before.get(s)}
@@ -233,7 +232,7 @@ def _metadata(origin: Origin, kept: Mapping[int, Mask], part: Part) -> dict[str,
         start = known.start if part.start is None else part.start
         end = known.end if part.end is None else part.end
         metadata[CUT] = Cut(known.of, start, end).metadata()
-    return metadata
+    return list(metadata.items())
 
 
 def kept_stamps(origin: Origin, kept: Mapping[int, Mask]) -> dict[str, dict[int, np.ndarray]]:

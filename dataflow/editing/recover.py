@@ -71,19 +71,22 @@ def recover(path: Path, out: Path, *, overwrite: bool = False, watch: Watch = un
     if out.exists() and out.samefile(path):
         raise RecordingError(f"{out} is the file to be recovered; name another one")
     with Origin(path, lenient=True) as origin:
+        attached = origin.file.attachments
         damage = list(origin.file.damage)
         broken = origin.file.broken_chunks()
         damage += [f"{where}: {why}" for where, why in broken.values()]
         kept = {c: ~np.isin(origin.entries(c).chunks, list(broken)) for c in origin.channels}
         with Copy(out, origin, overwrite=overwrite) as copy:
-            for name, values in origin.metadata.items():
+            for name, values in origin.records():
                 if name != DIGESTS:
                     copy.writer.add_metadata(name, values)
             if origin.own:
                 told = {"of": path.name, "lost_bytes": str(origin.file.lost_bytes), "damage": "\n".join(damage)}
                 copy.writer.add_metadata(RECOVERED, told)
+            copy.attachments(origin)
             copy_messages(copy, origin, kept, watch)
         saved = Edited(str(out), {n: k for n, k in sorted(origin.counts(kept).items()) if k}, out.stat().st_size)
+        saved.attachments = len(attached)
         lost = list(_by_numbers(origin, kept, out) if origin.own else _by_index(origin, kept))
         return Recovered(saved, origin.file.torn, origin.file.lost_bytes, damage, lost)
 

@@ -20,7 +20,8 @@ class Edited:
 
     `streams`: messages by stream; `span`: first and last stamp of what is not static (ns). `beyond`: messages outside
     of the span that was asked for, which its firings took or made, and `lead` the stamp of the first firing that is
-    repeated for it. `unknown`: operators whose state at the cut is not in the recording. `notes` tell what else is to
+    repeated for it. `attachments`: how many files inside of it.
+    `unknown`: operators whose state at the cut is not in the recording. `notes` tell what else is to
     be known, for people.
     """
 
@@ -32,6 +33,7 @@ class Edited:
     lead: int | None = None
     firings: int = 0
     unknown: tuple[str, ...] = ()
+    attachments: int = 0
     notes: list[str] = field(default_factory=list)
 
     @property

@@ -63,7 +63,7 @@ class LogFeed:
     ) -> None:
         """`numbered` gives the messages their numbers; they keep those that were recorded unless it says otherwise."""
         self.recording, self.emitter = recording, emitter
-        self._ports = ports
+        self._ports, self._start = ports, start
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
         self._streams = {
@@ -81,6 +81,14 @@ class LogFeed:
         self.ended = False
         self.work = Work()
         self.static_digests: dict[str, StreamDigest] = {}
+
+    def span(self) -> tuple[int, int] | None:
+        """The stamps between which it plays; None where it holds none."""
+        firsts = [s.first for name in self._streams if (s := self.recording.streams[name]).first is not None]
+        if not firsts:
+            return None
+        begin = max(min(firsts), min(firsts) if self._start is None else self._start)
+        return begin, max(begin, *(stream.final for stream in self._streams.values()))
 
     def _final(self, name: str, finals: Mapping[str, int], end: int | None) -> int:
         last = self.recording.streams[name].last

@@ -1,25 +1,32 @@
-"""The playback of a recording: paused, stepped, resumed. It decides when messages are given, never which meet."""
+"""The playback of what is not live: paused, stepped, paced. It decides when messages are given, never which meet."""
 
 from __future__ import annotations
 
 from typing import Literal, get_args
 
-Action = Literal["pause", "resume", "toggle", "step"]
+Action = Literal["pause", "resume", "toggle", "step", "speed", "faster", "slower"]
 ACTIONS: tuple[Action, ...] = get_args(Action)
 MOST_STEPS = 1_000_000
+SLOWEST, FASTEST = 1 / 64, 64.0
+"""The ends of what `slower` and `faster` choose; faster than that is as fast as the graph goes."""
 
 
 class Playback:
-    """Decides whether a feed may give its next step (all messages of one stamp)."""
+    """Decides whether a feed may give its next step (all messages of one stamp), and how fast event time passes.
 
-    def __init__(self, *, paused: bool = False) -> None:
+    `speed`: event time against the clock, 1.0 is real time; None: as fast as the graph goes.
+    """
+
+    def __init__(self, *, paused: bool = False, speed: float | None = None) -> None:
         self.paused = paused
+        self.speed = speed
         self._steps = 0
 
-    def do(self, action: Action, steps: int = 1) -> None:
-        """Pauses, resumes, or lets so many steps pass while paused: a step of what plays pauses it.
+    def do(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
+        """Pauses, resumes, changes the speed, or lets so many steps pass while paused: a step of what plays pauses it.
 
-        Raises `ValueError` for an action that is none.
+        `steps` belongs to `step`, `speed` to `speed`. Raises `ValueError` for an action that is none, or a speed that
+        is not above 0.
         """
         match action:
             case "pause":
@@ -32,6 +39,14 @@ class Playback:
             case "step":
                 self.paused = True
                 self._steps = min(self._steps + max(1, steps), MOST_STEPS)
+            case "speed":
+                if speed is not None and not 0 < speed < float("inf"):
+                    raise ValueError(f"a speed of {speed:g}: expected a factor of real time above 0")
+                self.speed = speed
+            case "faster":
+                self.speed = None if self.speed is None or self.speed * 2 > FASTEST else self.speed * 2
+            case "slower":
+                self.speed = 1.0 if self.speed is None else max(self.speed / 2, min(self.speed, SLOWEST))
             case _:
                 raise ValueError(f"{action!r}: expected one of {', '.join(ACTIONS)}")
 

@@ -13,6 +13,8 @@ class Feed(Protocol):
 
     firings: int
     ended: bool
+    last: int
+    """The stamp of the step that was given last; `NEVER` before the first."""
 
     def look_ahead(self) -> int | None:
         """The stamp of the next step, None at the end."""

@@ -23,8 +23,8 @@ class FoxgloveError(RuntimeError):
 class Controls(Protocol):
     """Is moved by the playback bar of Foxglove."""
 
-    def request(self, *, playing: bool, speed: float, seek: int | None) -> None:
-        """The state that a client asks for; `seek`: the stamp to go to."""
+    def request(self, *, playing: bool, speed: float, seek: int | None) -> str | None:
+        """Does what a client asks for; `seek`: the stamp to go to. Returns why it does not, where it does not."""
 
     def state(self) -> tuple[bool, int, float]:
         """Tells whether it plays, the stamp it is at, and its speed."""
@@ -62,7 +62,7 @@ class FoxgloveServer:
                 host=host,
                 port=port,
                 capabilities=capabilities,
-                server_listener=_Listener(self._sdk, self._again, controls),
+                server_listener=_Listener(self._sdk, self._again, controls, self._refuse),
                 context=self._context,
                 playback_time_range=span if controls is not None else None,
                 message_backlog_size=BACKLOG,
@@ -89,6 +89,10 @@ class FoxgloveServer:
     def playback(self, controls: Controls, *, did_seek: bool = False, ended: bool = False) -> None:
         """Tells the clients where the playback is."""
         self._server.broadcast_playback_state(_state(self._sdk, controls, did_seek, ended, ""))
+
+    def _refuse(self, why: str) -> None:
+        """Tells the clients why the playback bar did not do what it was asked for."""
+        self._server.publish_status(why, self._sdk.websocket.StatusLevel.Warning, "playback")
 
     def close(self) -> None:
         self._server.stop()
@@ -120,8 +124,10 @@ class FoxgloveServer:
 class _Listener:
     """Is told by the server, on its threads, what clients do."""
 
-    def __init__(self, sdk: Any, subscribed: Callable[[int], None], controls: Controls | None) -> None:
-        self._sdk, self._subscribed, self._controls = sdk, subscribed, controls
+    def __init__(
+        self, sdk: Any, subscribed: Callable[[int], None], controls: Controls | None, refused: Callable[[str], None]
+    ) -> None:
+        self._sdk, self._subscribed, self._controls, self._refused = sdk, subscribed, controls, refused
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
         self._subscribed(channel.id)
@@ -130,8 +136,11 @@ class _Listener:
         if self._controls is None:
             return None
         playing = request.playback_command == self._sdk.websocket.PlaybackCommand.Play
-        self._controls.request(playing=playing, speed=request.playback_speed, seek=request.seek_time)
-        return _state(self._sdk, self._controls, request.seek_time is not None, False, request.request_id)
+        why = self._controls.request(playing=playing, speed=request.playback_speed, seek=request.seek_time)
+        if why is not None:
+            self._refused(why)
+        moved = request.seek_time is not None and why is None
+        return _state(self._sdk, self._controls, moved, False, request.request_id)
 
 
 def _state(sdk: Any, controls: Controls, did_seek: bool, ended: bool, request: str) -> Any:

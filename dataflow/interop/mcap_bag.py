@@ -23,25 +23,25 @@ class McapBag:
 
     def __init__(self, path: Path, files: Sequence[Path]) -> None:
         self.path = path
-        self._files: list[McapFile] = []
+        self.files: list[McapFile] = []
         try:
             for file in files:
-                self._files.append(McapFile(file))
+                self.files.append(McapFile(file))
             self.topics = self._find()
         except BaseException:
             self.close()
             raise
-        profiles = {f.header.profile for f in self._files} - {""}
+        profiles = {f.header.profile for f in self.files} - {""}
         what = " ROS 2" if profiles == {"ros2"} else " ROS 1" if profiles == {"ros1"} else ""
         self.kind = f"MCAP{what}" + (f", {len(files)} files" if len(files) > 1 else "")
         self.notes = tuple(
-            [f"{f.path.name} has no proper end: its writer died" for f in self._files if f.torn]
-            + [note for f in self._files for note in f.damage]
+            [f"{f.path.name} has no proper end: its writer died" for f in self.files if f.torn]
+            + [note for f in self.files for note in f.damage]
         )
 
     def _find(self) -> Mapping[str, Topic]:
         found: dict[str, Topic] = {}
-        for file in self._files:
+        for file in self.files:
             sizes = file.message_bytes()
             for channel in file.channels.values():
                 if channel.metadata.get("kind") in _OWN:
@@ -91,7 +91,7 @@ class McapBag:
     def messages(self, topics: Collection[str]) -> Iterator[Stored]:
         """Every message of some topics, in the order of log times."""
         counters = {name: count() for name in topics}
-        merged = heapq.merge(*(self._one(file, topics) for file in self._files), key=lambda m: m[0])
+        merged = heapq.merge(*(self._one(file, topics) for file in self.files), key=lambda m: m[0])
         for log_time, name, data in merged:
             yield Stored(name, next(counters[name]), log_time, data)
 
@@ -107,5 +107,5 @@ class McapBag:
 
     def close(self) -> None:
         """Closes the files. Idempotent."""
-        for file in self._files:
+        for file in self.files:
             file.close()

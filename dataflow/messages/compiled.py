@@ -110,7 +110,7 @@ def compile_class(
         "def _arrays(_self):",
         "    _state = _self.__dict__",
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in arrays)})",
-        *_content(scalars, arrays),
+        *_content(names, scalars, arrays),
     ]
     exec(compile("\n".join(text), f"<message {schema!r}>", "exec"), names)
     construct, adopt, digest, header, held, content = (
@@ -215,13 +215,13 @@ def _digest(
         return [*text, f"    return _digest_of(_join(({', '.join(head)})))"]
     text.append(f"    _parts = [{', '.join(head)}]")
     text.append("    _hash = None")
-    for held in arrays:
+    for k, held in enumerate(arrays):
         text += [
             f"    _a = _state[{held.name!r}]",
             "    if _a is None:",
             "        _parts.append(b'\\x00')",
             "    else:",
-            "        _parts += (_dtype(_a.dtype), _shape(_a.shape))",
+            f"        _parts += ({_by_dtype(names, k, held, '_a', _dtype_bytes, '_dtype({})')}, _shape(_a.shape))",
             "        if _a.nbytes <= _small:",
             "            _parts.append(_a.tobytes())",
             "        else:",
@@ -238,13 +238,11 @@ def _digest(
     return text
 
 
-def _content(scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]) -> list[str]:
-    described = [
-        f"(_a{k}.dtype.str, _a{k}.shape), "
-        if not spec.optional
-        else f"None if _a{k} is None else (_a{k}.dtype.str, _a{k}.shape), "
-        for k, spec in enumerate(arrays)
-    ]
+def _content(names: dict[str, Any], scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]) -> list[str]:
+    described = []
+    for k, spec in enumerate(arrays):
+        array = f"({_by_dtype(names, k, spec, f'_a{k}', _dtype_name, '{}.str')}, _a{k}.shape)"
+        described.append(f"None if _a{k} is None else {array}, " if spec.optional else f"{array}, ")
     return [
         "def _content(_self):",
         "    _state = _self.__dict__",
@@ -252,6 +250,17 @@ def _content(scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]) -
         f"    _scalars = ({''.join(f'_state[{f.name!r}], ' for f in scalars)})",
         f"    return (_schema, _scalars, ({''.join(described)})), ({''.join(f'_a{k}, ' for k in range(len(arrays)))})",
     ]
+
+
+def _by_dtype(
+    names: dict[str, Any], k: int, spec: ArrayField, array: str, made: Callable[[np.dtype[Any]], Any], other: str
+) -> str:
+    """An expression for what `made` gives for the array's dtype: made beforehand for the first that is declared, by
+    the expression `other` of the dtype for any other."""
+    dtype = np.dtype(spec.dtypes[0].str)  # the one object that numpy has for it
+    names[f"_type{k}_0"] = dtype
+    names[f"{made.__name__}{k}"] = made(dtype)
+    return f"({made.__name__}{k} if {array}.dtype is _type{k}_0 else {other.format(f'{array}.dtype')})"
 
 
 def _updated(hasher: Any, data: bytes) -> Any:
@@ -318,6 +327,10 @@ def _parallel(arrays: tuple[ArrayField, ...], given: list[str], k: int) -> list[
     ]
     conditions += [f"_e{k}[{i}] == _e{k}[{j}]" for i, one in own for j, other in own if i < j and one == other]
     return conditions
+
+
+def _dtype_name(dtype: np.dtype[Any]) -> str:
+    return dtype.str
 
 
 @lru_cache(maxsize=64)

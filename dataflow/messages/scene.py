@@ -126,7 +126,8 @@ class FeatureVector(Message):
     ids: I64 | None = array("int64", "N", "what each vector belongs to: detection, track or node id", default=None)
 
     def validate(self) -> None:
-        parallel(self, "labels", len(self.vectors), "vectors", empty=True)
+        if self.labels:
+            parallel(self, "labels", len(self.vectors), "vectors")
 
     @property
     def count(self) -> int:

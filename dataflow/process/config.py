@@ -24,13 +24,13 @@ class ProcessConfig:
 
     `publish` maps the local streams that other processes take (firing records included) to how many take them;
     `subscribe` are the remote ones taken here. `listen` are the endpoints at which programs from outside reach it.
-    `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `firings`:
-    whether a recorder takes the firing records. `live`: sources do not wait for the graph, and operators not for their
-    inputs. `resume` is given to a process that takes the place of one that died: for each operator, where it had got
-    to (`Resumed`, as plain values). `warm`: the recording and the stamp from which on it is replayed, with the
-    operators' states of that moment. `rings_out` and `rings_in`: for each link to and from another process the keys of
-    its channels, after whether messages may be dropped for a consumer that takes nothing; their descriptors were handed
-    down in this order.
+    `replay` names a recording and the streams that stand in for sources. `window` is (messages, bytes). `paused`: its
+    sources wait until they are let go on. `firings`: whether a recorder takes the firing records. `live`: sources do
+    not wait for the graph, and operators not for their inputs. `resume` is given to a process that takes the place of
+    one that died: for each operator, where it had got to (`Resumed`, as plain values). `warm`: the recording and the
+    stamp from which on it is replayed, with the operators' states of that moment. `rings_out` and `rings_in`: for each
+    link to and from another process the keys of its channels, after whether messages may be dropped for a consumer that
+    takes nothing; their descriptors were handed down in this order.
     `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
@@ -43,6 +43,7 @@ class ProcessConfig:
     replay: dict[str, Any] | None = None
     window: tuple[int, int] = (256, 64 << 20)
     rate: float | None = None
+    paused: bool = False
     paranoid: bool = False
     firings: bool = False
     live: bool = False

@@ -6,6 +6,7 @@ from dataflow.feeds.log import LogFeed
 from dataflow.feeds.playback import Action, Playback
 from dataflow.feeds.window import Feed, Window
 from dataflow.process.pace import Pace
+from dataflow.sync import NEVER
 
 PROMISE_EVERY = 8
 """Steps after which a frontier is sent on streams that had no message."""
@@ -14,9 +15,9 @@ PROMISE_EVERY = 8
 class Feeding:
     """Of several feeds, the oldest step first, as far as the window and the pace allow."""
 
-    def __init__(self, window: Window, pace: Pace) -> None:
+    def __init__(self, window: Window, pace: Pace, *, paused: bool = False, speed: float | None = None) -> None:
         self.feeds: list[Feed] = []
-        self.playback = Playback()
+        self.playback = Playback(paused=paused, speed=speed)
         self._window, self._pace = window, pace
         self._since_promise = 0
 
@@ -55,12 +56,24 @@ class Feeding:
             feed.finish("end of source")
         return True
 
-    def play(self, action: Action, steps: int = 1) -> None:
-        """Pauses, resumes or steps; the clock goes on from where it stopped. Raises `ValueError`."""
-        was_paused = self.playback.paused
-        self.playback.do(action, steps)
-        if was_paused and not self.playback.paused and (due := self._oldest()) is not None:
-            self._pace.put(due[0])
+    def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
+        """Pauses, resumes, steps, changes the speed; the clock goes on from where it stopped. Raises `ValueError`."""
+        was_paused, was_speed = self.playback.paused, self.playback.speed
+        self.playback.do(action, steps, speed)
+        resumed = was_paused and not self.playback.paused
+        if not resumed and self.playback.speed == was_speed:
+            return
+        if (due := self._oldest()) is not None:
+            if self.playback.speed != was_speed:
+                self._pace.change(self.playback.speed, due[0])
+            if resumed:
+                self._pace.put(due[0])
+
+    @property
+    def last(self) -> int | None:
+        """The stamp that was given last; None before the first."""
+        last = max((feed.last for feed in self.feeds), default=NEVER)
+        return None if last == NEVER else last
 
     def promise(self) -> None:
         """Sends the frontiers of streams which had no message of late."""

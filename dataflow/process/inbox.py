@@ -2,6 +2,7 @@
 
 One thread takes, any may put. Whoever waits here waits for one eventfd: the writers of the rings, the readers of the
 rings that this process writes to (when they were full and have room again) and its own threads all wake it by that.
+What wakes is that the eventfd is written to (an edge), so nobody reads it.
 
 The thread that takes has the *turn*: it alone touches what the process has. While it waits for want of anything to do,
 another thread may have the turn for a moment, and do what it would else have to wake that one for.
@@ -36,8 +37,8 @@ class Inbox:
         self._asleep = False
         self._turn = threading.Lock()
         self._turn.acquire()
-        self._poll = select.poll()
-        self._poll.register(self.wake, select.POLLIN)
+        self._poll = select.epoll()
+        self._poll.register(self.wake, select.EPOLLIN | select.EPOLLET)
 
     def put(self, item: Item) -> None:
         """Appends an item; on any thread."""
@@ -47,7 +48,7 @@ class Inbox:
 
     def take_turn(self) -> bool:
         """Takes the turn until `give_turn`, on any thread, if the one that has it waits and nothing is there for it."""
-        if not self._asleep or not self._turn.acquire(blocking=False):
+        if not self._asleep or not self._turn.acquire(False):
             return False
         if self._items:
             self._turn.release()
@@ -71,11 +72,9 @@ class Inbox:
         if not self._items and not sum(not ring.sleep() for ring in self._incoming):
             self._turn.release()
             try:
-                woken = self._poll.poll(timeout * 1000)
+                self._poll.poll(timeout)
             finally:
                 self._turn.acquire()
-            if woken:
-                self._forget_wakes()
         self._asleep = False
         for ring in self._incoming:
             ring.awake()
@@ -102,9 +101,3 @@ class Inbox:
             "received_bytes": sum(ring.nbytes for ring in self._incoming),
             "unresolved": sum(ring.unresolved for ring in self._incoming),
         }
-
-    def _forget_wakes(self) -> None:
-        try:
-            os.eventfd_read(self.wake)
-        except BlockingIOError:
-            return

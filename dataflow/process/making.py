@@ -26,8 +26,6 @@ def make_operators(process: OperatorProcess) -> None:
     log = make_log(process.graph, process.config, process.outlet)
     if log is not None:
         process.feeding.feeds.append(log)
-        if process.config.replay is not None and process.config.replay["paused"]:
-            process.feeding.playback.do("pause")
 
 
 def _make(process: OperatorProcess, node: Node) -> None:

@@ -67,7 +67,7 @@ class OperatorProcess:
         self.window = Window(*config.window)
         self.backlog = Window(*(most * times for most, times in zip(config.window, BACKLOG, strict=True)))
         self.runners = Runners()
-        self.feeding = Feeding(self.window, self.pace)
+        self.feeding = Feeding(self.window, self.pace, paused=config.paused, speed=config.rate)
         self.live = LiveSources(
             inbox,
             channel,

@@ -62,7 +62,7 @@ class Orders:
             case "poll":
                 self.asked = fields["round"]
             case "playback":
-                process.feeding.play(fields["action"], fields["steps"])
+                process.requests.play(fields["action"], fields["steps"], fields["speed"])
             case "stop":
                 self.stopping = True
                 process.feeding.finish("interrupted")

@@ -91,6 +91,8 @@ class Outlet:
         self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
         self._publishers: Mapping[str, StreamPublisher] = {}
         self._logs: dict[str, list[FiringRecord]] = {}
+        self._unnoted: FiringRecord | None = None
+        """The last record, where it is kept and not yet in its batch."""
         self._flushed = time.monotonic()
 
     def open(self, network: Network) -> None:
@@ -191,6 +193,7 @@ class Outlet:
         envelope = Envelope(_MESSAGE, stream, entry.incarnation, entry.seq, entry.stamp, message, "", time.time_ns())
         if plain and stream not in self._static:
             self.sent += self._fanout.send(stream, encode_parts(envelope), envelope)
+            self._note_last()
             return
         if stream in self._static:
             self._once[stream] = [envelope]
@@ -229,9 +232,23 @@ class Outlet:
         return Envelope(kind, stream, incarnation, seq, stamp, reason=reason)
 
     def record(self, record: FiringRecord) -> None:
+        """Keeps a record where it survives this process, ahead of the messages of its firing. What else is done with
+        the record of a firing follows its first message, which need not wait for that."""
+        self._note_last()
+        if self._box is not None:
+            self._box.keep(record)
+        self._unnoted = record
+        if record.kind not in ("fire", "tick"):
+            self._note_last()
+
+    def _note_last(self) -> None:
+        """Gives the last record to the recorder's batch, and to those who ask for latencies."""
+        record, self._unnoted = self._unnoted, None
+        if record is None:
+            return
+        if self._box is not None:
+            self._box.note(record)
         self.recent.add(record)
-        if self._box is not None:  # ahead of its messages, to where it survives this process
-            self._box.add(record)
         if self._firings:
             log = self._logs.setdefault(record.operator, [])
             if log and log[-1].incarnation != record.incarnation:
@@ -241,6 +258,7 @@ class Outlet:
                 self.flush(record.operator, last=record.kind == "finish")
 
     def flush(self, operator: str, *, last: bool = False) -> None:
+        self._note_last()
         log = self._logs.get(operator)
         if log:
             self._send_records(operator, encode_batch(log, last=last))
@@ -248,11 +266,13 @@ class Outlet:
 
     def flush_due(self) -> None:
         """Sends the batches that have waited long enough."""
+        self._note_last()
         if time.monotonic() - self._flushed >= BATCH_SECONDS:
             self.flush_all()
 
     def flush_all(self) -> None:
         self._flushed = time.monotonic()
+        self._note_last()
         for operator in self._logs:
             self.flush(operator)
 

@@ -34,6 +34,13 @@ class Pace:
         if self._began is not None:
             self._began = (stamp, time.time())
 
+    def change(self, rate: float | None, due: int) -> None:
+        """Goes on at another rate, from the event time of now, at the latest that of the next step, `due` (ns); from
+        there where nothing waited for the clock so far."""
+        place = due if self._began is None else min(self.event_time(), due)
+        self._rate, self._began = rate, None
+        self.begin(place, time.time())
+
     def event_time(self) -> int:
         """Event time now: the clock's own, or, where sources are held to the clock, as far as they have been let."""
         if self._began is None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import msgpack
 
+from dataflow.feeds.playback import Action
 from dataflow.firing.source import SourceRunner
 from dataflow.messages.base import MessageError
 from dataflow.operator import ParameterError, is_live
@@ -20,11 +21,12 @@ from dataflow.process.progress import Progress
 from dataflow.process.recent import RecentFirings
 from dataflow.process.runners import Maker, Runners
 from dataflow.remote import Remote
-from dataflow.sync import NEVER
 from dataflow.transport import Bus
 from dataflow.transport.codec import decode
 from dataflow.transport.envelope import DecodeError
 from dataflow.transport.keys import runtime_key
+
+LIVE = "it is a live run: devices and the clock wait for nobody; what runs without --live, and replays, can be paused"
 
 
 class Requests:
@@ -55,8 +57,16 @@ class Requests:
                 bus.serve(runtime_key(namespace, "pub", name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
         bus.serve(runtime_key(namespace, "trigger", self._config.label), self._answer_trigger)
-        if self._config.replay is not None:
+        if self._feeding.feeds or self._runners.sources:
             bus.serve(runtime_key(namespace, "playback"), _to_inbox(inbox, "", "playback"))
+
+    def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
+        """Pauses, resumes, steps, or changes the speed, and tells the supervisor. Raises `ValueError`."""
+        if not self._feeding.feeds:
+            return
+        self._feeding.play(action, steps, speed)
+        playback = self._feeding.playback
+        self._channel.send("playback", paused=playback.paused, speed=playback.speed)
 
     def answer_parameter(self, name: str, query: Any) -> None:
         """Answers a request to change a parameter with the value as validated, or with an error.
@@ -73,18 +83,30 @@ class Requests:
             query.reply(query.key_expr, msgpack.packb(answer))
 
     def answer_playback(self, query: Any) -> None:
-        """Answers a request to pause, resume or step what is replayed; one without an action asks how it stands."""
+        """Answers a request to pause, resume, step, or change the speed of what this process reads; one without an
+        action asks how it stands."""
         with query:
             feeding = self._feeding
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
+                if self._config.live:
+                    raise ValueError(LIVE)
                 if "action" in asked:
-                    feeding.play(asked["action"], int(asked.get("steps", 1)))
-                answer: dict[str, Any] = {"ok": True, "paused": feeding.playback.paused, "ended": feeding.ended}
+                    speed = asked.get("speed")
+                    self.play(asked["action"], int(asked.get("steps", 1)), None if speed is None else float(speed))
+                playback = feeding.playback
+                answer: dict[str, Any] = {"ok": True, "paused": playback.paused, "ended": feeding.ended}
+                answer |= {"speed": playback.speed, "stamp": feeding.last, "replay": self._replayed()}
             except (KeyError, TypeError, ValueError, AttributeError, msgpack.UnpackException) as error:
                 answer = {"ok": False, "error": str(error)}
-            stamps = [log.last for log in feeding.logs if log.last != NEVER]
-            query.reply(query.key_expr, msgpack.packb(answer | {"stamp": max(stamps, default=None)}))
+            query.reply(query.key_expr, msgpack.packb(answer))
+
+    def _replayed(self) -> dict[str, Any] | None:
+        """Tells from when to when a recording is played, and the stamp that `--start` counts from."""
+        spans = [span for log in self._feeding.logs if (span := log.span()) is not None]
+        if self._config.replay is None or not spans:
+            return None
+        return {"span": list(spans[0]), "first": self._config.replay["first"]}
 
     def answer_publication(self, maker: SourceRunner, query: Any) -> None:
         """Takes an envelope from outside for a source that is made for it; on Zenoh's thread.

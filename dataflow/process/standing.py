@@ -42,7 +42,7 @@ class Standing:
             full=process.feeding.full,
             waiting=process.progress.waiting(),
             due=process.feeding.next_due(),
-            **({"paused": process.feeding.playback.paused} if process.feeding.logs else {}),
+            **({"paused": process.feeding.playback.paused} if process.feeding.feeds else {}),
         )
 
     def _waits_for_clock(self) -> bool:

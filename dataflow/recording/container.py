@@ -20,6 +20,7 @@ from pathlib import Path
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import (
+    AttachmentIndex,
     Channel,
     ChunkIndex,
     DataEnd,
@@ -33,6 +34,7 @@ from mcap.records import (
     SummaryOffset,
 )
 
+from dataflow.recording.attachments import Attachment, Place
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.packing import MAX_CHUNK_BYTES, Buffer, Compression, Gathered, Packer, message_size
 from dataflow.recording.seals import sealed
@@ -96,6 +98,7 @@ class ContainerWriter:
         self._counts: dict[int, int] = {}
         self._chunks = _ChunkIndexes()
         self._metadata: list[MetadataIndex] = []
+        self._attachments: list[AttachmentIndex] = []
         self._records: Gathered | None = None
         self._messages: Gathered | None = None
         self.first_time: int | None = None
@@ -163,6 +166,13 @@ class ContainerWriter:
         offset = self._position
         self._append(record)
         self._metadata.append(MetadataIndex(offset=offset, length=len(record), name=name))
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Adds a file inside this one; its record has a checksum of its own."""
+        record = record_bytes(attachment.record())
+        place = Place(self._position, len(record))
+        self._append(record)
+        self._attachments.append(attachment.index(place))
 
     def add_messages(self, group: Sequence[tuple[int, int, int, Sequence[Buffer]]]) -> None:
         """Adds messages, each (channel, log time, sequence, parts of its data), that must not be torn apart.
@@ -304,6 +314,7 @@ class ContainerWriter:
             (Opcode.CHANNEL, _joined(self._channels)),
             (Opcode.STATISTICS, _joined([self._statistics()])),
             (Opcode.CHUNK_INDEX, self._chunks.records),
+            (Opcode.ATTACHMENT_INDEX, _joined(self._attachments)),
             (Opcode.METADATA_INDEX, _joined(self._metadata)),
         ]
         summary = bytearray()
@@ -325,7 +336,7 @@ class ContainerWriter:
 
     def _statistics(self) -> Statistics:
         return Statistics(
-            attachment_count=0,
+            attachment_count=len(self._attachments),
             channel_count=len(self._channels),
             channel_message_counts={c: n for c, n in self._counts.items() if n},
             chunk_count=self._chunks.count,

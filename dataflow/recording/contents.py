@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, Schema
 
+from dataflow.recording.attachments import Place
 from dataflow.recording.chunks import ChunkRef, Chunks
 from dataflow.recording.rawfile import RECORD, RawFile
 
@@ -71,6 +72,7 @@ class Contents:
         self.schemas: dict[int, Schema] = {}
         self.channels: dict[int, Channel] = {}
         self.metadata: list[tuple[str, dict[str, str]]] = []
+        self.attachments: list[Place] = []
         self.chunks = Chunks(file)
         self.damage: list[str] = []
         self.loose_bytes: dict[int, int] = {}
@@ -115,6 +117,11 @@ class Contents:
         self.count_parsed(offset)
         record = self.file.parse(Metadata, body, offset)
         self.metadata.append((record.name, record.metadata))
+
+    def add_attachment(self, place: Place) -> None:
+        """Takes the place of an attachment, which is not read."""
+        self.count_parsed(place.offset)
+        self.attachments.append(place)
 
     def add_loose_message(self, offset: int, length: int) -> None:
         """Takes a message that lies outside chunks, its body of `length` bytes."""

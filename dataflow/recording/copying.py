@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import repeat
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import numpy as np
 import numpy.typing as npt
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 from mcap.records import Channel
 
 from dataflow.messages import Odometry, Transforms
@@ -92,13 +91,9 @@ class Origin:
         times = [t for t in times if len(t)]
         return (min(int(t.min()) for t in times), max(int(t.max()) for t in times)) if times else None
 
-    def attachments(self) -> int:
-        """Counts the attachments that the file's summary tells of: they are not copied."""
-        with self.path.open("rb") as file, contextlib.suppress(McapError):
-            summary = make_reader(file).get_summary()
-            if summary is not None and summary.statistics is not None:
-                return int(summary.statistics.attachment_count)
-        return 0
+    def records(self) -> list[tuple[str, dict[str, str]]]:
+        """The metadata records: another program's as they stand, ours with the latest of each name and key."""
+        return list(self.metadata.items()) if self.own else self.file.metadata
 
     def close(self) -> None:
         """Closes the file. Idempotent."""
@@ -142,6 +137,7 @@ class Copy:
         self._channels: dict[tuple[int, int], int] = {}
         self._alike: dict[tuple[object, ...], list[tuple[int, int]]] = {}
         self._frames: tuple[int, int] | None = None
+        self.attached = 0
 
     def channel(self, origin: Origin, channel: int, topic: str | None = None) -> int:
         """The id in this file of a channel of `origin`, which is declared when it is first asked for.
@@ -168,6 +164,16 @@ class Copy:
         """A new channel for the firing records of one operator."""
         metadata = {"kind": str(Kind.FIRINGS), "operator": operator}
         return self.writer.add_channel(firings_topic(namespace, operator), "msgpack", 0, metadata)
+
+    def attachments(self, origin: Origin, names: Sequence[str | None] | None = None) -> int:
+        """Takes over the attachments of `origin`, under other names where `names` says so (None: not); how many."""
+        before = self.attached
+        for place, name in zip(origin.file.attachments, names or repeat(""), strict=False):
+            if name is not None:
+                found = origin.file.attachment(place)
+                self.writer.add_attachment(replace(found, name=name) if name else found)
+                self.attached += 1
+        return self.attached - before
 
     def message(self, channel: int, raw: RawMessage) -> None:
         """Adds a message of a stream."""

@@ -6,6 +6,8 @@ The index takes 24 bytes of memory a message, whatever the messages hold.
 from __future__ import annotations
 
 import struct
+from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,6 +16,7 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 from mcap.records import Header
 
+from dataflow.recording.attachments import Attachment, Place, read_attachment
 from dataflow.recording.container import MAGIC
 from dataflow.recording.contents import UNCHUNKED, Contents, Entries, signed
 from dataflow.recording.errors import DamagedError, RecordingError
@@ -64,6 +67,7 @@ class McapFile:
             raise
         self.schemas, self.channels = contents.schemas, contents.channels
         self.metadata = contents.metadata
+        self._attachments = contents.attachments
         self.entries: dict[int, Entries] = contents.entries()
         self._chunks = contents.chunks
         self._loose_bytes = contents.loose_bytes
@@ -90,6 +94,23 @@ class McapFile:
                 chunk, offset, f"a message of channel {found} at {time}, not of channel {channel} at {log_time}"
             )
         return RawMessage(channel, sequence, log_time, data[start + _MESSAGE.size : end], published)
+
+    @cached_property
+    def attachments(self) -> Sequence[Place]:
+        """The attachments that can be read, in file order; those that cannot are noted in `damage`. Reads all of
+        them."""
+        sound = []
+        for place in sorted(self._attachments, key=lambda p: p.offset):
+            try:
+                read_attachment(self._file, place)
+                sound.append(place)
+            except DamagedError as error:
+                self.damage.append(f"{error.what}; it is left out")
+        return sound
+
+    def attachment(self, place: Place) -> Attachment:
+        """The attachment at a place. Raises `DamagedError`."""
+        return read_attachment(self._file, place)
 
     def message_bytes(self) -> dict[int, int]:
         """Bytes of message data by channel, before compression. Exact where chunks hold nothing but messages."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from mcap.opcode import Opcode
 
+from dataflow.recording.attachments import Place
 from dataflow.recording.chunks import CHUNK_HEAD, ChunkRef, size_in_head
 from dataflow.recording.container import MAGIC
 from dataflow.recording.contents import MESSAGE_BODY, Contents
@@ -73,6 +74,8 @@ class Scan:
                 body = self._body(at, length)
                 if body is not None:
                     self.contents.add_metadata(body, at)
+            case Opcode.ATTACHMENT:
+                self.contents.add_attachment(Place(at, RECORD.size + length))
             case Opcode.MESSAGE if not self._sealed:
                 if length < MESSAGE_BODY.size:
                     raise self._file.damaged(f"the message at byte {at} is too short")

@@ -7,8 +7,9 @@ import zlib
 from dataclasses import dataclass
 
 from mcap.opcode import Opcode
-from mcap.records import ChunkIndex, MetadataIndex, Statistics
+from mcap.records import AttachmentIndex, ChunkIndex, MetadataIndex, Statistics
 
+from dataflow.recording.attachments import Place
 from dataflow.recording.chunks import ChunkRef
 from dataflow.recording.container import MAGIC
 from dataflow.recording.contents import Contents
@@ -71,6 +72,9 @@ def read_summary(file: RawFile, footer: Footer, *, sealed: bool) -> Contents | N
             case Opcode.METADATA_INDEX:
                 contents.count_parsed(at)
                 metadata.append(file.parse(MetadataIndex, body, at))
+            case Opcode.ATTACHMENT_INDEX:
+                index = file.parse(AttachmentIndex, body, at)
+                contents.add_attachment(Place(index.offset, index.length))
             case Opcode.STATISTICS:
                 statistics = file.parse(Statistics, body, at)
         position += RECORD.size + length
@@ -159,8 +163,12 @@ def _message_indexes(file: RawFile, start: int, index: ChunkIndex, sealed: bool)
 
 def _compare(contents: Contents, statistics: Statistics | None) -> None:
     """Raises `DamagedError` where the statistics count other messages than the index."""
-    if statistics is None or not statistics.channel_message_counts:
+    if statistics is None:
         return
+    if statistics.attachment_count > len(contents.attachments):
+        contents.damage.append(
+            f"its statistics count {statistics.attachment_count} attachments, its index {len(contents.attachments)}"
+        )
     found = contents.counts()
     for channel, count in statistics.channel_message_counts.items():
         if found.get(channel, 0) != count:

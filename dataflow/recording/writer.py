@@ -12,6 +12,7 @@ from typing import Any, Self
 from dataflow.messages import Transforms
 from dataflow.messages.base import Message
 from dataflow.messages.digest import StreamDigest
+from dataflow.recording.attachments import Attachment
 from dataflow.recording.codecs import Codec, SchemaText, codec_for, declaration_metadata
 from dataflow.recording.container import CHUNK_BYTES, CHUNK_SECONDS, ContainerWriter
 from dataflow.recording.errors import RecordingError
@@ -232,6 +233,10 @@ class RecordingWriter:
         if name in RESERVED_METADATA:
             raise RecordingError(f"{self.path}: metadata {name!r} is written by the recording itself; use another name")
         self._file.add_metadata(name, mapping)
+
+    def add_attachment(self, attachment: Attachment) -> None:
+        """Adds a file inside the recording."""
+        self._file.add_attachment(attachment)
 
     def digests(self) -> Mapping[str, str]:
         """Stream digest of everything written so far, by stream."""

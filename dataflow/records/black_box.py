@@ -72,11 +72,19 @@ class BlackBox:
         self._begin(0, generation=1, least=0)
 
     def add(self, record: FiringRecord) -> None:
-        """Keeps a record; to be called before the messages of its firing are sent."""
+        """Keeps a record, and notes where its operator has got to."""
+        self.keep(record)
+        self.note(record)
+
+    def keep(self, record: FiringRecord) -> None:
+        """Keeps a record; to be called before the messages of its firing are sent. `note` follows before the next."""
         data = encode_single(record)
         if self._length + _FRAME.size + len(data) > self._room:
             self._begin(1 - self._active, self._words[4 * self._active + _GENERATION] + 1, least=len(data))
         self._append(_RECORD, data)
+
+    def note(self, record: FiringRecord) -> None:
+        """Notes where an operator has got to by a record that is kept: the next checkpoint says so."""
         self._reached[record.operator].take(record, self._ports[record.operator])
 
     def kept(self, operator: str) -> list[FiringRecord]:

@@ -69,6 +69,7 @@ def _operators(
         "replay": _log(plan) if process.has_log else None,
         "window": list(plan.window),
         "rate": 1.0 if plan.live and plan.rate is None else plan.rate,
+        "paused": plan.paused,
         "paranoid": plan.paranoid,
         "firings": plan.keeps_records,
         "snapshots": plan.graph.record.snapshots,
@@ -83,10 +84,10 @@ def _log(plan: RunPlan) -> dict[str, Any]:
         "path": str(log.path),
         "streams": list(log.streams),
         "finals": dict(log.finals),
+        "first": log.first,
         "start": log.start,
         "end": log.end,
         "bag": log.bag,
-        "paused": plan.paused,
     }
 
 

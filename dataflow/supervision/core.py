@@ -76,9 +76,9 @@ class Core:
                 self._tick()
             case StopAsked():
                 self._stop()
-            case PlaybackAsked(action, steps):
-                if self._closing is None and self.run.phase is not Phase.STARTING:
-                    self.run.send_all("playback", action=action, steps=steps)
+            case PlaybackAsked(action, steps, speed):
+                if self._closing is None and self.run.phase is not Phase.STARTING and not self.run.plan.live:
+                    self.run.send_all("playback", action=action, steps=steps, speed=speed)
             case Aborted(why, interrupted):
                 raise RunFailed(why, interrupted=interrupted)
             case Said(label, kind, fields):

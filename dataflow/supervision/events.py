@@ -36,10 +36,11 @@ class StopAsked:
 
 @dataclass(frozen=True, slots=True)
 class PlaybackAsked:
-    """The user asks to pause, resume or step what is replayed."""
+    """The user asks to pause, resume, step what is not live, or to change its speed."""
 
     action: Action
     steps: int = 1
+    speed: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,12 +27,14 @@ VIEWER_FILE = "@view"
 class LogPlan:
     """Recorded streams that stand in for sources: stream names, the stamps they ended with, and the span (ns).
 
-    `bag`: how the bag of another system is opened as such streams; None for a recording.
+    `first`: the stamp that `--start` counts from. `bag`: how the bag of another system is opened as such streams; None
+    for a recording.
     """
 
     path: Path
     streams: tuple[str, ...]
     finals: Mapping[str, int] = field(default_factory=dict)
+    first: int = 0
     start: int | None = None
     end: int | None = None
     bag: Mapping[str, Any] | None = None
@@ -51,7 +53,8 @@ class RunPlan:
       `live:` policies apply.
     - `faults`: what is to go wrong on purpose, by time (live runs only).
     - `rate`: pace of event time against the clock (1.0 is real time); None: as fast as the graph goes.
-    - `paused`: a replay waits at its beginning until it is let go on, or step by step.
+    - `paused`: sources, or the recording in their place, wait at their beginning until they are let go on, or step
+      by step (no live run).
     - `window`: messages and bytes that feeds may be ahead of the graph.
     - `paranoid`: re-digest inputs after each firing to catch operators that write into them.
     - `start_timeout`, `stall_timeout`: seconds allowed for all processes to become ready, and without any progress.

@@ -56,6 +56,7 @@ def plan_replay(
         Path(recording.path),
         tuple(sorted(streams)),
         finals=final_stamps(recording, streams),
+        first=first,
         start=None if start is None else first + round(start * 1e9),
         end=None if end is None else first + round(end * 1e9),
         bag=recording.opening(),

@@ -59,7 +59,9 @@ class Status:
     behind: dict[str, float] = field(default_factory=dict)
     """Seconds by which each source of a live run is behind the clock."""
     paused: bool = False
-    """A replay waits until it is let go on."""
+    """Sources, or the recording in their place, wait until they are let go on."""
+    speed: float | None = None
+    """Event time against the clock, as it was last asked for while it runs; None: nobody has, or as fast as it goes."""
 
     @property
     def covered(self) -> int:

@@ -29,9 +29,17 @@ Controls = Callable[[Supervisor], AbstractContextManager[None]]
 """Steers a run while it lasts."""
 
 
-def run(graph: Graph, *, watch: Watch | None = None, early: EarlyNursery | None = None, **options: Any) -> RunReport:
-    """Runs a graph's own sources. Options are the fields of `RunPlan`. Raises `RunFailed`."""
-    return execute(RunPlan(graph, **options), mode="run", watch=watch, early=early)
+def run(
+    graph: Graph,
+    *,
+    watch: Watch | None = None,
+    early: EarlyNursery | None = None,
+    controls: Controls | None = None,
+    **options: Any,
+) -> RunReport:
+    """Runs a graph's own sources. `controls` may pause and step them, unless the run is live. Further options are the
+    fields of `RunPlan`. Raises `RunFailed`."""
+    return execute(RunPlan(graph, **options), mode="run", watch=watch, early=early, controls=controls)
 
 
 def replay(

@@ -36,8 +36,10 @@ class StallWatch(Part):
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         if kind in ("progress", "ended") or fields.get("paused"):
             self._heard = self.run.steady
-        if kind == "state" and "paused" in fields:
+        if "paused" in fields:
             self.run.status.paused = fields["paused"]
+        if kind == "playback":
+            self.run.status.speed = fields["speed"]
 
     def tick(self) -> None:
         timeout = self.run.plan.stall_timeout

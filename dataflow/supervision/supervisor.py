@@ -81,9 +81,9 @@ class Supervisor:
         with contextlib.suppress(BlockingIOError, OSError):  # full: it will wake up; closed: it is over
             os.write(self._waking, b"!")
 
-    def play(self, action: Action, steps: int = 1) -> None:
-        """Pauses, resumes or steps what is replayed; on any thread."""
-        self._asked.append(events.PlaybackAsked(action, steps))
+    def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
+        """Pauses, resumes, steps what is not live, or changes its speed; on any thread."""
+        self._asked.append(events.PlaybackAsked(action, steps, speed))
         with contextlib.suppress(BlockingIOError, OSError):
             os.write(self._waking, b"!")
 

@@ -67,14 +67,17 @@ class Fanout:
         droppable: bool,
     ) -> None:
         pool = self._pool = self._pool or SharedPool(self._pool_bytes)
-        present = [(link, channel) for link, channel in takers if link.present()]
-        able = [(link, channel) for link, channel in present if not droppable or link.may_borrow(size, pool.free)]
-        for link, _ in present:
-            if all(link is not each for each, _ in able):
+        able = []
+        for link, channel in takers:
+            if not link.present():
+                continue
+            if droppable and not link.may_borrow(size, pool.free):
                 link.refuse()
+            else:
+                able.append((link, channel))
         if not able:
             return
-        block = pool.write(parts, size, tuple(link.claim for link, _ in able))
+        block = pool.write(parts, size, tuple([link.claim for link, _ in able]))
         if block is None:
             self._full += 1
             for link, channel in able:

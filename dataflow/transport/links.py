@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from dataflow.transport.envelope import Buffer, DecodeError, Kind
+from dataflow.transport.envelope import Buffer, DecodeError
 from dataflow.transport.pool import Block
 from dataflow.transport.ring import READERS, RingReader, RingWriter
 from dataflow.transport.shared import (
@@ -31,7 +31,6 @@ _FIRST, _LAST = 1 << 31, 1 << 30
 _WHOLE = _FIRST | _LAST
 _CHANNEL = _LAST - 1
 _AT_ONCE = 1024
-_REFERENCE = bytes([Kind.REFERENCE])
 STILL = 0.3
 
 
@@ -229,7 +228,7 @@ class Incoming:
                     continue
                 content = whole
             payload: Buffer = content
-            if content[5:6] == _REFERENCE and is_reference(content):
+            if is_reference(content):
                 payload = self._resolved(content)
             self.messages += 1
             self.nbytes += len(payload)

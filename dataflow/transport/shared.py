@@ -12,10 +12,12 @@ import fcntl
 import mmap
 import os
 import weakref
+from functools import partial
 from typing import Any, Final
 
 import msgpack
 import numpy as np
+import numpy.typing as npt
 
 from dataflow.transport.envelope import MAGIC, PRELUDE, DecodeError, Kind
 
@@ -26,6 +28,7 @@ SLOTS: Final = 4096
 BOARD_BYTES: Final = 8 * (SLOTS + 1)
 _SEAL_FUTURE_WRITE: Final = 0x0010  # Linux 5.1; not in Python 3.11's fcntl
 POOL_NAME: Final = "dataflow-pool-"
+_REFERENCE: Final = bytes([Kind.REFERENCE])
 
 
 class SharedMemoryError(RuntimeError):
@@ -78,6 +81,14 @@ def make_board() -> int:
     return descriptor
 
 
+class _Lent(weakref.ref["npt.NDArray[np.uint8]"]):
+    """Refers to a block in use. (`weakref.finalize` costs as much as decoding the message.)"""
+
+    __slots__ = ("of",)
+    of: tuple[int, int, int]
+    """Base of the pool, slot, generation."""
+
+
 class Board:
     """Holds what the consumer at the end of a link has released. Written here only, read by the producer."""
 
@@ -86,12 +97,26 @@ class Board:
         self._cells = memoryview(mmap.mmap(descriptor, BOARD_BYTES)).cast("Q")
         self._base = 0
         self._pool: mmap.mmap | None = None
+        self._lent: dict[int, _Lent] = {}
+
+    def pool(self, base: int) -> mmap.mmap | None:
+        """Returns the pool whose generations begin at `base`, if that is the one in use."""
+        return self._pool if base == self._base else None
 
     def use(self, pool: mmap.mmap, base: int) -> None:
         """Notes that the pool whose generations begin at `base` is mapped, and keeps it so; an earlier one is over."""
-        if base != self._base:
-            self._pool = pool
-            self._base = self._cells[SLOTS] = base
+        self._pool = pool
+        self._base = self._cells[SLOTS] = base
+
+    def lend(self, block: npt.NDArray[np.uint8], base: int, slot: int, generation: int) -> None:
+        """Has a block released when the last view of it is gone."""
+        lent = _Lent(block, self._take_back)
+        lent.of = base, slot, generation
+        self._lent[id(lent)] = lent  # a reference that is gone itself calls nobody
+
+    def _take_back(self, lent: _Lent) -> None:
+        del self._lent[id(lent)]
+        self.release(*lent.of)
 
     def release(self, base: int, slot: int, generation: int) -> None:
         if base == self._base:
@@ -115,14 +140,16 @@ class PoolReader:
         mapped and `DecodeError` for what is no reference.
         """
         _, _, _, head_bytes, body_bytes = PRELUDE.unpack_from(payload)
-        fields = _reference(payload[PRELUDE.size + head_bytes :], body_bytes)
+        fields = _reference(memoryview(payload)[PRELUDE.size + head_bytes :], body_bytes)
         pool_id, base, pid, descriptor, offset, size, slot, generation = fields
-        pool = self._map(pool_id, pid, descriptor)
+        used = board.pool(base)
+        pool = self._map(pool_id, pid, descriptor) if used is None else used
         if offset + size > len(pool) or slot >= SLOTS or size < PRELUDE.size:
             raise DecodeError(f"reference to {size} bytes at {offset} of a pool of {len(pool)}")
-        board.use(pool, base)
-        block = np.frombuffer(pool, np.uint8, size, offset)
-        weakref.finalize(block, board.release, base, slot, generation).atexit = False
+        if used is None:
+            board.use(pool, base)
+        block: npt.NDArray[np.uint8] = np.ndarray((size,), np.uint8, pool, offset)
+        board.lend(block, base, slot, generation)
         return block.data
 
     def _map(self, pool_id: str, pid: int, descriptor: int) -> mmap.mmap:
@@ -134,12 +161,15 @@ class PoolReader:
 
 def is_reference(payload: bytes) -> bool:
     """Tells whether the payload is an envelope that stands for one in shared memory."""
-    return len(payload) >= PRELUDE.size and payload[:4] == MAGIC and payload[5] == Kind.REFERENCE
+    return payload[5:6] == _REFERENCE and payload[:4] == MAGIC and len(payload) >= PRELUDE.size
 
 
-def _reference(body: bytes, body_bytes: int) -> tuple[Any, ...]:
+_unpack = partial(msgpack.unpackb, raw=False, use_list=False, max_array_len=8, max_str_len=16, max_map_len=0)
+
+
+def _reference(body: memoryview, body_bytes: int) -> tuple[Any, ...]:
     try:
-        fields = msgpack.unpackb(body, raw=False, use_list=False, max_array_len=8, max_str_len=16, max_map_len=0)
+        fields = _unpack(body)
     except Exception as error:  # msgpack raises a dozen types for malformed input
         raise DecodeError(f"reference: {error}") from None
     if (
@@ -147,7 +177,8 @@ def _reference(body: bytes, body_bytes: int) -> tuple[Any, ...]:
         or not isinstance(fields, tuple)
         or len(fields) != 8
         or type(fields[0]) is not str
-        or not all(type(f) is int and f >= 0 for f in fields[1:])
+        or {type(f) for f in fields[1:]} != {int}
+        or min(fields[1:]) < 0
     ):
         raise DecodeError("reference: expected [pool id, base, process, descriptor, offset, size, slot, generation]")
     return fields

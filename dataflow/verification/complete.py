@@ -18,6 +18,7 @@ from typing import Any
 from dataflow.graph.model import Graph
 from dataflow.process.recorder import RecorderSink
 from dataflow.recording import Recording
+from dataflow.recording.copying import Origin
 from dataflow.recording.layout import COMPLETED, ENDS, OUTCOME, RESERVED_METADATA
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import decode_batch
@@ -176,6 +177,9 @@ class _Store:
         for operator, payload in recording.firings():  # those of setup() have no stamp, and keep their place
             stamp = decode_batch(payload).records[-1].stamp
             self.sink.firings(operator, stamp if stamp > 0 else first, payload)
+        with Origin(recording.path) as origin:
+            for place in origin.file.attachments:
+                self.sink.writer.add_attachment(origin.file.attachment(place))
         self._copied = 0
         self._taken: dict[str, set[tuple[int, int]]] = {stream: set() for stream in self.streams}
         for stream in sorted(recording.streams.keys() - graph.streams.keys()):

@@ -176,10 +176,27 @@ def test_a_running_graph_is_recorded_by_pattern_and_what_it_lacks_is_said(datafl
 
 
 @pytest.mark.usefixtures("running")
-def test_what_plays_no_recording_and_has_no_flight_recorder_says_so(dataflow) -> None:
-    assert "plays no recording" in dataflow("playback", "pause", code=2).stderr
+def test_what_has_no_flight_recorder_says_so_and_so_do_wrong_words_about_playback(dataflow) -> None:
     assert "has no flight recorder" in dataflow("trigger", code=2).stderr
-    assert "expected pause, resume, step or status" in dataflow("playback", "rewind", code=2).stderr
+    assert "expected pause, resume, step, speed or status" in dataflow("playback", "rewind", code=2).stderr
+    assert "expected a factor of real time, or max" in dataflow("playback", "speed", code=2).stderr
+    assert "expected a number from 0.001 to 1,000" in dataflow("playback", "speed", 0, code=2).stderr
+    assert "expected a whole number" in dataflow("playback", "step", 0, code=2).stderr
+    assert "pause takes no '3'" in dataflow("playback", "pause", 3, code=2).stderr
+
+
+@pytest.mark.usefixtures("running")
+def test_a_run_is_paused_stepped_and_goes_on(dataflow) -> None:
+    assert dataflow("playback", "pause").stdout.startswith("paused at ")
+    before = json.loads(dataflow("playback", "status", "--json").stdout)
+    assert before["paused"]
+    assert not before["replay"]
+    dataflow("playback", "step", 2)
+    dataflow("playback", "speed", 1000)
+    after = json.loads(dataflow("playback", "resume", "--json").stdout)
+    assert (after["paused"], after["speed"]) == (False, 1000.0)
+    assert "playing" in (told := dataflow("playback", "speed", "max").stdout)
+    assert "as fast as it goes" in told
 
 
 def test_view_follows_the_graph_to_its_end_and_saves_what_it_saw(dataflow, running: Background, tmp_path: Path) -> None:

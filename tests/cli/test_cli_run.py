@@ -260,3 +260,8 @@ def test_a_viewer_that_fails_does_not_end_the_run(dataflow, small: Path, tmp_pat
 
     assert "viewer: error: the Rerun program is missing" in told.stderr
     assert "small  complete" in told.stdout
+
+
+def test_a_live_run_cannot_begin_paused(dataflow, small: Path) -> None:
+    told = dataflow("run", small, "--live", "--step", code=2).stderr
+    assert "a live run cannot wait" in " ".join(told.split())

@@ -11,9 +11,10 @@ import pytest
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
-from dataflow.cli.playback import _steered, looped, pressed
-from dataflow.feeds.playback import ACTIONS, Playback
+from dataflow.cli.playback import _steered, keys, looped, pressed
+from dataflow.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
 def test_paused_holds_everything_until_it_goes_on() -> None:
@@ -33,6 +34,28 @@ def test_steps_pass_one_by_one_without_the_clock() -> None:
         playback.passed()
         assert playback.stepping is left
     assert playback.holds
+
+
+def test_speed_is_doubled_halved_and_chosen() -> None:
+    playback = Playback(speed=1.0)
+    playback.do("faster")
+    assert playback.speed == 2.0
+    for _ in range(20):
+        playback.do("slower")
+    assert playback.speed == SLOWEST
+    playback.do("speed", speed=FASTEST)
+    playback.do("faster")
+    assert playback.speed is None
+    playback.do("faster")
+    assert playback.speed is None
+    playback.do("slower")
+    assert playback.speed == 1.0
+    playback.do("speed", speed=0.001)
+    playback.do("slower")
+    assert playback.speed == 0.001
+    for wrong in (0.0, -1.0, float("nan"), float("inf")):
+        with pytest.raises(ValueError, match="expected a factor of real time above 0"):
+            playback.do("speed", speed=wrong)
 
 
 @given(st.lists(st.sampled_from([*ACTIONS, "passed"])))
@@ -58,7 +81,9 @@ def test_an_unknown_action_is_refused() -> None:
         (b" ", ["toggle"]),
         (b"\x1b[C\x1b[C", ["step", "step"]),
         (b"nq", ["step", "quit"]),
-        (b"\x1b[A\x1b[D?", []),  # up, left
+        (b"+\x1b[A=", ["faster", "faster", "faster"]),
+        (b"-\x1b[B", ["slower", "slower"]),
+        (b"\x1b[H\x1b[D?", []),  # home, left
         (b"x n", ["toggle", "step"]),
     ],
 )
@@ -90,6 +115,16 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.Mon
 
     assert done == ["toggle", "step", "step", "stop"]
     assert after == before
+
+
+def test_a_job_in_the_background_reads_no_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal that is not this process group's to read."""
+    master, slave = pty.openpty()
+    with os.fdopen(slave, "r") as terminal:
+        monkeypatch.setattr("sys.stdin", terminal)
+        monkeypatch.setattr("dataflow.cli.playback.err", Console(force_terminal=True))
+        assert keys(False) is None
+    os.close(master)
 
 
 def test_passes_of_a_loop_are_compared(capsys: pytest.CaptureFixture[str]) -> None:

@@ -144,3 +144,15 @@ def test_looking_at_the_generator_does_not_draw() -> None:
     before = peek()
     np.random.rand()
     assert peek() != before
+
+
+def test_looking_at_the_generator_tells_of_as_many_draws_as_bring_it_back_to_its_place() -> None:
+    seed_lazily(3)
+    np.random.bytes(4 * 624)
+    before = peek()
+    state = np.random.get_state(legacy=False)
+
+    np.random.bytes(4 * 624)
+
+    assert np.random.get_state(legacy=False)["state"]["pos"] == state["state"]["pos"]  # type: ignore[call-overload]
+    assert peek() != before

@@ -153,6 +153,25 @@ def test_the_playback_bar_moves_the_clock() -> None:
     assert (status, current, speed, did_seek) == (1, STAMP + 5 * 10**9, 2.0, 1)
 
 
+def test_a_jump_that_is_refused_moves_nothing_and_is_said() -> None:
+    class Fixed(Clock):
+        def request(self, *, playing: bool, speed: float, seek: int | None) -> str | None:  # type: ignore[override]
+            return "no jumps here" if seek is not None else None
+
+    clock = Fixed(STAMP, STAMP + 10**10)
+    with FoxgloveServer("test", port=0, controls=clock, span=(clock.first, clock.last)) as server:
+        client = Client(server.address)
+        client.request(playing=True, speed=1.0, seek=STAMP + 5 * 10**9)
+        _, body = client.other.get(timeout=WITHIN)
+        while (said := client.said.get(timeout=WITHIN))["op"] != "status":
+            pass
+        client.close()
+
+    assert (said["level"], said["message"]) == (1, "no jumps here")
+    _, current, _, did_seek = struct.unpack_from("<BQfB", body)
+    assert (current, did_seek) == (STAMP, 0)
+
+
 def test_the_command_plays_a_recording_until_it_is_interrupted(repository: Path) -> None:
     command = [sys.executable, "-m", "dataflow.cli.main", "foxglove", str(repository / "recordings" / "demo.mcap")]
     process = subprocess.Popen([*command, "--port", "0", "--start", "2"], stderr=subprocess.PIPE, text=True)

@@ -9,12 +9,15 @@ import cv2
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from typer.testing import CliRunner
 
+from dataflow.cli.main import app
 from dataflow.interop.export.kitti_raw import export_kitti_raw
 from dataflow.interop.export.lerobot import export_lerobot
+from dataflow.interop.export.lerobot_layouts import Layout30
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
-from dataflow.messages import CameraInfo, Image, JointState, Message, PointCloud, Text, Transforms, Twist
+from dataflow.messages import CameraInfo, Image, JointState, Message, Number, PointCloud, Text, Transforms, Twist
 from dataflow.recording import RecordingError, RecordingWriter
 from operators.sources.kitti_raw import KittiRaw
 
@@ -93,6 +96,72 @@ def test_the_statistics_of_a_lerobot_dataset_are_those_of_its_columns(tmp_path: 
     assert np.array(stats["observation.images.camera.image"]["mean"]).shape == (3, 1, 1)
     assert json.loads((tmp_path / "set/meta/episodes.jsonl").read_text())["length"] == len(states)
     assert b"huggingface" in table.schema.metadata
+
+
+def test_a_lerobot_dataset_of_format_3_says_which_rows_of_which_file_an_episode_is(tmp_path: Path) -> None:
+    """What LeRobot 3 reads, in its order: info, tasks by their text, episodes, then the rows of an episode."""
+    pd = pytest.importorskip("pandas")
+    path, done = write(tmp_path / "a.mcap", arm()), Exported()
+    with Material(path) as material:
+        export_lerobot(material, tmp_path / "set", done, layout=Layout30(), action="cmd/twist", task="pick it up")
+    with Material(path) as material:
+        export_lerobot(material, tmp_path / "old", Exported(), action="cmd/twist", task="pick it up")
+
+    meta = tmp_path / "set/meta"
+    info = json.loads((meta / "info.json").read_text())
+    assert (info["codebase_version"], info["total_episodes"], info["total_frames"]) == ("v3.0", 1, 5)
+    assert (info["chunks_size"], info["data_files_size_in_mb"], info["video_path"]) == (1000, 100, None)
+    assert not {"total_chunks", "total_videos"} & info.keys()
+    assert all("/" not in name for name in info["features"])
+    tasks = pd.read_parquet(meta / "tasks.parquet")
+    assert (tasks.index.name, int(tasks.loc["pick it up"].task_index)) == ("task", 0)
+    (episode,) = pq.read_table(meta / "episodes/chunk-000/file-000.parquet").to_pylist()
+    assert (episode["episode_index"], episode["tasks"], episode["length"]) == (0, ["pick it up"], 5)
+    assert (episode["meta/episodes/chunk_index"], episode["meta/episodes/file_index"]) == (0, 0)
+    place = {"chunk_index": episode["data/chunk_index"], "file_index": episode["data/file_index"]}
+    table = pq.read_table(tmp_path / "set" / info["data_path"].format(**place))
+    rows = table.slice(episode["dataset_from_index"], episode["dataset_to_index"] - episode["dataset_from_index"])
+    assert rows["index"].to_pylist() == [0, 1, 2, 3, 4]
+    assert set(rows["episode_index"].to_pylist()) == {0}
+    assert table.equals(pq.read_table(tmp_path / "old/data/chunk-000/episode_000000.parquet"))
+    stats = json.loads((meta / "stats.json").read_text())
+    assert stats == json.loads((tmp_path / "old/meta/episodes_stats.jsonl").read_text())["stats"]
+    for key, values in stats.items():
+        assert {name: episode[f"stats/{key}/{name}"] for name in values} == values
+    assert sorted(Path(file).relative_to(tmp_path / "set").as_posix() for file in done.files) == [
+        "data/chunk-000/file-000.parquet",
+        "meta/episodes/chunk-000/file-000.parquet",
+        "meta/info.json",
+        "meta/stats.json",
+        "meta/tasks.parquet",
+    ]
+
+
+def test_a_single_number_is_a_number_in_the_table_as_lerobot_takes_it(tmp_path: Path) -> None:
+    streams = arm()
+    streams["arm/joints"] = [Number(stamp=m.stamp, value=float(k)) for k, m in enumerate(streams["camera/image"])]
+    with Material(write(tmp_path / "a.mcap", streams)) as material:
+        export_lerobot(material, tmp_path / "set", Exported(), layout=Layout30(), action="cmd/twist")
+
+    table = pq.read_table(tmp_path / "set/data/chunk-000/file-000.parquet")
+    features = json.loads(table.schema.metadata[b"huggingface"])["info"]["features"]
+    assert table.schema.field("observation.state").type == "float"
+    assert features["observation.state"] == {"dtype": "float32", "_type": "Value"}
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["features"]["observation.state"]["shape"] == [1]
+
+
+def test_the_command_writes_format_3(tmp_path: Path) -> None:
+    command = [
+        "convert",
+        str(write(tmp_path / "a.mcap", arm())),
+        str(tmp_path / "set"),
+        "--quiet",
+        "--to",
+        "lerobot-v3",
+    ]
+    shown = CliRunner().invoke(app, [*command, "--action", "cmd/twist"])
+    assert shown.exit_code == 0, shown.output
+    assert json.loads((tmp_path / "set/meta/info.json").read_text())["codebase_version"] == "v3.0"
 
 
 def test_a_dataset_without_images_or_with_another_action_is_refused(tmp_path: Path) -> None:

@@ -139,3 +139,14 @@ def test_the_thread_that_waits_is_woken_for_what_another_has_left_it(wired: Wire
     with pytest.raises(queue.Empty):
         wired.inbox.get(timeout=LONG)
     thread.join()
+
+
+def test_what_has_woken_the_one_who_waits_does_not_wake_it_again(wired: Wired) -> None:
+    os.eventfd_write(wired.wake, 1)
+    with pytest.raises(queue.Empty):
+        wired.inbox.get(timeout=LONG)
+
+    timer = threading.Timer(0.02, lambda: wired.inbox.put(("control", "go", {})))
+    timer.start()
+    assert wired.inbox.get(timeout=LONG) == ("control", "go", {})
+    timer.join()

@@ -7,6 +7,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from dataflow.foxglove.drawing import data_of, schema_of
+from dataflow.interop.export.extras import carry
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Message
@@ -37,6 +38,7 @@ def export_foxglove(material: Material, file: Path, done: Exported) -> None:
                 kept[stored.topic], stored.log_time, bytes(stored.data), stored.log_time, stored.number % 2**32
             )
             done.count(stored.topic)
+        carry(material, writer, done)
         writer.finish()  # type: ignore[no-untyped-call]
     done.files.append(str(file))
 

@@ -1,4 +1,4 @@
-"""KITTI raw: a drive with the left colour camera and a LiDAR, synchronised and rectified, and their calibration.
+"""KITTI raw: a synchronised drive with the left colour camera, a LiDAR and inertial navigation, and the calibration.
 
 Geiger et al., "Vision meets robotics: the KITTI dataset", 2013.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dataflow.interop.export.frames import IMAGES, PAIR_WITHIN, messages_as, optional, write_png, write_text
+from dataflow.interop.export.kitti_oxts import write_oxts
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import CameraInfo, Image, PointCloud, Transforms
@@ -21,11 +22,11 @@ SECOND = 1_000_000_000
 
 
 def export_kitti_raw(material: Material, folder: Path, done: Exported) -> None:
-    """Writes `DATE/DATE_drive_0001_sync/` with image_02, velodyne_points and their timestamps, and the calibration.
+    """Writes `DATE/DATE_drive_0001_sync/` with image_02, velodyne_points, oxts, their timestamps, and the calibration.
 
     A frame is a scan and the image nearest to it, within 20 ms; scans alone are a drive without images. Reflectance is
     the cloud's intensity; 0 where it has none. The pose of the camera in the LiDAR's frame comes from a stream of
-    transforms between the two frames. Raises `RecordingError` where there are no scans.
+    transforms between the two frames; of `oxts`, see `write_oxts`. Raises `RecordingError` where there are no scans.
     """
     scans = material.only("KITTI raw", PointCloud)
     camera = optional(material, *IMAGES)
@@ -50,6 +51,9 @@ def export_kitti_raw(material: Material, folder: Path, done: Exported) -> None:
     if not kept:
         raise RecordingError(f"{material.path}: no scan has an image within 20 ms")
     write_text(drive / "velodyne_points" / "timestamps.txt", _times([scan for scan, _ in kept]), done)
+    unit = write_oxts(material, [scan for scan, _ in kept], drive, _times, done)
+    if unit is not None:
+        _mounting(material, folder / date, lidar, unit, done)
     if camera is None:
         return
     frame = _images(material, camera, [near for _, near in kept if near is not None], drive / "image_02", done)
@@ -88,6 +92,15 @@ def _calibration(material: Material, folder: Path, camera: str, lidar: str, done
         T_camera_lidar = invert(T)
         lines = {"R": T_camera_lidar[:3, :3].ravel(), "T": T_camera_lidar[:3, 3]}
         write_text(folder / "calib_velo_to_cam.txt", _lines(lines), done)
+
+
+def _mounting(material: Material, folder: Path, lidar: str, unit: str, done: Exported) -> None:
+    """Writes calib_imu_to_velo.txt, if a transform says it."""
+    T = _between(material, lidar, unit)
+    if T is None:
+        done.left_out["calib_imu_to_velo.txt"] = f"no transform says where {unit!r} is in {lidar!r}"
+    else:
+        write_text(folder / "calib_imu_to_velo.txt", _lines({"R": T[:3, :3].ravel(), "T": T[:3, 3]}), done)
 
 
 def _between(material: Material, parent: str, child: str) -> np.ndarray | None:

@@ -1,4 +1,4 @@
-"""A dataset of LeRobot (format 2.1): a table of frames with their images, states and actions, and what is in it.
+"""A dataset of LeRobot: a table of frames with their images, states and actions, and what is in it.
 
 A frame is an image of the first camera with the newest message of every other stream, as a graph that samples them
 would be given. LeRobot takes frames as equally far apart, so a frame's time is its number over the rate; when it was is
@@ -18,13 +18,13 @@ import numpy.typing as npt
 
 from dataflow.interop.conversions import convert
 from dataflow.interop.export.frames import IMAGES
+from dataflow.interop.export.lerobot_layouts import Dataset, Layout, Layout21
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Image, Message
 from dataflow.messages.base import ArrayField
 from dataflow.recording.errors import RecordingError
 
-VERSION = "v2.1"
 ROWS = 64
 """Frames of a row group: their images are in memory together."""
 SAMPLED_PIXELS = 4096
@@ -71,17 +71,27 @@ class _Plan:
 
 
 def export_lerobot(
-    material: Material, folder: Path, done: Exported, *, action: str | None = None, task: str = ""
+    material: Material,
+    folder: Path,
+    done: Exported,
+    *,
+    layout: Layout | None = None,
+    action: str | None = None,
+    task: str = "",
 ) -> None:
-    """Writes data/, meta/ and the images in the table. Raises `RecordingError` without pyarrow, images or numbers."""
+    """Writes data/, meta/ and the images in the table, in the layout of LeRobot 2.1 unless another is given.
+
+    Raises `RecordingError` without pyarrow, and without images.
+    """
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError:
-        raise RecordingError("--to lerobot needs pyarrow: pip install pyarrow") from None
+        raise RecordingError("a dataset of LeRobot needs pyarrow: pip install pyarrow") from None
+    layout = layout or Layout21()
     plan = _planned(material, action, done)
     stamps: list[int] = []
-    path = folder / "data" / "chunk-000" / "episode_000000.parquet"
+    path = folder / layout.table
     path.parent.mkdir(parents=True, exist_ok=True)
     fps = _rate(material, plan.anchor)
     writer: Any = None
@@ -97,7 +107,8 @@ def export_lerobot(
         raise RecordingError(f"{material.path}: no image of {material.names[plan.anchor]} has all others before it")
     writer.close()
     done.files.append(str(path))
-    _describe(folder, plan, len(stamps), fps, task or material.path.stem, done)
+    dataset = _described(plan, len(stamps), fps, task or material.path.stem)
+    done.files += [str(file) for file in layout.describe(folder, dataset)]
 
 
 def _planned(material: Material, action: str | None, done: Exported) -> _Plan:
@@ -204,8 +215,11 @@ def _picture(key: str, message: Message, plan: _Plan) -> dict[str, Any]:
     return {"bytes": encoded.tobytes(), "path": None}
 
 
-def _vector(key: str, messages: list[Message], streams: list[str], plan: _Plan) -> list[float]:
-    """The numbers of several messages in a row. Raises `RecordingError` where there are more or fewer than before."""
+def _vector(key: str, messages: list[Message], streams: list[str], plan: _Plan) -> list[float] | float:
+    """The numbers of several messages in a row, one alone as it is.
+
+    Raises `RecordingError` where there are more or fewer than before.
+    """
     parts = [_numbers(message) for message in messages]
     names = [f"{stream}/{name}" for stream, (_, found) in zip(streams, parts, strict=True) for name in found]
     known = plan.vectors.setdefault(key, names)
@@ -215,7 +229,7 @@ def _vector(key: str, messages: list[Message], streams: list[str], plan: _Plan) 
         )
     values = np.concatenate([found for found, _ in parts])
     plan.statistics.setdefault(key, _Statistics()).add(values[np.newaxis])
-    return [float(value) for value in values]
+    return [float(value) for value in values] if len(values) > 1 else float(values[0])
 
 
 def _rate(material: Material, stream: str) -> float:
@@ -235,16 +249,18 @@ def _schema(pa: Any, plan: _Plan) -> Any:
         fields.append((key, pa.struct([("bytes", pa.binary()), ("path", pa.string())])))
         features[key] = {"_type": "Image"}
     for key, names in plan.vectors.items():
-        fields.append((key, pa.list_(pa.float32(), len(names))))
-        features[key] = {"feature": {"dtype": "float32", "_type": "Value"}, "length": len(names), "_type": "Sequence"}
+        value = {"dtype": "float32", "_type": "Value"}
+        alone = len(names) == 1  # LeRobot reads the shape [1] as a number
+        fields.append((key, pa.float32() if alone else pa.list_(pa.float32(), len(names))))
+        features[key] = value if alone else {"feature": value, "length": len(names), "_type": "Sequence"}
     for key, kind in (("timestamp", "float32"), *((name, "int64") for name in INDEXES)):
         fields.append((key, pa.float32() if kind == "float32" else pa.int64()))
         features[key] = {"dtype": kind, "_type": "Value"}
     return pa.schema(fields, metadata={"huggingface": json.dumps({"info": {"features": features}})})
 
 
-def _describe(folder: Path, plan: _Plan, frames: int, fps: float, task: str, done: Exported) -> None:
-    """Writes meta/: what the columns are, the tasks, the episodes, and their statistics."""
+def _described(plan: _Plan, frames: int, fps: float, task: str) -> Dataset:
+    """The columns and their statistics."""
     features: dict[str, Any] = {}
     for key in plan.images:
         names = ["height", "width", "channels"]
@@ -253,32 +269,7 @@ def _describe(folder: Path, plan: _Plan, frames: int, fps: float, task: str, don
         features[key] = {"dtype": "float32", "shape": [len(words)], "names": words}
     for key in ("timestamp", *INDEXES):
         features[key] = {"dtype": "float32" if key == "timestamp" else "int64", "shape": [1], "names": None}
-    info = {
-        "codebase_version": VERSION,
-        "robot_type": None,
-        "total_episodes": 1,
-        "total_frames": frames,
-        "total_tasks": 1,
-        "total_videos": 0,
-        "total_chunks": 1,
-        "chunks_size": 1000,
-        "fps": int(fps) if fps == int(fps) else fps,
-        "splits": {"train": "0:1"},
-        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
-        "video_path": None,
-        "features": features,
-    }
     statistics = {
         key: found.as_json(frames, (3, 1, 1) if key in plan.images else (-1,)) for key, found in plan.statistics.items()
     }
-    lines = {
-        "info.json": json.dumps(info, indent=4),
-        "tasks.jsonl": json.dumps({"task_index": 0, "task": task}),
-        "episodes.jsonl": json.dumps({"episode_index": 0, "tasks": [task], "length": frames}),
-        "episodes_stats.jsonl": json.dumps({"episode_index": 0, "stats": statistics}),
-    }
-    for name, text in lines.items():
-        path = folder / "meta" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text + "\n", encoding="utf-8")
-        done.files.append(str(path))
+    return Dataset(features, statistics, frames, fps, task)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dataflow.interop.export.extras import Extras, tell_runs
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.recording import RecordingWriter
+from dataflow.recording.attachments import tells_of_run
 from dataflow.recording.layout import BAG
 
 
@@ -29,4 +31,17 @@ def export_own(material: Material, file: Path, done: Exported, *, overwrite: boo
         for stored in material.stored([t.name for t in material.untouched]):
             writer.write_untouched(stored.topic, stored.log_time, bytes(stored.data))
             done.count(stored.topic)
+        _carry(material, writer, done)
     done.files.append(str(file))
+
+
+def _carry(material: Material, writer: RecordingWriter, done: Exported) -> None:
+    """Takes over attachments and metadata; names that a recording gives a meaning to get the file's in front."""
+    extras = Extras(material)
+    for name, values in extras.metadata:
+        writer.add_metadata(f"{material.path.stem}/{name}" if tells_of_run(name) else name, values)
+        done.metadata += 1
+    for found in extras.attachments():
+        writer.add_attachment(found)
+        done.attachments += 1
+    tell_runs(extras, done)

@@ -12,11 +12,16 @@ Watch = Callable[[int], None]
 
 @dataclass(slots=True)
 class Exported:
-    """Messages written by stream or topic, files written, and what was left out with the reason."""
+    """Messages written by stream or topic, files written, and what was left out with the reason.
+
+    `attachments`, `metadata`: how many of an MCAP file's were carried over.
+    """
 
     written: dict[str, int] = field(default_factory=dict)
     files: list[str] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
+    attachments: int = 0
+    metadata: int = 0
     watch: Watch | None = None
 
     def count(self, name: str) -> None:

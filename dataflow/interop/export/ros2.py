@@ -10,6 +10,7 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from dataflow.interop.bag import Topic
+from dataflow.interop.export.extras import ROSBAG2, carry
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.interop.ros.made import typestore
@@ -53,8 +54,8 @@ class Ros2Writer:
         self.folder = folder
         self.file = folder / f"{folder.name}_0.mcap"
         self._stream = self.file.open("wb")
-        self._writer = Writer(self._stream, compression=CompressionType.ZSTD)
-        self._writer.start(profile="ros2", library="dataflow convert")
+        self.mcap = Writer(self._stream, compression=CompressionType.ZSTD)
+        self.mcap.start(profile="ros2", library="dataflow convert")
         self._schemas: dict[SchemaText, int] = {}
         self._channels: dict[str, _Channel] = {}
         self._first: int | None = None
@@ -67,23 +68,21 @@ class Ros2Writer:
             channel = self._channels[topic] = self._open(topic, schema, latched)
         if channel.type != schema.name:
             raise RecordingError(f"topic {topic} is {channel.type} already, and cannot hold {schema.name}")
-        self._writer.add_message(channel.id, log_time=stamp, publish_time=stamp, data=data, sequence=channel.count)
+        self.mcap.add_message(channel.id, log_time=stamp, publish_time=stamp, data=data, sequence=channel.count)
         channel.count += 1
         self._first = stamp if self._first is None else min(self._first, stamp)
         self._last = max(self._last, stamp)
 
     def _open(self, topic: str, schema: SchemaText, latched: bool) -> _Channel:
         if schema not in self._schemas:
-            self._schemas[schema] = self._writer.register_schema(schema.name, schema.encoding, schema.data)
+            self._schemas[schema] = self.mcap.register_schema(schema.name, schema.encoding, schema.data)
         qos = _QOS.format(depth=1 if latched else 10, durability=LATCHED if latched else VOLATILE)
-        number = self._writer.register_channel(
-            topic, "cdr", self._schemas[schema], metadata={"offered_qos_profiles": qos}
-        )
+        number = self.mcap.register_channel(topic, "cdr", self._schemas[schema], metadata={"offered_qos_profiles": qos})
         return _Channel(number, schema.name, qos)
 
     def close(self) -> None:
         """Finishes the file and writes metadata.yaml."""
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self.mcap.finish()  # type: ignore[no-untyped-call]
         self._stream.close()
         (self.folder / "metadata.yaml").write_text(self._metadata(), encoding="utf-8")
 
@@ -145,6 +144,7 @@ def export_ros2(material: Material, folder: Path, done: Exported) -> None:
     try:
         _copy(material, ros, writer, done)
         _convert(material, others, writer, done)
+        carry(material, writer.mcap, done, without=(ROSBAG2,))
     finally:
         writer.close()
     done.files.append(str(folder))

@@ -515,10 +515,11 @@ class Selectors:
 class Select:
     """The module `select`, for handles of processes and the one descriptor that an inbox waits for."""
 
-    POLLIN = select.POLLIN
+    POLLIN, EPOLLIN, EPOLLET = select.POLLIN, select.EPOLLIN, select.EPOLLET
 
     def __init__(self, system: System) -> None:
         self.poll = lambda: Poll(system)
+        self.epoll = lambda: Epoll(system)
 
 
 class Poll:
@@ -548,6 +549,31 @@ class Poll:
 
     def _ready(self) -> list[tuple[int, int]]:
         return [(descriptor, select.POLLIN) for descriptor, thing in self._things.items() if thing.readable]
+
+
+class Epoll:
+    """`select.epoll` for counters, edge-triggered: finds those that were written to since it last did."""
+
+    def __init__(self, system: System) -> None:
+        self._system = system
+        self._seen: dict[int, int] = {}
+
+    def register(self, descriptor: int, events: int) -> None:
+        assert events == select.EPOLLIN | select.EPOLLET
+        self._seen[descriptor] = 0
+
+    def poll(self, seconds: float | None = None) -> list[tuple[int, int]]:
+        world, things = self._system.world, self._system.things
+        world.call()
+        until = None if seconds is None else world.now + seconds
+        while not (ready := [d for d, seen in self._seen.items() if things[d].count != seen]) and (
+            until is None or world.now < until
+        ):
+            first = things[next(iter(self._seen))]
+            first.changed.wait(None if until is None else until - world.now)
+        for descriptor in ready:
+            self._seen[descriptor] = things[descriptor].count
+        return [(descriptor, select.EPOLLIN) for descriptor in ready]
 
 
 class Signals:
