@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from dataflow.graph.keys import canonical, has_wildcard, key_fault, matching
+from dataflow.graph.keys import as_expression, canonical, has_wildcard, key_fault, matching
 from dataflow.graph.problems import did_you_mean
 
 
@@ -19,11 +19,11 @@ def streams_named(word: str, names: Iterable[str], namespace: str = "") -> list[
     """The streams that `word` means, in the order of `names`.
 
     It is a full name, a name without the namespace, the last parts of a name (`imu` for `robot1/robot/imu`), or a key
-    expression with wildcards (`robot/*`, `**/image`). Raises `StreamNameError` where there is none.
+    expression with wildcards (`robot/*`, `**/image`, `image*`). Raises `StreamNameError` where there is none.
     """
     known = list(names)
     keys = {name.strip("/"): name for name in known}  # foreign recordings name streams "/tf"
-    bare = word.strip("/")
+    bare = as_expression(word.strip("/"))
     if (fault := key_fault(bare)) is not None:
         raise StreamNameError(f"stream {word!r}: {fault}")
     for expression in _readings(bare, namespace):

@@ -59,11 +59,41 @@ Clock = Annotated[
     ),
 ]
 RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
+
+
+def offset(word: str) -> float:
+    """Seconds of a number of them, or of a duration with its unit, for `typer.Option(parser=...)`."""
+    from dataflow.sync.stamps import parse_duration
+
+    try:
+        return float(word)
+    except ValueError:
+        try:
+            return parse_duration(word) * 1e-9
+        except ValueError as error:
+            raise typer.BadParameter(str(error)) from None
+
+
 Start = Annotated[
-    float | None, typer.Option("--start", metavar="SECONDS", help="Begin so long after the recording's first message.")
+    float | None,
+    typer.Option(
+        "--start",
+        metavar="TIME",
+        parser=offset,
+        help="Begin so long after the recording's first message: seconds, or 500ms, 2min.",
+    ),
 ]
 End = Annotated[
-    float | None, typer.Option("--end", metavar="SECONDS", help="End so long after the recording's first message.")
+    float | None,
+    typer.Option(
+        "--end",
+        metavar="TIME",
+        parser=offset,
+        help="End so long after the recording's first message: seconds, or 500ms, 2min.",
+    ),
+]
+Without = Annotated[
+    list[str] | None, typer.Option("--without", metavar="STREAM", help="Leave these streams out. May be repeated.")
 ]
 ModuleFolders = Annotated[
     list[Path] | None,
@@ -148,21 +178,30 @@ def output_file(path: Path, suffix: str, *, overwrite: bool, option: str) -> Pat
     return path
 
 
-def chosen_streams(words: Sequence[str] | None, names: Iterable[str], namespace: str = "") -> list[str]:
-    """The streams that `words` mean: full names, names without the namespace, or key expressions with wildcards.
+def chosen_streams(
+    words: Sequence[str] | None, names: Iterable[str], namespace: str = "", without: Sequence[str] | None = None
+) -> list[str]:
+    """The streams that `words` mean, but those of `without`.
 
-    None or no words: all. A word that matches nothing is an error that names the nearest stream.
+    They are full names, names without the namespace, or patterns with wildcards; None or no words: all. A word that
+    matches nothing is an error that names the nearest stream.
     """
-    from dataflow.graph.keys import canonical, key_fault, matching
+    known = list(names)
+    left_out = set(_meant(without, known, namespace)) if without else set()
+    chosen = [name for name in (_meant(words, known, namespace) if words else known) if name not in left_out]
+    if left_out and not chosen:
+        raise fail(f"no stream is left: --without takes {'all that --stream gives' if words else 'all of them'}")
+    return chosen
+
+
+def _meant(words: Sequence[str], known: Sequence[str], namespace: str) -> list[str]:
+    from dataflow.graph.keys import as_expression, canonical, key_fault, matching
     from dataflow.graph.problems import did_you_mean
 
-    known = list(names)
-    if not words:
-        return known
     keys = {name.strip("/"): name for name in known}  # foreign recordings name streams "/tf"
     found: dict[str, None] = {}
     for word in words:
-        bare = word.removeprefix("/")
+        bare = as_expression(word.removeprefix("/"))
         fault = key_fault(bare)
         if fault is not None:
             raise fail(f"stream {word!r}: {fault}")

@@ -47,7 +47,7 @@ class Command:
         called: Callable[..., None] = getattr(import_module(f"dataflow.cli.{module}"), function)
         settings = {"ignore_unknown_options": True} if self.ignore_unknown_options else {}
         app.command(
-            self.called, rich_help_panel=self.panel, help=_paragraphs(called.__doc__ or ""), context_settings=settings
+            self.called, rich_help_panel=self.panel, help=paragraphs(called.__doc__ or ""), context_settings=settings
         )(called)
 
 
@@ -65,7 +65,7 @@ class Family:
         app = typer.Typer(
             name=self.called,
             no_args_is_help=True,
-            help=self.help,
+            help=paragraphs(self.help),
             add_completion=False,
             rich_markup_mode="rich",
             pretty_exceptions_enable=False,
@@ -112,13 +112,27 @@ BUILT_IN: tuple[Command | Family, ...] = (
     Family(
         "new",
         MAKE,
-        "Begin an operator, a graph or a project, with tests that pass.",
+        """Begin an operator, a graph or a project, with tests that pass.
+
+        Examples:
+
+          dataflow new project my_robot
+          dataflow new operator NearestObstacle
+          dataflow new graph obstacle_watch
+        """,
         (Command("new:operator"), Command("new:graph"), Command("new:project")),
     ),
     Family(
         "param",
         FOLLOW,
-        "Read and change the parameters of a running graph.",
+        """Read and change the parameters of a running graph.
+
+        Examples:
+
+          dataflow param list
+          dataflow param set detector.score_threshold 0.5
+          dataflow param dump tuned.yaml
+        """,
         (
             Command("param:set_", name="set", ignore_unknown_options=True),  # so that -1 is a value
             Command("param:get"),
@@ -163,7 +177,12 @@ class Commands(MutableMapping[str, Any]):
         return len(self._made)
 
 
-def _paragraphs(text: str) -> str:
-    """A docstring with the lines of each paragraph joined, so that it wraps where the terminal ends; lists stay."""
-    blocks = inspect.cleandoc(text).split("\n\n")
+def paragraphs(text: str) -> str:
+    """A docstring with the lines of each paragraph joined, so that it wraps where the terminal ends; lists stay.
+
+    An empty paragraph follows the first: Typer takes the rest for a docstring and would strip the indentation of
+    examples that stand alone in it.
+    """
+    first, *rest = (block for block in inspect.cleandoc(text).split("\n\n") if block.strip())
+    blocks = (first, "", *rest) if rest else (first,)
     return "\n\n".join(block if block.startswith(" ") else " ".join(block.split("\n")) for block in blocks)

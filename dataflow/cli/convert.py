@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -19,6 +20,7 @@ from dataflow.cli.arguments import (
     Json,
     Overwrite,
     Start,
+    Without,
     chosen_streams,
     existing_recording,
     output_file,
@@ -58,6 +60,7 @@ def convert(
         list[str] | None,
         typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
     ] = None,
+    without: Without = None,
     start: Start = None,
     end: End = None,
     clock: Clock = "auto",
@@ -75,9 +78,9 @@ def convert(
     what is left out is said. Into mcap, a bag becomes a recording of streams, and topics that nothing here can read are
     kept as they are. Into mcap, ros2 and foxglove, attachments and metadata records of an MCAP file go along; other
     formats have no place for them, which is said. Datasets (tum, 7scenes, euroc, kitti, kitti-raw) take one stream of a
-    kind: --stream chooses among several. Into lerobot (format 2.1) and lerobot-v3 (3.0), every image of the first
-    camera is a frame, with the newest message of every other stream; images stay images, lossless, since no video
-    encoder is among the dependencies.
+    kind: --without leaves out others, --stream names all that are taken. Into lerobot (format 2.1) and lerobot-v3
+    (3.0), every image of the first camera is a frame, with the newest message of every other stream; images stay
+    images, lossless, since no video encoder is among the dependencies.
 
     Exit codes:
 
@@ -93,7 +96,7 @@ def convert(
       dataflow convert run.mcap folder --to tum
       dataflow convert run.mcap folder --to 7scenes
       dataflow convert run.mcap folder --to euroc
-      dataflow convert run.mcap folder --to kitti --stream camera/*
+      dataflow convert run.mcap folder --to kitti --stream "camera/*"
       dataflow convert run.mcap folder --to kitti-raw
       dataflow convert run.mcap folder --to lerobot --action cmd/twist
       dataflow convert run.mcap folder --to lerobot-v3 --task "pick up cups"
@@ -104,15 +107,26 @@ def convert(
         existing_recording(recording)
         _check_output(output, to, overwrite)
         if to == "rrd":
-            from dataflow.cli.viewing import view
+            from dataflow.cli.drawing import draw_recording, drawn_as_json, report
+            from dataflow.view import Save
 
-            view(recording, to=str(output), streams=streams, start=start, end=end, overwrite=overwrite)
-            _tell_rrd(recording)
+            with _complete(output) as place:
+                drawn = draw_recording(recording, Save(place), streams, without, start, end, clock)
+            if json:
+                print_json(drawn_as_json(drawn[0], output))
+            else:
+                report(*drawn, output)
+                _tell_rrd(recording)
             return
-        with _opened(recording, streams, start, end, clock) as material, _progress(quiet or json) as watch:
-            if not to.startswith("lerobot") and (action is not None or task):
-                raise fail("--action and --task are of --to lerobot and lerobot-v3")
-            done = _export(material, output, to, overwrite, watch, action, task)
+        if not to.startswith("lerobot") and (action is not None or task):
+            raise fail("--action and --task are of --to lerobot and lerobot-v3")
+        with (
+            _opened(recording, streams, without, start, end, clock) as material,
+            _progress(quiet or json) as watch,
+            _complete(output) as place,
+        ):
+            done = _export(material, place, to, watch, action, task)
+        done.files = [str(output / Path(file).relative_to(place)) for file in done.files]
     if json:
         print_json(done.as_json())
         return
@@ -155,8 +169,24 @@ def _check_output(output: Path, to: str, overwrite: bool) -> None:
 
 
 @contextmanager
+def _complete(output: Path) -> Iterator[Path]:
+    """Gives a place to write to, of the same name; what is written there appears as `output` when it is complete."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=f".{output.name}.", dir=output.parent) as folder:
+        place = Path(folder) / output.name
+        yield place
+        if place.exists():
+            place.replace(output)
+
+
+@contextmanager
 def _opened(
-    path: Path, words: list[str] | None, start: float | None, end: float | None, clock: Literal["auto", "header", "log"]
+    path: Path,
+    words: list[str] | None,
+    without: list[str] | None,
+    start: float | None,
+    end: float | None,
+    clock: Literal["auto", "header", "log"],
 ) -> Iterator[Material]:
     from dataflow.interop.export.material import Material
     from dataflow.recording.cutting import cut_of
@@ -172,7 +202,7 @@ def _opened(
             with Recording(path) as opened:
                 metadata = opened.metadata
                 namespace = metadata.get(RECORDING, {}).get("namespace", "")
-        chosen = chosen_streams(words, names, namespace) if words else None
+        chosen = chosen_streams(words, names, namespace, without) if words or without else None
         firsts = [i.first for i in whole.streams.values() if i.first is not None and not i.static]
         firsts += [t.first for t in whole.untouched if t.first is not None]
         part = None if whole.foreign else cut_of(metadata)
@@ -189,7 +219,6 @@ def _export(
     material: Material,
     output: Path,
     to: str,
-    overwrite: bool,
     watch: Callable[[int], None] | None,
     action: str | None,
     task: str,
@@ -205,7 +234,7 @@ def _export(
     done = Exported(watch=watch)
     match to:
         case "mcap":
-            export_own(material, output, done, overwrite=overwrite)
+            export_own(material, output, done)
         case "foxglove":
             export_foxglove(material, output, done)
         case "ros2":

@@ -9,7 +9,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, Overwrite, chosen_streams, output_file
+from dataflow.cli.arguments import FLAG, Json, Overwrite, Without, chosen_streams, output_file
 from dataflow.cli.material import (
     Material,
     Out,
@@ -44,8 +44,8 @@ def cut(
 ) -> None:
     """Cut a span out of a recording.
 
-    A TIME is seconds after the first message (12.5), a duration (500ms, 2m), or a date in ISO 8601 with its time zone.
-    Messages go over byte for byte, static streams always.
+    A TIME is seconds after the first message (12.5), a duration (500ms, 2min), or a date in ISO 8601 with its time
+    zone. Messages go over byte for byte, static streams always.
 
     The part replays from there with the states that operators had, and verifies: every operator is taken up after its
     last recorded state at or before --from, and what its firings took since then goes along. For that, record with
@@ -60,7 +60,7 @@ def cut(
     Examples:
 
       dataflow cut run.mcap --from 30 --to 45 -o part.mcap
-      dataflow cut run.mcap --from 2m --duration 10s -o part.mcap
+      dataflow cut run.mcap --from 2min --duration 10s -o part.mcap
       dataflow cut run.mcap --from 2026-03-01T12:00:00Z -o end.mcap
       dataflow cut bag.mcap --to 10 --bare -o beginning.mcap
     """
@@ -82,12 +82,9 @@ def filter_(
     output: Out,
     streams: Annotated[
         list[str] | None,
-        typer.Option("--streams", metavar="PATTERN", help="Keep these streams; wildcards work. May be repeated."),
+        typer.Option("--stream", metavar="STREAM", help="Keep these streams; wildcards work. May be repeated."),
     ] = None,
-    without: Annotated[
-        list[str] | None,
-        typer.Option("--without", metavar="PATTERN", help="Leave these streams out. May be repeated."),
-    ] = None,
+    without: Without = None,
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -105,22 +102,18 @@ def filter_(
 
     Examples:
 
-      dataflow filter run.mcap --streams imu/* --streams camera/* -o sensors.mcap
-      dataflow filter run.mcap --without camera/** -o small.mcap
+      dataflow filter run.mcap --stream imu/imu --stream "camera/*" -o s.mcap
+      dataflow filter run.mcap --without "camera/**" -o small.mcap
     """
     from dataflow.editing.part import Part, write_part
 
     with friendly_errors(), opened_material(recording) as origin, copying("filtering", quiet or json) as watch:
         if not streams and not without:
-            raise fail("nothing to choose by: name streams with --streams, or with --without")
+            raise fail("nothing to choose by: name streams with --stream, or with --without")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         refuse_itself(output, [recording])
         names = sorted(origin.counts())
-        kept = chosen_streams(streams, names, origin.namespace)
-        left_out = set(chosen_streams(without, names, origin.namespace)) if without else set()
-        kept = [name for name in kept if name not in left_out]
-        if not kept:
-            raise fail("no stream is left: --without takes all that --streams gives")
+        kept = chosen_streams(streams, names, origin.namespace, without)
         done = write_part(origin, Part(streams=kept), output, overwrite=overwrite, watch=watch)
     if json:
         print_json(done.as_json())
@@ -131,7 +124,7 @@ def filter_(
 def split(
     recording: Material,
     every: Annotated[
-        Word, typer.Option("--every", metavar="TIME", help="Event time of a part: 60s, 5m, or a number of seconds.")
+        Word, typer.Option("--every", metavar="TIME", help="Event time of a part: 60s, 5min, or a number of seconds.")
     ] = None,
     nbytes: Annotated[
         Word, typer.Option("--size", metavar="SIZE", help="Size of a part, about: 500MB, 2GB, 100MiB.")

@@ -12,7 +12,7 @@ def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json 
     """Print the latency of every path of a recorded run, from source to sink.
 
     The time runs from the moment a source gave a message to the end of the sink's firing that the message caused. It is
-    computed from the firing records, so every recording has it: of a live run the latencies of that run, of a run as
+    computed from the firing records, so every recorded run has it: of a live run the latencies of that run, of a run as
     fast as the graph goes those under full load. "costs most" names the operator with the largest share: its own calls
     and the time that messages waited in front of it.
 
@@ -27,6 +27,11 @@ def latency(recording: RecordingFile, folders: ModuleFolders = None, json: Json 
 
     find_modules_in(folders)
     with friendly_errors(), Recording(existing(recording, "a recording")) as opened:
+        if not opened.firing_batches():
+            raise fail(
+                f"{recording} holds no firing records, from which latencies are computed: `dataflow run --record` and "
+                "replays keep them; `dataflow record`, conversions and other programs do not"
+            )
         found = recorded_latencies(opened, resolved_graph(opened) or recorded_graph(opened))
     if not found:
         raise fail(f"{recording}: no firing of a sink is recorded that a source's message caused")

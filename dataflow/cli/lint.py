@@ -125,8 +125,10 @@ def _print(report: Report, prefix: str) -> None:
         out.print(line, soft_wrap=True)
     if report.findings:
         out.print(Text(plural(len(report.findings), "finding"), style="bold"))
-    else:
+    elif report.timings:
         out.print(Text("nothing was found", style="green"))
+    else:
+        out.print(Text("there is no stream that could be looked at", style="yellow"))
 
 
 def _deviating(value: float, deviation: float) -> str:

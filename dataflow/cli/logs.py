@@ -32,7 +32,6 @@ def logs(
         list[str] | None,
         typer.Option(
             "--operator",
-            "-o",
             metavar="NAME",
             autocompletion=running_operators,
             help="Only this operator or process. May be repeated.",

@@ -34,7 +34,8 @@ def set_(
     It changes between two firings; the value that the operator took is printed. The change stands in the recording at
     its place, and `verify` repeats it there. `dataflow param list` tells which parameters can change.
 
-    Exit codes: 0 changed; 1 refused, or nobody answered; 2 no such graph or operator.
+    Exit codes: 0 changed; 1 refused (no such parameter, a value that it cannot take), or nobody answered; 2 no such
+    graph or operator.
 
     Examples:
 

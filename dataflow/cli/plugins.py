@@ -10,6 +10,7 @@ from __future__ import annotations
 import traceback
 from collections.abc import Mapping
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -17,7 +18,7 @@ from rich.markup import escape
 from typer.core import TyperGroup
 
 from dataflow.cli.arguments import FLAG
-from dataflow.cli.commands import Commands
+from dataflow.cli.commands import Commands, paragraphs
 from dataflow.cli.output import COULD_NOT_RUN, err, fail, say, wants_traceback
 from dataflow.cli.values import take_plainly
 
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 GROUP = "dataflow.commands"
 PANEL = "Commands of other packages"
 BROKEN_PANEL = "Commands that do not load"
+NAMES = {int: "N", float: "X", str: "TEXT", Path: "PATH"}
+"""The name of a value in the help, by its type."""
 
 
 @cache
@@ -37,7 +40,7 @@ def advertised() -> Mapping[str, EntryPoint]:
     return {entry.name: entry for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value))}
 
 
-RENAMED = {"one-host": "one-process", "host-each": "process-each", "patience": "timeout"}
+RENAMED = {"one-host": "one-process", "host-each": "process-each", "patience": "timeout", "streams": "stream"}
 """Options by their names of the version before, which still work in this one."""
 
 
@@ -92,17 +95,33 @@ class CommandGroup(TyperGroup):
 
 
 def tidy(command: Any, ctx: Any) -> None:
-    """Makes the help of a command and its subcommands alike: no type beside flags, no options to install completion."""
+    """Makes the help of a command and its subcommands alike.
+
+    Examples stay on lines of their own, values have a name in capitals and not a type, flags have neither, and there
+    are no options to install completion.
+    """
+    if command.help:
+        command.help = paragraphs(command.help)
     command.params = [p for p in command.params if p.name not in ("install_completion", "show_completion")]
     own = type(ctx)(command, help_option_names=ctx.help_option_names)
     helping = command.get_help_option(own)
     take_plainly(helping)
     for param in (*command.params, helping):
-        if getattr(param, "is_bool_flag", False) and param.metavar is None and not param.secondary_opts:
-            param.metavar = FLAG
+        if param.metavar is None:
+            param.metavar = _metavar(param)
     for inner in getattr(command, "commands", {}).values():
         if inner is not command:
             tidy(inner, ctx)
+
+
+def _metavar(param: Any) -> str | None:
+    """The name of a parameter's value in the help, where its declaration has none."""
+    if getattr(param, "is_bool_flag", False):
+        return FLAG
+    if param.param_type_name == "argument":
+        return str(param.name).upper()
+    declared = getattr(param, "type_descriptor", None)  # an older Typer has none
+    return None if declared is None else NAMES.get(declared.annotation)
 
 
 def load(entry: EntryPoint) -> Any:

@@ -29,7 +29,8 @@ def record(
         typer.Option("--out", "-o", metavar="OUT.mcap", help="The file to write; NAME_000.mcap and so on if split."),
     ] = Path("recording.mcap"),
     split_every: Annotated[
-        str | None, typer.Option("--split-every", metavar="TIME", help="A new file after so much event time: 60s, 5m.")
+        str | None,
+        typer.Option("--split-every", metavar="TIME", help="A new file after this event time: 60s, 5min."),
     ] = None,
     split_size: Annotated[
         str | None, typer.Option("--split-size", metavar="SIZE", help="A new file after so many bytes: 500MB, 2GB.")

@@ -73,6 +73,8 @@ def info(
     namespace = described.metadata.get(RECORDING, {}).get("namespace", "")
     out.print(_facts(described))
     out.print(_streams(described, namespace))
+    if silent := _silent(described, namespace):
+        out.print(Text(silent, style="dim"))
     if described.events:
         out.print(_mapping("events", described.events))
     for name, digest in (computed or {}).items():
@@ -142,6 +144,8 @@ def _streams(described: Description, namespace: str) -> Table:
     numbers = ("messages", "Hz", "size")
     made = table("stream", "type", *numbers, "", right=numbers)
     for s in described.streams:
+        if not s.count:
+            continue
         notes = ["static"] if s.static else []
         notes += [f"{s.incarnations} incarnations"] if s.incarnations > 1 else []
         notes += [f"unsupported encoding ({s.encoding})"] if not s.readable else []
@@ -152,6 +156,12 @@ def _streams(described: Description, namespace: str) -> Table:
         row = (_relative(s.name, namespace), kind, count(s.count), rate, size(s.bytes), ", ".join(notes))
         made.add_row(*map(Text, row))
     return made
+
+
+def _silent(described: Description, namespace: str) -> str:
+    """Names the streams without a message, as those of a sensor that is off are."""
+    names = [_relative(s.name, namespace) for s in described.streams if not s.count]
+    return f"without messages: {', '.join(names)}" if names else ""
 
 
 def _relative(stream: str, namespace: str) -> str:

@@ -19,7 +19,6 @@ from dataflow.cli.arguments import (
     Network,
     Settings,
     Start,
-    existing,
     existing_recording,
     find_modules_in,
     graph_file,
@@ -160,7 +159,7 @@ def replay(
                 raise fail(f"{recording} does not hold the graph that made it: name one with --graph")
             if complete is not None:
                 raise fail("--complete needs the firing records of a run, which bags do not hold")
-            loaded = load_graph(existing(graph, "a graph file"), settings=settings or ())
+            loaded = load_graph(graph_file(graph), settings=settings or ())
             outputs = checked_outputs(record, view, open_view, overwrite)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
             options |= {"early": early, "paused": step, "controls": keys(quiet or json)}

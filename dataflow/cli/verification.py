@@ -17,6 +17,7 @@ from dataflow.cli.arguments import (
     existing,
     find_modules_in,
     graph_file,
+    offset,
     output_file,
 )
 from dataflow.cli.output import (
@@ -72,8 +73,10 @@ def verify(
         float | None,
         typer.Option(
             "--start",
-            metavar="S",
-            help="Begin S seconds after the recording's first message, from the states that it holds there.",
+            metavar="TIME",
+            parser=offset,
+            help="Begin so long after the recording's first message (seconds, or 500ms, 2min), from the states that it "
+            "holds there.",
         ),
     ] = None,
     baseline: Annotated[

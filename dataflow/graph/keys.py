@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Sequence
 
 _NAME = re.compile(r"[^\W\d][\w-]*")
 _REPEATED = re.compile(r"(\$\*){2,}")
+_BARE_STAR = re.compile(r"(?<!\$)\*")
 _WITHIN = re.compile(r"\$\*|.", re.DOTALL)
 
 
@@ -55,6 +56,11 @@ def canonical(key: str) -> str:
         elif chunk != "**":
             chunks.append(chunk)
     return "/".join(chunks)
+
+
+def as_expression(pattern: str) -> str:
+    """Returns the key expression for a pattern as people write it: the `*` of `image*`, too, is any characters."""
+    return "/".join(c if c in ("*", "**") else _BARE_STAR.sub("$*", c) for c in pattern.split("/"))
 
 
 def has_wildcard(key: str) -> bool:

@@ -94,5 +94,12 @@ def play(
     return BagStreams(path, match(path, graph, words).played(), clock, watch=watch)
 
 
+def readable(bag: Bag, path: Path, clock: Choice = "auto", topics: Collection[str] | None = None) -> BagStreams:
+    """Opens all topics of a bag, or some, that a message type fits, each under its own name. Raises `BagError`."""
+    found = [r for r in readings_of(bag, topics) if r.playable and r.topic.count]
+    played = {r.topic.name: Played(r.topic.name, r.read_as.SCHEMA) for r in found if r.read_as is not None}
+    return BagStreams(path, played, clock)
+
+
 def _types(reading: Reading) -> tuple[str, ...]:
     return () if reading.read_as is None else tuple(t.SCHEMA for t in offers(reading.read_as))

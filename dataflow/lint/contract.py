@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_valida
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from dataflow.graph.keys import canonical, key_fault, matching
+from dataflow.graph.keys import as_expression, canonical, key_fault, matching
 from dataflow.graph.problems import did_you_mean
 from dataflow.lint.material import StreamFacts
 from dataflow.lint.timing import Timing
@@ -94,7 +94,7 @@ class Contract(_Section):
 
 def means(word: str, stream: str, namespace: str) -> bool:
     """Tells whether a name or pattern of a contract means a stream."""
-    bare, key = word.strip("/"), stream.strip("/")
+    bare, key = as_expression(word.strip("/")), stream.strip("/")
     readings = (bare, f"{namespace}/{bare}") if namespace else (bare,)
     return any(matching(canonical(reading), [key]) for reading in readings)
 
@@ -116,7 +116,7 @@ def load_contract(path: Path) -> Contract:
         text = "unknown key" if hint else str(first["msg"]).removeprefix("Value error, ")
         raise ContractError(f"{path}: {where}: {text}{hint}") from None
     for word in found.streams:
-        if (fault := key_fault(word.strip("/"))) is not None:
+        if (fault := key_fault(as_expression(word.strip("/")))) is not None:
             raise ContractError(f"{path}: streams.{word}: {fault}")
     return found
 

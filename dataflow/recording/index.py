@@ -167,8 +167,11 @@ class McapFile:
         return times, weights
 
     def _load(self) -> Contents:
-        if self._file.read_up_to(0, len(MAGIC)) != MAGIC:
-            raise RecordingError(f"{self._file.path} is not an MCAP file: it does not begin with the MCAP magic bytes")
+        head = self._file.read_up_to(0, 16)
+        if not head.startswith(MAGIC):
+            path = self._file.path
+            bag = f"; of a ROS bag, `dataflow convert {path} OUT.mcap --to mcap` makes one" if _is_bag(head) else ""
+            raise RecordingError(f"{path} is not an MCAP file: it does not begin with the MCAP magic bytes{bag}")
         self._load_header()
         footer = read_footer(self._file)
         self.torn = footer is None
@@ -228,3 +231,8 @@ class McapFile:
     def _misplaced(self, chunk: int, offset: int, where: str) -> DamagedError:
         within = "the file" if chunk == UNCHUNKED else self._chunks.where(chunk)
         return self._file.damaged(f"its index points to byte {offset} of {within}, {where}")
+
+
+def _is_bag(head: bytes) -> bool:
+    """Tells whether a file begins as a ROS 1 bag does, or a ROS 2 bag in SQLite."""
+    return head.startswith((b"#ROSBAG V", b"SQLite format 3"))

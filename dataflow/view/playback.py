@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
+from typing import Protocol
 
 from dataflow.graph.model import Graph
 from dataflow.graph.sections import PLACE_FRAMES
 from dataflow.messages import Alarm, Message
-from dataflow.recording import LogLine, Recorded, Recording
+from dataflow.recording import LogLine, Recorded, Recording, StreamInfo
 from dataflow.recording.layout import RECORDING, logs_topic
 from dataflow.records.figures import recorded_summaries
 from dataflow.view.process import ViewerError
@@ -18,13 +19,24 @@ from dataflow.view.sink import ViewerSink
 _PATIENCE = 30.0  # seconds without progress after which a viewer counts as stalled
 
 
+class RecordedStreams(Protocol):
+    """Streams of messages by name, of a recording or of a bag of another system."""
+
+    streams: Mapping[str, StreamInfo]
+
+    def messages(
+        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
+    ) -> Iterator[Recorded]:
+        """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream); static streams first and whole."""
+
+
 def as_alarm(line: LogLine, clock: int) -> Alarm:
     """A line of the log as the message that is drawn, at its event time or, where it has none, at `clock`."""
     return Alarm(stamp=line.stamp or clock, level=line.level, name=line.name, text=line.text)
 
 
 def from_recording(
-    recording: Recording,
+    recording: RecordedStreams,
     sink: ViewerSink,
     streams: Sequence[str] | None = None,
     start: int | None = None,
@@ -37,7 +49,7 @@ def from_recording(
 
     Static streams come first and whole; of the others, messages with start ≤ stamp ≤ end (ns). `graph` says what is
     drawn over what, and what is hidden. Frames are placed by what is recorded of them, whatever is shown. The run's log
-    is shown too where all streams are, and its scores where there is a graph. Waits for the
+    is shown too where all streams are, and its scores where there is a graph; a bag has neither. Waits for the
     viewer instead of dropping. `progress` is called with each stamp. Returns how many messages were handed over; the
     sink stays open. Raises `ViewerError` for a viewer that cannot be reached or takes nothing for 30 s,
     `RecordingError` for an unknown stream and for data that does not decode.
@@ -55,13 +67,14 @@ def from_recording(
     }
     static = [name for name in (*types, *others) if readable[name].static]
     lines: Sequence[tuple[int, LogLine]] = ()
-    if types.keys() >= readable.keys():
+    logs = ""
+    if isinstance(recording, Recording) and types.keys() >= readable.keys():
         lines = [entry for entry in recording.logs() if (start or 0) <= entry[0] and (end is None or entry[0] <= end)]
-    logs = logs_topic(recording.metadata.get(RECORDING, {}).get("namespace", ""))
+        logs = logs_topic(recording.metadata.get(RECORDING, {}).get("namespace", ""))
     if lines:
         types[logs] = Alarm
     sink.open(types | others, graph, static, hidden=others)
-    if graph is not None:
+    if graph is not None and isinstance(recording, Recording):
         judges = (name for name, node in graph.nodes.items() if not node.outputs)
         sink.scores(recorded_summaries(recording, judges))
     wanted = None if streams is None else [*streams, *others]

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Activity, Odometry, Pose, SceneGraph
-from dataflow.messages.geometry import yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
-from operators.recognition.agent_features import AGENTS, MATTERING, AgentWindow, Surroundings
+from operators.recognition.agent_features import AGENTS, AgentWindow, Surroundings
+from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
 from operators.scene.bodies import Body
 from operators.weights import shipped
@@ -65,8 +65,8 @@ class ActivityRecognizer(Operator):
         """Raises ValueError where the robot is in another frame than the nodes."""
         if robot is not None and robot.frame != nodes.frame:
             raise ValueError(f"the robot is in {robot.frame!r}, the nodes in {nodes.frame!r}")
-        bodies, unusable = _mattering(nodes)
-        seen = _seen(nodes)
+        bodies, unusable = mattering(nodes)
+        seen = seen_times(nodes)
         time = nodes.stamp * 1e-9
         self._around.update(time, bodies)
         agents = sorted((b for b in bodies if b.label in AGENTS), key=lambda b: b.id)
@@ -137,27 +137,3 @@ class ActivityRecognizer(Operator):
             objects=objects,
             since=np.array([self._agents[b.id].since for b in agents], np.int64),
         )
-
-
-def _seen(nodes: SceneGraph) -> dict[int, int]:
-    """Returns when each node was last seen, ns; the graph's own stamp where it does not say."""
-    times = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
-    return dict(zip(nodes.ids.tolist(), times.tolist(), strict=True))
-
-
-def _mattering(nodes: SceneGraph) -> tuple[list[Body], int]:
-    """Returns the nodes that features are made of as upright bodies, and how many of these are not usable."""
-    labels = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
-    rows = [k for k, label in enumerate(labels) if label in MATTERING and nodes.ids[k] > 0]
-    finite = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
-    usable = np.asarray(finite & (nodes.sizes >= 0).all(axis=1), bool)
-    yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
-    still = np.zeros(3)
-    bodies = [
-        Body(
-            int(nodes.ids[k]), labels[k], nodes.positions[k], nodes.sizes[k], float(yaws[k]), still, labels[k] in AGENTS
-        )
-        for k in rows
-        if usable[k]
-    ]
-    return bodies, len(rows) - len(bodies)

@@ -35,7 +35,7 @@ def sequences(moments: Iterator[Moment], agents: Sequence[int]) -> list[Track]:
     found: list[Track] = []
     for moment in moments:
         around.update(moment.time, moment.bodies)
-        there = {b.id: b for b in moment.bodies if b.id in set(agents)}
+        there = {b.id: b for b in moment.bodies if b.id in moment.unseen and b.id in set(agents)}
         for i in [i for i in open_ if i not in there]:
             found.append(_closed(i, open_.pop(i)))
             del windows[i]

@@ -25,6 +25,7 @@ from operators.recognition.activity_samples import (
 from operators.recognition.activity_score import macro_f1
 from operators.recognition.agent_features import NAMES
 from operators.recognition.episodes import Episode
+from operators.recognition.sensed_people import SensedTrack
 from operators.sources.simulator.classes import ACTIVITIES
 from operators.training.export import export_steps
 
@@ -60,7 +61,10 @@ _AROUND.append(([NAMES.index("distance of the robot")], np.array([0.5], np.float
 
 
 class ActivityTask:
-    """Trains an ActivityNetwork on episodes: each as it is, and `variations` times as a tracker would have it."""
+    """Trains an ActivityNetwork on episodes: each as it is, and `variations` times as a tracker would have it.
+
+    `sensed` tracks are trained on as they are, each `repeats` times.
+    """
 
     kind = KIND
 
@@ -69,6 +73,9 @@ class ActivityTask:
         training: Sequence[Episode],
         validation: Sequence[Episode],
         *,
+        sensed: Sequence[SensedTrack] = (),
+        sensed_validation: Sequence[SensedTrack] = (),
+        repeats: int = 4,
         seed: int = 0,
         variations: int = 6,
         width: int = 96,
@@ -82,12 +89,21 @@ class ActivityTask:
             for k, episode in enumerate(training)
             for track in drawn(episode, np.random.default_rng((seed, k)), variations)
         ]
+        self._training += [
+            (track.features, track.labels, np.where(track.plain, 1.0, _UNSEEN))
+            for track in sensed
+            for _ in range(repeats)
+        ]
+        self._sensed = len(sensed)
         self._validation = scored_tracks(validation, seed)
+        if sensed_validation:
+            self._validation["sensed"] = [(t, t.now, t.right) for t in sensed_validation]
         self.activities = ActivityNetwork(len(NAMES), len(ACTIVITIES), width)
         every = np.concatenate([features for features, _, _ in self._training])
         self.activities.mean.copy_(torch.from_numpy(every.mean(axis=0)))
         self.activities.scale.copy_(torch.from_numpy(np.maximum(every.std(axis=0), 0.05)))
-        counts = np.bincount(np.concatenate([labels for _, labels, _ in self._training]), minlength=len(ACTIVITIES))
+        known = np.concatenate([labels[labels >= 0] for _, labels, _ in self._training])
+        counts = np.bincount(known, minlength=len(ACTIVITIES))
         weights = (counts.sum() / np.maximum(counts, 1)) ** 0.5
         self._weights = torch.from_numpy((weights / np.average(weights, weights=counts)).astype(np.float32))
 
@@ -105,6 +121,7 @@ class ActivityTask:
             "features": list(NAMES),
             "episodes": self._episodes,
             "variations": self._variations,
+            "sensed": self._sensed,
             "width": self.activities.width,
         }
 
@@ -127,7 +144,7 @@ class ActivityTask:
         return {"entropy": (each * weights.flatten()).sum() / weights.sum().clamp(min=1.0)}
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:
-        """Scores by the mean of the macro-F1 over true and over tracked agents, of the worlds to choose by."""
+        """Scores by the mean of the macro-F1 over true, tracked and sensed agents, of the worlds to choose by."""
         found = {fed: score_of(network, tracks, self.classes) for fed, tracks in self._validation.items()}
         return {"score": float(np.mean(list(found.values()))), **found}
 
@@ -142,6 +159,7 @@ class ActivityTask:
             "width": network.width,
             "lag": LAG,
             "training_episodes": self._episodes,
+            "sensed_tracks": self._sensed,
             **facts,
         }
         step = ActivityStep(copy.deepcopy(network).cpu())
@@ -202,7 +220,7 @@ def drawn(episode: Episode, rng: np.random.Generator, variations: int) -> list[T
     return tracks
 
 
-Scored = list[tuple[Track, NDArray[np.int64], NDArray[np.bool_]]]
+Scored = list[tuple[Track | SensedTrack, NDArray[np.int64], NDArray[np.bool_]]]
 
 
 def scored_tracks(episodes: Sequence[Episode], seed: int) -> dict[str, Scored]:
@@ -227,7 +245,7 @@ def score_of(network: nn.Module, tracks: Scored, classes: Sequence[str]) -> floa
         with torch.inference_mode():
             scores = network(torch.from_numpy(track.features)[None].to(device))[0].softmax(dim=1).cpu().numpy()
         best = scores.argmax(axis=1)
-        for k in np.flatnonzero(track.seen):
+        for k in np.flatnonzero(track.plain if isinstance(track, SensedTrack) else track.seen):
             answer = classes[best[k]] if scores[k, best[k]] >= _LEAST else "unknown"
             true.append(classes[now[k]])
             said.append(classes[now[k]] if answer != "unknown" and right[k, best[k]] else answer)

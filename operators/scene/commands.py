@@ -42,22 +42,28 @@ def show(
     export: Annotated[
         Path | None, typer.Option(metavar="FILE.json", help="Write it for Spark-DSG, which Hydra's tools open.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --export file if it is there.")] = False,
 ) -> None:
     """Show the scene graph of a recording at a time in short, all its nodes, or what in it a question asks for.
 
     A question names a class and conditions on it: `mug on table near person` is a mug that is on a table and near a
     person. A class may be `anything` or have a number, as in `on table 3`. Exit code 1 where nothing fits.
+
+    Examples:
+
+      dataflow scene out/demo.mcap
+      dataflow scene out/demo.mcap --at 9.2 --query "book in shelf"
+      dataflow scene out/demo.mcap --nodes --json
     """
     try:
         graph, activities, since = _graph(recording, stream, at)
         matches = None if query is None else ask(graph, query)
-    except (QueryError, RecordingError, ValueError, FileNotFoundError) as error:
+        if export is not None:
+            _write(graph, export, overwrite=overwrite)
+    except (QueryError, RecordingError, ValueError, OSError) as error:
         Console(stderr=True).print(f"[bold red]error:[/bold red] {escape(str(error))}", highlight=False, soft_wrap=True)
         raise typer.Exit(2) from None
     names = graph.names()
-    if export is not None:
-        export.parent.mkdir(parents=True, exist_ok=True)
-        export.write_text(jsonlib.dumps(as_spark_dsg(graph)), encoding="utf-8")
     if json:
         content = as_json(graph)
         if matches is not None:
@@ -82,6 +88,13 @@ def show(
         raise typer.Exit(1)
 
 
+def _write(graph: SceneGraph, file: Path, *, overwrite: bool) -> None:
+    if file.exists() and not overwrite:
+        raise FileExistsError(f"{file} exists; name another file, or replace it with --overwrite")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(jsonlib.dumps(as_spark_dsg(graph)), encoding="utf-8")
+
+
 def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph, Activity | None, float]:
     """Returns the newest graph at a time, its operator's activities then, and its age (s) since the recording began."""
     if not path.is_file():
@@ -90,6 +103,9 @@ def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph
         known = [n for n, info in recording.streams.items() if info.message_type is SceneGraph]
         wanted = [n for n in known if stream is None or n == stream or n.endswith(f"/{stream}")]
         built = [n for n in wanted if n.endswith("/graph")] or wanted
+        if not known:
+            made = f"dataflow replay {path} --graph perception --record OUT.mcap"
+            raise ValueError(f"{path} holds no scene graph; a graph that makes one, of a robot's camera: {made}")
         if len(built) != 1:
             there = ", ".join(known) or "none"
             raise ValueError(f"{path} has no single scene graph to show; give --stream one of: {there}")

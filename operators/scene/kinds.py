@@ -24,8 +24,11 @@ class Kinds:
         movers: Iterable[int],
         usual: Mapping[int, Sequence[Usual]],
         telling: Mapping[int, float] | None = None,
+        carriers: Iterable[int] = (),
+        portable: Iterable[int] = (),
     ) -> None:
-        """`telling` says how much a label counts, where that is not 1."""
+        """`telling` says how much a label counts, where that is not 1; `carriers` may hold what is `portable`."""
+        self.carriers, self.portable = frozenset(carriers), frozenset(portable)
         self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
 
     def vote(self, class_id: int, score: float) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 
 from operators.cloud.clustering import upright_box
 from operators.cloud.filtering import Voxels
+from operators.scene.body_points import beyond, body_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -23,6 +24,7 @@ _FEWEST = 5  # points of a part
 _WHOLE = 0.6  # overlap from which points without a gap in range are not divided
 _MIDDLE = 0.5  # what holding all points in the middle of a box counts, beside the overlap
 _SAME = 0.5  # overlap from which two boxes are around the same thing
+_SAME_BODY = 0.2  # that overlap where most of the points are in both
 _SMALLER = 4.0  # times smaller, and a box in another is in front
 _LEFT = 0.3  # share of its points that an object keeps
 _DENSE = 256  # so many places are compared each with each
@@ -39,6 +41,7 @@ class LiftSettings:
     min_overlap: float = 0.3
     slab: float = 0.03
     mask_share: float = 0.15
+    body_share: float = 0.08
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +95,12 @@ class _Part:
 
 
 def lift(
-    seen: Seen, boxes: Array, mask_classes: Sequence[int], background: Sequence[int], s: LiftSettings
+    seen: Seen,
+    boxes: Array,
+    mask_classes: Sequence[int],
+    background: Sequence[int],
+    s: LiftSettings,
+    bodies: Collection[int] = (),
 ) -> list[Lifted]:
     """Finds the object of each image box (M, 4) among a cloud's points; boxes without one are left out.
 
@@ -100,6 +108,9 @@ def lift(
     it that make the overlap better. `mask_classes` (M,) is the mask's class of each box, -1 for none. Where the box
     holds enough of it, only such points count. Otherwise points of `background` classes and on level surfaces that
     reach beyond the box do not. Points go to the box that they fit best, once.
+
+    Of the boxes in `bodies` the mask tells more than the edges: such an object is what of its mask hangs together, also
+    beyond the box, and how much of the mask in the box it is counts in place of the overlap.
     """
     candidates: list[tuple[int, Indices, float]] = []
     inside = np.flatnonzero(seen.inside)
@@ -119,9 +130,16 @@ def lift(
             rows = _off_support(seen, near[inner], around, s)
         else:
             of_class = inner & (classes[first:last] == mask_classes[k])
-            if mask_classes[k] >= 0 and np.count_nonzero(of_class) >= max(
-                s.min_points, s.mask_share * np.count_nonzero(inner)
-            ):
+            share = s.body_share if k in bodies else s.mask_share
+            masked = mask_classes[k] >= 0 and np.count_nonzero(of_class) >= max(
+                s.min_points, share * np.count_nonzero(inner)
+            )
+            if k in bodies:
+                own = classes == mask_classes[k]
+                body = _body(seen, columns, lines, own, order, (left, upper, right, lower), s) if masked else None
+                candidates += [] if body is None else [(k, *body)]
+                continue
+            if masked:
                 rows = near[of_class]
             else:
                 around = near[~inner & (v >= upper - ring[1]) & (v <= lower + ring[1])]
@@ -129,7 +147,7 @@ def lift(
         found = _object(seen, np.sort(rows), (left, upper, right, lower), s)
         if found is not None:
             candidates.append((k, *found))
-    owned = _divided(seen.pixels, boxes, candidates)
+    owned = _divided(seen.pixels, boxes, candidates, bodies)
     kept = [
         Lifted(k, own, value, *upright_box(seen.points[own], seen.up))
         for (k, points, value), own in zip(candidates, owned, strict=True)
@@ -138,7 +156,37 @@ def lift(
     return sorted(kept, key=lambda c: c.detection)
 
 
-def _divided(pixels: Array, boxes: Array, candidates: Sequence[tuple[int, Indices, float]]) -> list[Indices]:
+def _body(
+    seen: Seen,
+    columns: Array,
+    lines: Array,
+    own: Mask,
+    order: Indices,
+    box: tuple[float, float, float, float],
+    s: LiftSettings,
+) -> tuple[Indices, float] | None:
+    """Returns the points of the body that a box is around, and the share of its mask in the box that they are.
+
+    `columns`, `lines` and `own`, whether it is of the mask, are of the points `order`, by rising column.
+    """
+    left, upper, right, lower = beyond(box)
+    first, last = np.searchsorted(columns, [left, right])
+    u, v = columns[first:last], lines[first:last]
+    taken = own[first:last] & (v >= upper) & (v <= lower)
+    u, v, rows = u[taken], v[taken], order[first:last][taken]
+    points = seen.points[rows]
+    reach = s.reach + s.reach_growth * float(np.sqrt(np.median((points * points).sum(axis=1))))
+    voxels = Voxels.by_size(points.astype(np.float32), reach / 2)
+    inner = (u >= box[0]) & (u <= box[2]) & (v >= box[1]) & (v <= box[3])
+    found = body_of(points, inner, _linked(voxels.means(points), reach)[voxels.of], seen.up)
+    if found is None or len(found[0]) < s.min_points or found[1] < s.min_overlap:
+        return None
+    return np.sort(rows[found[0]]), found[1]
+
+
+def _divided(
+    pixels: Array, boxes: Array, candidates: Sequence[tuple[int, Indices, float]], bodies: Collection[int]
+) -> list[Indices]:
     """Returns what each candidate (box, points, overlap) keeps of its points: each goes to one.
 
     Of boxes around the same thing the better one gets all. Of others a much smaller one does, since it is in front;
@@ -155,9 +203,12 @@ def _divided(pixels: Array, boxes: Array, candidates: Sequence[tuple[int, Indice
         wins = before < 0
         for rival in np.unique(before[~wins]).tolist():
             other = candidates[rival][0]
-            same = _overlap(tuple(boxes[k].tolist()), tuple(boxes[other].tolist())) >= _SAME
+            alike = _overlap(tuple(boxes[k].tolist()), tuple(boxes[other].tolist()))
+            same = alike >= _SAME
             ratio = float(np.prod(sides[k]) / np.prod(sides[other]))
             nearer = away < distance[points] if 1 / _SMALLER < ratio < _SMALLER else ratio <= 1 / _SMALLER
+            shared = int(np.count_nonzero(before == rival)) if {k, other} <= set(bodies) else 0
+            same = same or (alike >= _SAME_BODY and shared >= len(points) // 2)
             wins |= (before == rival) & np.asarray(nearer & (not same))
         owner[points[wins]], distance[points[wins]] = c, away[wins]
     return [points[owner[points] == c] for c, (_, points, _) in enumerate(candidates)]

@@ -91,10 +91,17 @@ class MapObject:
             self.images.pop(_most_alike([v.eye - self.center for v in self.images]))
         return True
 
-    def fit(self, usual: Mapping[int, Sequence[Usual]], heading: float | None = None, noise: float = 0.0) -> None:
+    def fit(
+        self,
+        usual: Mapping[int, Sequence[Usual]],
+        heading: float | None = None,
+        noise: float = 0.0,
+        floor: float | None = None,
+    ) -> None:
         """Puts the box around what is surely the object's, in agreement with its images and with its class.
 
-        `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square.
+        `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square. How high
+        it reaches over the `floor`, if that is known, tells which of the ways in which its class stands is its own.
         """
         sure = self.cells.sure()
         if not len(sure):
@@ -107,7 +114,10 @@ class MapObject:
             form, box = fit_cuboid(box, self.images, sure[:: -(-len(sure) // _POINTS)], known, before, heading, noise)
             self.form = form if len(self.images) >= _SETTLED else -1
         elif known:
-            box = completed(box, self.view / max(self.views, 1), known[0])
+            stands = floor is not None and any(u.on_floor for u in known)
+            height = float(box[0][2] + box[1][2] / 2) - floor if stands and floor is not None else float(box[1][2])
+            usually = min(known, key=lambda u: abs(math.log(u.size[2] / max(height, 0.01)))) if stands else known[0]
+            box = completed(box, self.view / max(self.views, 1), usually)
         self.center, self.size, self.yaw = box
 
     def stand_on(self, floor: float) -> None:

@@ -61,6 +61,8 @@ class ObjectLifter(Operator):
     status: Out[Diagnostics] = Out(doc="detections with and without an object; a warning where all are without")
 
     min_score: float = Param(0.3, ge=0, le=1, live=True, doc="weaker detections are not lifted")
+    bodies: list[str] = Param(["person"], doc="classes of which masks tell more than the edges of boxes do")
+    min_body_score: float = Param(0.2, ge=0, le=1, live=True, doc="weaker detections of these, with masks, are not")
     min_points: int = Param(8, ge=5, live=True, doc="fewest points of an object")
     min_overlap: float = Param(0.3, gt=0, le=1, live=True, doc="least IoU of an object's image with its box")
     max_range: float = Param(6.0, gt=0, live=True, doc="farther points are not used", unit="m")
@@ -93,8 +95,10 @@ class ObjectLifter(Operator):
         masks = self._masks(detections, segmentation)
         T_image_cloud = transform_between(extrinsics, cloud.frame, detections.frame)
         seen = _seen(points, T_image_cloud, image_info, masks, up)
-        rows = np.flatnonzero(detections.scores >= np.float32(self.min_score))
         names = detections.labels()
+        body = np.array([masks is not None and name in self.bodies for name in names], bool)
+        least = np.where(body, np.float32(self.min_body_score), np.float32(self.min_score))
+        rows = np.flatnonzero(detections.scores >= least)
         known = {} if masks is None else {name: k for k, name in enumerate(masks.class_names)}
         background = [k for name, k in known.items() if name not in detections.class_names]
         settings = LiftSettings(
@@ -104,8 +108,8 @@ class ObjectLifter(Operator):
             min_points=self.min_points,
             min_overlap=self.min_overlap,
         )
-        boxes = detections.boxes[rows].astype(np.float64)
-        found = lift(seen, boxes, [known.get(names[k], -1) for k in rows], background, settings)
+        boxes, bodies = detections.boxes[rows].astype(np.float64), frozenset(np.flatnonzero(body[rows]).tolist())
+        found = lift(seen, boxes, [known.get(names[k], -1) for k in rows], background, settings, bodies)
         labels = np.full(cloud.count, -1, np.int32)
         for number, each in enumerate(found):
             labels[usable[each.points]] = number

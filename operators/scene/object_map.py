@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.scene.carrying import in_hand, taken
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
@@ -57,9 +58,15 @@ class ObjectMap:
         settings: MapSettings,
         usual: Mapping[int, Sequence[Usual]] | None = None,
         telling: Mapping[int, float] | None = None,
+        carriers: Iterable[int] = (),
+        portable: Iterable[int] = (),
     ) -> None:
-        """`usual` are the sizes of classes whose size is known, `telling` how much their labels count, where not 1."""
-        self._settings, self._classes, self._kinds = settings, classes, Kinds(movers, usual or {}, telling)
+        """`usual` are the sizes of classes whose size is known, `telling` how much their labels count, where not 1.
+
+        What is `portable` may be in the hands of `carriers`.
+        """
+        self._settings, self._classes = settings, classes
+        self._kinds = Kinds(movers, usual or {}, telling, carriers, portable)
         self.objects: dict[int, MapObject] = {}
         self.gone: dict[int, tuple[int, MapObject]] = {}
         self.moved = 0
@@ -84,8 +91,12 @@ class ObjectMap:
             for each in seen
         ]
         joined = self._joined(seen, cells, stamp, view)
+        carried = self._carried(seen, cells, joined, view)
         for k, each in enumerate(seen):
-            if k in joined:
+            if k in carried:
+                self._see(self.objects[carried[k]], each, cells[k], stamp, view.origin, moved=True)
+                joined[k] = carried[k]
+            elif k in joined:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
                 self._begin(each, cells[k], stamp, view.origin)
@@ -138,9 +149,35 @@ class ObjectMap:
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
 
-    def _see(self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
-        mover = self._kinds.is_mover(object)
-        if each.class_id in self._kinds.movers and outside(cells.middle, object.box) > _GONE * float(object.size.max()):
+    def _carried(
+        self, seen: Sequence[Observation], cells: Sequence[Cells], joined: Mapping[int, int], view: RangeView
+    ) -> dict[int, int]:
+        """Returns the object's id of each observation that is of none where it lay, but of one in somebody's hand."""
+        free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in self._kinds.portable]
+        hands = [self.objects[i] for k, i in joined.items() if seen[k].class_id in self._kinds.carriers]
+        if not free or not hands:
+            return {}
+        there = set(joined.values())
+        things = [
+            o for i, o in sorted(self.objects.items())
+            if i not in there and o.class_id in self._kinds.portable and o.views >= self._settings.views
+        ]  # fmt: skip
+        shown = view.may_show(np.array([o.center for o in things]).reshape(-1, 3), np.zeros(len(things)))
+        usable = [o.id for o, plain in zip(things, shown.tolist(), strict=True) if plain]
+        found: dict[int, int] = {}
+        for k in free:
+            id = taken(cells[k].middle, seen[k].class_id, self.objects, usable)
+            if id is not None and in_hand(cells[k].middle, hands):
+                found[k] = id
+                usable.remove(id)
+        return found
+
+    def _see(
+        self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array, *, moved: bool = False
+    ) -> None:
+        mover = moved or self._kinds.is_mover(object)
+        gone = outside(cells.middle, object.box) > _GONE * float(object.size.max())
+        if moved or (each.class_id in self._kinds.movers and gone):
             mover, object.images, object.form = True, [], -1  # what lay still is moved
         direction = _direction(eye, cells)
         object.views += 1
@@ -169,7 +206,7 @@ class ObjectMap:
             self._fit(object)
 
     def _fit(self, object: MapObject) -> None:
-        object.fit(self._kinds.usual, self._heading, self._settings.range_noise)
+        object.fit(self._kinds.usual, self._heading, self._settings.range_noise, self.floor)
         if self.floor is not None and self._kinds.is_on_floor(object):
             object.stand_on(self.floor)
 

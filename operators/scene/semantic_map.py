@@ -87,6 +87,8 @@ class SemanticMap(Operator):
     missed: float = Param(0.12, ge=0, doc="evidence that a view in which it is plain but not detected takes")
     plain: float = Param(0.03, gt=0, doc="angle of view from which an object should be detected", unit="rad")
     movers: list[str] = Param(["person", "robot", "ball"], doc="classes that move by themselves")
+    carriers: list[str] = Param(["person"], doc="classes that have things in their hands")
+    portable: list[str] = Param(["mug", "bottle"], doc="classes of such things")
     mover_memory: float = Param(8.0, gt=0, doc="time out of sight after which such objects are forgotten", unit="s")
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
     surface_views: int = Param(2, ge=1, doc="views of a surface from which it is given")
@@ -215,7 +217,10 @@ class SemanticMap(Operator):
         movers = [k for k, name in enumerate(self._classes) if name in self.movers]
         usual = {k: CLASS_SIZES[name] for k, name in enumerate(self._classes) if name in CLASS_SIZES}
         telling = {k: TELLING[name] for k, name in enumerate(self._classes) if name in TELLING}
-        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, telling)
+        carriers, portable = (
+            [k for k, name in enumerate(self._classes) if name in names] for names in (self.carriers, self.portable)
+        )
+        return ObjectMap(max(len(self._classes), 1), movers, settings, usual, telling, carriers, portable)
 
     def _observation(
         self,

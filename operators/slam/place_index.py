@@ -1,71 +1,66 @@
-"""Places that look alike: views as bags of visual words, compared through an inverted index.
+"""Places that look alike: each feature of a view votes for the views of the map that hold a distinctly near one.
 
-Sivic and Zisserman, "Video Google", 2003. A word is a descriptor's side of random planes (Charikar, "Similarity
-estimation techniques from rounding algorithms", 2002), so there is no vocabulary to be trained or loaded; each
-descriptor has one in every one of several tables, and two that are alike share some of them.
+McCann and Lowe, "Local naive Bayes nearest neighbor for image classification", 2012, on rooted SIFT descriptors
+(Arandjelović and Zisserman, "Three things everyone should know to improve object retrieval", 2012). Distances count as
+they are, not which cell of a vocabulary they fall into, so nothing is trained or loaded. The time grows with the number
+of views.
 """
 
 from __future__ import annotations
 
-from functools import cache
-
 import numpy as np
 from numpy.typing import NDArray
 
-TABLES = 8
-BITS = 11
-WORDS = TABLES << BITS
 LENGTH = 128  # of a descriptor
+KEPT = 256  # descriptors of a view that are looked for
+ASKED = 128  # descriptors of a view that look for others
+CROWD = 10  # a feature votes for views that are nearer to it than the tenth nearest
+UNRELATED = 0.3  # squared distance of unit vectors beyond which descriptors say nothing, however few views there are
 
-Words = NDArray[np.int32]
+Array32 = NDArray[np.float32]
 
 
-@cache
-def _planes() -> NDArray[np.float32]:
-    return np.random.default_rng(20031013).standard_normal((LENGTH, TABLES * BITS)).astype(np.float32)
-
-
-def words_of(descriptors: NDArray[np.uint8]) -> Words:
-    """Returns the different words, ascending, of descriptors (N, 128)."""
-    if not len(descriptors):
-        return np.zeros(0, np.int32)
-    rooted = np.sqrt(descriptors.astype(np.float32))
-    rooted /= np.maximum(np.linalg.norm(rooted, axis=1, keepdims=True), 1e-6)
-    rooted -= 0.0722  # about the mean of a unit vector's entries: the planes then halve the descriptors
-    bits = (rooted @ _planes() > 0).reshape(-1, TABLES, BITS)
-    codes = bits @ (1 << np.arange(BITS))
-    return np.unique(codes + (np.arange(TABLES) << BITS)).astype(np.int32)
+def rooted(descriptors: NDArray[np.uint8], most: int) -> Array32:
+    """Returns unit vectors (N, 128) whose products are Bhattacharyya's coefficients; N is `most` or less."""
+    chosen = descriptors
+    if len(descriptors) > most:
+        chosen = descriptors[np.linspace(0, len(descriptors) - 1, most).astype(np.int64)]
+    roots = np.sqrt(chosen.astype(np.float32))
+    return np.asarray(roots / np.maximum(np.linalg.norm(roots, axis=1, keepdims=True), 1e-6), np.float32)
 
 
 class PlaceIndex:
-    """Views by the words in them: for each word, which views have it. Keys are given once each."""
+    """Views by their descriptors. Keys are given once each."""
 
     def __init__(self) -> None:
         self.keys: list[int] = []
-        self._lengths: list[int] = []
-        self._holders = np.zeros((WORDS, 64), np.uint8)  # (word, view)
+        self._held = np.zeros((16, KEPT, LENGTH), np.float32)  # of each view; rows of zeros are like nothing
 
     def __len__(self) -> int:
         return len(self.keys)
 
-    def add(self, key: int, words: Words) -> None:
+    def add(self, key: int, descriptors: NDArray[np.uint8]) -> None:
+        """Takes a view's descriptors (N, 128)."""
         place = len(self.keys)
-        if place == self._holders.shape[1]:
-            self._holders = np.concatenate([self._holders, np.zeros_like(self._holders)], axis=1)
+        if place == len(self._held):
+            self._held = np.concatenate([self._held, np.zeros_like(self._held)])
+        vectors = rooted(descriptors, KEPT)
+        self._held[place, : len(vectors)] = vectors
         self.keys.append(key)
-        self._lengths.append(len(words))
-        self._holders[words, place] = 1
 
-    def likeness(self, words: Words) -> NDArray[np.float64]:
-        """Returns how much each view, in the order of the keys, has in common with the words.
+    def likeness(self, descriptors: NDArray[np.uint8]) -> NDArray[np.float64]:
+        """Returns how much each view, in the order of the keys, has in common with the descriptors (N, 128).
 
-        It is near 1 for the same words and 0 for none in common; a word counts the more, the fewer views have it.
+        It is the mean over the features of how much nearer the view's nearest one is than that of most other views: 0
+        for nothing in common, at most `UNRELATED`.
         """
         count = len(self.keys)
-        if not count or not len(words):
+        asked = rooted(descriptors, ASKED)
+        if not count or not len(asked):
             return np.zeros(count)
-        held = self._holders[words, :count].astype(np.float32)
-        rarity = np.log((count + 1.0) / (held.sum(axis=1) + 0.5)) ** 2
-        shared = rarity.astype(np.float32) @ held
-        mean = float(rarity.mean())
-        return np.asarray(shared / (mean * np.sqrt(len(words) * np.maximum(self._lengths, 1))), np.float64)
+        products = asked @ self._held[:count].reshape(-1, LENGTH).T
+        distance = 2.0 - 2.0 * products.reshape(len(asked), count, KEPT).max(axis=2)
+        crowd = np.full(len(asked), UNRELATED, np.float32)
+        if count > CROWD:
+            crowd = np.minimum(crowd, np.partition(distance, CROWD, axis=1)[:, CROWD])
+        return np.asarray(np.maximum(crowd[:, None] - distance, 0.0).mean(axis=0), np.float64)

@@ -15,7 +15,7 @@ from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import Node
 from operators.slam.place_graph import PlaceGraph
 from operators.slam.place_index import PlaceIndex
-from operators.slam.sights import Added, PlaceSettings
+from operators.slam.sights import Added, PlaceSettings, Sighting
 from operators.slam.visual_view import Judge, Sight, View, sight
 
 DRIFT = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # what odometry may be off besides: it errs more where things move
@@ -35,7 +35,7 @@ class GraphSettings(PlaceSettings):
     near: int = 2
     alike: int = 2
     searched: int = 4
-    likeness: float = 0.05
+    likeness: float = 0.01
     least: Matrix = field(default_factory=LEAST.copy)
     judge: Judge = field(default_factory=Judge)
 
@@ -62,24 +62,24 @@ class CameraEyes:
         return self.judge.doubt(found) or found
 
 
-class _Words:
+class _Looks:
     """The place index of views."""
 
     def __init__(self) -> None:
         self._index = PlaceIndex()
 
     def add(self, key: int, view: View) -> None:
-        self._index.add(key, view.words)
+        self._index.add(key, view.descriptors)
 
     def likeness(self, view: View) -> dict[int, float]:
-        return dict(zip(self._index.keys, self._index.likeness(view.words).tolist(), strict=True))
+        return dict(zip(self._index.keys, self._index.likeness(view.descriptors).tolist(), strict=True))
 
 
 class VisualGraph(PlaceGraph[View]):
     """The map that a camera makes."""
 
     def __init__(self, settings: GraphSettings) -> None:
-        super().__init__(settings, _Words, between)
+        super().__init__(settings, _Looks, between)
         self._judge = settings.judge
 
     def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> Added:
@@ -92,6 +92,12 @@ class VisualGraph(PlaceGraph[View]):
             CameraEyes(fitter, self._judge, typical_depth(keyframe.surface)),
             lambda: View.of(keyframe, fitter.camera),
         )  # fmt: skip
+
+    def _confirmed(self, k: int, number: int, seen: Sighting) -> bool:
+        """Leaves out surprises that rest on one plane, since two views of a repeated pattern say the same."""
+        if isinstance(seen, Sight) and seen.relief < self._judge.relief:
+            return False
+        return super()._confirmed(k, number, seen)
 
 
 def between(node: Node[View], T_odom: Matrix, covariance_odom: Matrix) -> Matrix:

@@ -24,11 +24,12 @@ from operators.odometry.relocalizer import rough_points
 from operators.odometry.surface import Surface
 from operators.odometry.watch import Watch
 from operators.slam.graph_memory import plain
-from operators.slam.place_index import Words, words_of
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
 SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
+FLAT = 0.05  # metres by which features of one plane may be off it
+TRIPLES = 64  # planes that are tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +61,6 @@ class View:
         )
 
     @cached_property
-    def words(self) -> Words:
-        return words_of(self.descriptors)
-
-    @cached_property
     def description(self) -> Description:
         return Description(self.pixels.astype(np.float64), self.descriptors.astype(np.float32))
 
@@ -72,25 +69,32 @@ class View:
 class Sight:
     """Holds how a camera's view was measured against a known one, and what supports it.
 
-    `inliers` features agree with the pose; `overlap` is the share of the depth image that the known view could see,
-    `agreement` the share of that which lies on its surfaces.
+    `inliers` features agree with the pose, of which `relief` lie off the plane that holds most of them; `overlap` is
+    the share of the depth image that the known view could see, `agreement` the share of that which lies on its
+    surfaces.
     """
 
     T_known_seen: Matrix
     covariance: Matrix  # (6, 6), right perturbation
     matched: int
     inliers: int
+    relief: int
     overlap: float
     agreement: float
 
 
 @dataclass(frozen=True)
 class Judge:
-    """Decides what makes a sight certain enough to correct a map by it."""
+    """Decides what makes a sight certain enough to correct a map by it.
+
+    `relief` features off one plane make a sight one of its place alone: a floor or a wall whose pattern repeats agrees
+    with itself in features and depth where it is shifted by a period.
+    """
 
     inliers: int = 20
     overlap: float = 0.2
     agreement: float = 0.8
+    relief: int = 8
 
     def doubt(self, sight: Sight) -> str:
         """Returns why a sight is not to be believed; nothing for one that is."""
@@ -124,7 +128,26 @@ def sight(known: View, seen: View, fitter: Fitter, fewest: int) -> Sight | None:
     if fit.inliers < fewest:
         return None
     overlap = fit.compared / fit.offered if fit.offered else 0.0
-    return Sight(fit.T_world_camera, SURE * fit.covariance, len(pairs), fit.inliers, overlap, fit.depth_inliers)
+    return Sight(
+        fit.T_world_camera, SURE * fit.covariance, len(pairs), fit.inliers, relief(sighting.points_world), overlap,
+        fit.depth_inliers,
+    )  # fmt: skip
+
+
+def relief(points: NDArray[np.float64]) -> int:
+    """Returns how many of points (N, 3) lie off the plane that holds the most of them, of planes through three each."""
+    if len(points) < 4:
+        return 0
+    rng = np.random.default_rng(len(points))
+    a, b, c = points[np.array([rng.choice(len(points), 3, replace=False) for _ in range(TRIPLES)])].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    sound = lengths > 1e-9
+    if not sound.any():
+        return 0
+    units = normals[sound] / lengths[sound, None]
+    off = np.abs(np.einsum("kj,nj->kn", units, points) - np.einsum("kj,kj->k", units, a[sound])[:, None])
+    return int((off > FLAT).sum(axis=1).min())
 
 
 def _frame(view: View, camera: RgbdCamera) -> Frame:

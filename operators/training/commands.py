@@ -45,7 +45,16 @@ from operators.training.torchvision_command import train_torchvision
 __all__ = ["evaluate", "train"]
 
 train = typer.Typer(
-    name="train", help="Train the project's networks on your own data.", no_args_is_help=True, rich_markup_mode="rich"
+    name="train",
+    help="""Train the project's networks on your own data.
+
+    Examples:
+
+      dataflow train detector DATA --out out/mine.onnx
+      dataflow train torchvision ssdlite320_mobilenet_v3_large DATA --weights COCO_V1
+    """,
+    no_args_is_help=True,
+    rich_markup_mode="rich",
 )
 train.command("activity")(train_activity)
 train.command("torchvision")(train_torchvision)
@@ -82,6 +91,12 @@ def train_detector(
 
     Writes the best epoch's network (.onnx), which the operator `operators.detection:CustomDetector` takes as `weights`,
     and a checkpoint (.pt) to resume from.
+
+    Examples:
+
+      dataflow train detector DATA --out out/mine.onnx
+      dataflow train detector DATA --classes mug,bottle --epochs 30 --size 320x240
+      dataflow train detector DATA --out out/mine.onnx --resume
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
@@ -134,7 +149,12 @@ def train_segmenter(
     bfloat16: Bfloat16 = False,
     json: Json = False,
 ) -> None:
-    """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt."""
+    """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt.
+
+    Examples:
+
+      dataflow train segmenter DATA --out out/segmenter.onnx
+    """
     with friendly():
         keep_earlier(out, resume, overwrite)
         from operators.segmentation.dataset import read_segmentation_data
@@ -187,6 +207,11 @@ def train_classifier(
 
     Four convolution blocks and two linear layers, for any number of classes. The operators
     `operators.recognition:ImageClassifier` and `FeatureExtractor` take the file as `weights`.
+
+    Examples:
+
+      dataflow train classifier DATA --out out/classifier.onnx
+      dataflow train classifier DATA --residual --size 128x128
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
@@ -241,6 +266,10 @@ def train_pair(
 
     Writes detector.onnx and segmenter.onnx of the best epoch, and a checkpoint (pair.pt) to resume from.
     `python -m operators.training.simulated_worlds DATA` renders such a folder.
+
+    Examples:
+
+      dataflow train pair DATA --out out/networks
     """
     with friendly():
         file = out / "pair.onnx"
@@ -283,6 +312,10 @@ def quantize(
     """Write a trained network in 8-bit integers: half the time on a CPU, at nearly the same score.
 
     Ranges are measured on training images of DATA; both files are then scored on its validation images.
+
+    Examples:
+
+      dataflow train quantize out/mine.onnx DATA
     """
     with friendly():
         out = weights.with_suffix(".int8.onnx") if out is None else out

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-FAILED = 1
+FAILED, COULD_NOT_RUN = 1, 2
 out_console, err_console = Console(), Console(stderr=True)
 
 
@@ -30,14 +30,16 @@ Weights = Annotated[Path, typer.Option("--weights", help="The network file (.onn
 
 @contextlib.contextmanager
 def friendly() -> Iterator[None]:
-    """Turns errors that the user can mend into one line and exit code 1."""
+    """Turns errors into one line: exit code 2 for data, files and options that do not do, 1 for a failed training."""
     try:
         yield
     except ModuleNotFoundError as error:
         if error.name not in _EXTRA:
             raise
-        fail(f"training needs the package {error.name!r}: pip install 'robot-dataflow[train]'")
-    except (ValueError, FileNotFoundError, FileExistsError, FloatingPointError) as error:
+        fail(f"training needs the package {error.name!r}: pip install 'robot-dataflow[train]'", COULD_NOT_RUN)
+    except (ValueError, FileNotFoundError, FileExistsError) as error:
+        fail(str(error), COULD_NOT_RUN)
+    except FloatingPointError as error:
         fail(str(error))
     except KeyboardInterrupt:
         fail("interrupted; go on with --resume", 130)

@@ -17,7 +17,13 @@ Sample = TypeVar("Sample")
 
 evaluate = typer.Typer(
     name="evaluate",
-    help="Score a network file on labelled data, or a graph by its metrics.",
+    help="""Score a network file on labelled data, or a graph by its metrics.
+
+    Examples:
+
+      dataflow evaluate detector DATA --weights out/mine.onnx
+      dataflow evaluate graph slam --set duration=20s
+    """,
     no_args_is_help=True,
     rich_markup_mode="rich",
 )
@@ -34,7 +40,13 @@ def evaluate_detector(
     seed: SplitSeed = None,
     json: Json = False,
 ) -> None:
-    """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format."""
+    """Score a detector by COCO's rules on the validation images of a folder in COCO or YOLO format.
+
+    Examples:
+
+      dataflow evaluate detector DATA --weights out/mine.onnx
+      dataflow evaluate detector DATA --weights out/mine.onnx --all --json
+    """
     with friendly():
         from operators.detection.custom.assessment import assess
         from operators.detection.custom.folder import read_detection_data
@@ -68,7 +80,12 @@ def evaluate_segmenter(
     seed: SplitSeed = None,
     json: Json = False,
 ) -> None:
-    """Score a segmenter by its mean IoU on the validation images of a folder with images/, masks/ and classes.txt."""
+    """Score a segmenter by its mean IoU on the validation images of a folder with images/, masks/ and classes.txt.
+
+    Examples:
+
+      dataflow evaluate segmenter DATA --weights out/segmenter.onnx
+    """
     with friendly():
         from operators.segmentation.assessment import assess
         from operators.segmentation.dataset import read_segmentation_data

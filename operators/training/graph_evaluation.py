@@ -15,6 +15,7 @@ from rich.table import Table
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from dataflow.shipped import graph as shipped_graph
 from operators.training.console import Json, fail, friendly, out_console
 
 DATA_NAMES = ("data", "path", "folder", "recording")
@@ -22,27 +23,36 @@ DATA_NAMES = ("data", "path", "folder", "recording")
 
 
 def evaluate_graph(
-    graph: Annotated[Path, typer.Argument(help="The graph file: its metrics operators do the scoring.")],
+    graph: Annotated[
+        Path,
+        typer.Argument(
+            help="A graph file, or a name that `dataflow graphs` lists: its metrics operators do the scoring."
+        ),
+    ],
     data: Annotated[
         list[str] | None,
-        typer.Option("--data", metavar="FOLDER|NAME=FOLDER", help="The data: sets the graph's parameter for it."),
+        typer.Option(
+            "--data", metavar="FOLDER|NAME=FOLDER", help="The data: sets the graph's parameter for it. May be repeated."
+        ),
     ] = None,
     settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME=VALUE", help="Sets another parameter of the graph.")
+        list[str] | None,
+        typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
     ] = None,
     json: Json = False,
 ) -> None:
     """Run a graph and print the figures of its metrics.
 
     `--data FOLDER` sets the parameter data, path, folder or recording, whichever the graph has; `--data NAME=FOLDER`
-    one of another name. Examples:
+    one of another name.
+
+    Examples:
 
       dataflow evaluate graph graphs/lidar.yaml --data ../data/kitti_raw
       dataflow evaluate graph graphs/localize.yaml --set duration=20s --json
     """
     with friendly():
-        if not graph.is_file():
-            raise FileNotFoundError(f"no graph file {str(graph)!r} (looked for {graph.absolute()})")
+        graph = _file(graph)
         given = [*data_settings(parameters_of(graph), data or ()), *(settings or ())]
     command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--json", "--quiet"]
     ran = subprocess.run(
@@ -57,6 +67,16 @@ def evaluate_graph(
         typer.echo(jsonlib.dumps({"graph": str(graph), "settings": given, "figures": figures}, indent=2))
         return
     out_console.print(table_of(figures))
+
+
+def _file(graph: Path) -> Path:
+    """Returns a graph file that is there, or that comes with dataflow and has that name."""
+    if graph.is_file():
+        return graph
+    shipped = shipped_graph(graph.as_posix().removeprefix("graphs/"))
+    if shipped is None:
+        raise FileNotFoundError(f"no graph file {str(graph)!r} (looked for {graph.absolute()})")
+    return shipped.path
 
 
 def parameters_of(graph: Path) -> Mapping[str, Any]:

@@ -11,14 +11,17 @@ from rich.markup import escape
 
 from operators.training.console import Data, Json, friendly, out_console
 
-learn = typer.Typer(
-    name="learn", help="Learn new things from a few examples.", no_args_is_help=True, rich_markup_mode="rich"
-)
+learn = typer.Typer(name="learn", no_args_is_help=True, rich_markup_mode="rich")
 
 
 @learn.callback()
 def _learn() -> None:
-    """Learn new things from a few examples."""
+    """Learn new things from a few examples.
+
+    Examples:
+
+      dataflow learn object mug DATA
+    """
 
 
 @learn.command("object")
@@ -40,6 +43,11 @@ def learn_object(
 
     The file holds a prototype in the feature space of the detector's network.
     `operators.recognition:LearnedDetector` takes it in `objects` and finds known and learned classes.
+
+    Examples:
+
+      dataflow learn object mug DATA
+      dataflow learn object mug DATA --background FOLDER --out out/mug.object.npz
     """
     out = Path(f"{name}.object.npz") if out is None else out
     with friendly():

@@ -9,7 +9,7 @@ import typer
 from rich.progress import track
 
 from operators.training.console import Json, err_console, friendly
-from operators.training.options import Device, Every, Overwrite, Rate, Resume, Seed, Threads
+from operators.training.options import Every, Overwrite, Rate, Resume, Seed
 from operators.training.running import keep_earlier, report, run_task
 
 if TYPE_CHECKING:
@@ -20,6 +20,12 @@ Worlds = Annotated[int, typer.Option(min=1, help="Worlds to train on.")]
 Chosen = Annotated[int, typer.Option("--validation", min=1, help="Worlds by which the best epoch is chosen.")]
 Processes = Annotated[int, typer.Option(min=1, help="Worlds made at once.")]
 Variations = Annotated[int, typer.Option(min=0, help="Times that a tracker's errors are drawn for each world.")]
+Sensed = Annotated[
+    Path | None,
+    typer.Option(help="Folder of tracks as sensors gave them (*.npz); benchmarks/sensed_people.py makes them."),
+]
+SensedChosen = Annotated[Path | None, typer.Option(help="Folder of such tracks by which the best epoch is chosen too.")]
+Repeats = Annotated[int, typer.Option(min=1, help="Times that each of the sensed tracks is taken.")]
 Epochs = Annotated[int, typer.Option(min=1, help="Passes through the tracks.")]
 Batch = Annotated[int, typer.Option(min=1, help="Tracks a step.")]
 
@@ -30,6 +36,9 @@ def train_activity(
     validation: Chosen = 12,
     processes: Processes = 1,
     variations: Variations = 4,
+    sensed: Sensed = None,
+    sensed_validation: SensedChosen = None,
+    repeats: Repeats = 8,
     epochs: Epochs = 10,
     out: Annotated[Path, typer.Option(help="The network file to write.")] = Path("activity.onnx"),
     resume: Resume = False,
@@ -38,23 +47,33 @@ def train_activity(
     learning_rate: Rate = 3e-3,
     seed: Seed = 0,
     evaluate_every: Every = 1,
-    threads: Threads = 1,
-    device: Device = "cpu",
+    threads: Annotated[int, typer.Option(min=1, help="Threads that compute.")] = 1,
+    device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1 ...")] = "cpu",
     json: Json = False,
 ) -> None:
     """Train the activity network, two LSTM layers, on people of simulated worlds.
 
-    No image is rendered: true boxes go through a seeded model of a tracker in space. The score is the macro-F1 at 0.5 s
-    tolerance, the mean of true and tracked boxes. `operators.recognition:ActivityRecognizer` takes the file as
-    `weights`.
+    No image is rendered: true boxes go through a seeded model of a tracker in space. Tracks that came from sensors may
+    be added. The score is the macro-F1 at 0.5 s tolerance, the mean of true, tracked and sensed boxes.
+    `operators.recognition:ActivityRecognizer` takes the file as `weights`.
+
+    Examples:
+
+      dataflow train activity out/episodes
+      dataflow train activity out/episodes --worlds 10 --epochs 3 --out out/activity.onnx
     """
     with friendly():
         keep_earlier(out, resume, overwrite)
         from operators.recognition.activity_training import ActivityTask
+        from operators.recognition.sensed_people import read_tracks
         from operators.training.loop import Settings
 
         training, choosing = _episodes(data, worlds, validation, processes, json)
-        task = ActivityTask(training, choosing, seed=seed, variations=variations)
+        parts = [read_tracks(folder) if folder else [] for folder in (sensed, sensed_validation)]
+        task = ActivityTask(
+            training, choosing, sensed=parts[0], sensed_validation=parts[1], repeats=repeats, seed=seed,
+            variations=variations,
+        )  # fmt: skip
         _tell(f"{task.samples} tracks of {worlds} worlds to train on, {validation} worlds to choose by", json)
         settings = Settings(
             epochs, batch, learning_rate, seed=seed, evaluate_every=evaluate_every, workers=1, threads=threads,

@@ -62,10 +62,11 @@ def train_torchvision(
     A detector takes a folder in COCO or YOLO format, a segmenter one with images/, masks/ and classes.txt. The last
     layers are made for your classes; without --weights or --from all others begin at random too, which takes many
     epochs. Writes the best epoch's weights with the class names (.pth), which `TorchvisionDetector` and
-    `TorchvisionSegmenter` take as `checkpoint`, and a checkpoint (.pt) to resume from. Examples:
+    `TorchvisionSegmenter` take as `checkpoint`, and a checkpoint (.pt) to resume from.
+
+    Examples:
 
       dataflow train torchvision ssdlite320_mobilenet_v3_large out/worlds --weights COCO_V1 --epochs 10
-
       dataflow train torchvision lraspp_mobilenet_v3_large out/worlds --out out/masks.pth --size 384x288 --json
     """
     with friendly():

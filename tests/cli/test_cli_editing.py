@@ -48,7 +48,7 @@ def test_a_cut_that_cannot_be_is_refused(
 def test_a_filter_keeps_what_it_is_told_to(dataflow, recorded: Recorded, tmp_path: Path) -> None:
     path = tmp_path / "part.mcap"
 
-    dataflow("filter", recorded[0], "--streams", "left/*", "-o", path)
+    dataflow("filter", recorded[0], "--stream", "left/*", "-o", path)
 
     with Recording(path) as opened:
         assert {s for s, i in opened.streams.items() if i.count} == {
@@ -61,7 +61,7 @@ def test_a_filter_keeps_what_it_is_told_to(dataflow, recorded: Recorded, tmp_pat
     told = json.loads(dataflow("verify", tmp_path / "b.mcap", "--json", code=1).stdout)
     assert {o["operator"]: o["verdict"] for o in told["operators"]}["sum"] == "identical"
     assert {o["operator"]: o["missing"] for o in told["operators"]}["smooth"] == "test/left/fast"
-    words = ("--streams", "left/*", "--without", "**", "-o", tmp_path / "c.mcap")
+    words = ("--stream", "left/*", "--without", "**", "-o", tmp_path / "c.mcap")
     assert "no stream is left" in dataflow("filter", recorded[0], *words, code=2).stderr
 
 

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
+from typer import Context
+from typer.main import get_command
 
-from dataflow.cli import main, plugins
-from dataflow.cli.commands import BUILT_IN, Command, Commands
+from dataflow.cli import arguments, main, plugins
+from dataflow.cli.commands import BUILT_IN, Command, Commands, Family
 from dataflow.cli.main import app
+from dataflow.sync.stamps import parse_duration
 
 COMMANDS = sorted(each.called for each in BUILT_IN if isinstance(each, Command))
 
@@ -89,6 +93,36 @@ def test_a_fault_of_ours_is_one_message_and_code_2(monkeypatch, capsys, asked: s
     assert ("Traceback" in told) == (asked == "1")
 
 
+def every_command() -> list[tuple[str, ...]]:
+    """All commands and groups with their subcommands, of plug-ins too, as the words that call them."""
+    group = get_command(app)
+    context = Context(group)
+    found: list[tuple[str, ...]] = []
+    for name in group.list_commands(context):
+        inner = group.get_command(context, name)
+        found += [(name,), *((name, each) for each in getattr(inner, "commands", {}))]
+    return found
+
+
+@pytest.mark.parametrize("words", every_command(), ids=" ".join)
+def test_every_command_and_subcommand_has_indented_examples_of_itself(dataflow, words: tuple[str, ...]) -> None:
+    lines = dataflow(*words, "--help").stdout.splitlines()
+
+    examples = [line for line in lines if line.startswith("   dataflow ")]  # one space is the page's margin
+    assert any(line.strip() == "Examples:" for line in lines)
+    assert examples
+    assert all(line.split()[1 : 1 + len(words)] == list(words) for line in examples)
+
+
+@pytest.mark.parametrize("words", every_command(), ids=" ".join)
+def test_no_option_is_explained_by_a_type(dataflow, words: tuple[str, ...]) -> None:
+    told = dataflow(*words, "--help").stdout
+
+    options = told[told.index("─ Options") :]
+    assert not [kind for kind in ("<int", "<float", "<str", "<path", "<bool") if kind in options]
+    assert "[default: None]" not in told
+
+
 @pytest.mark.parametrize("words", [["run"], ["param", "set"], ["train"], ["evaluate", "detector"], []])
 def test_help_shows_no_type_beside_flags_and_no_completion(dataflow, words: list[str]) -> None:
     told = dataflow(*words, "--help").stdout
@@ -108,3 +142,26 @@ def test_options_by_their_former_names_work_and_say_so(dataflow, small: Path) ->
     assert "--one-process and --process-each exclude each other" in told.stderr
     shown = dataflow("run", "--help").stdout
     assert not any(name in shown for name in ("--one-host", "--host-each", "--patience"))
+
+
+def test_times_in_the_help_are_times_to_the_commands() -> None:
+    told = [*(text for each in BUILT_IN for text in _texts(each)), *vars(arguments).values()]
+    words = re.findall(r"\b\d+(?:ms|s|m|min|h|us|ns)\b", " ".join(map(str, told)))
+
+    assert len(words) > 8
+    for word in words:
+        assert parse_duration(word) > 0
+
+
+def _texts(command: Command | Family) -> list[str]:
+    made = command.make()
+    return [made.help, *(str(param.help) for param in made.params if getattr(param, "help", None))]
+
+
+def test_a_recording_is_begun_and_ended_at_a_duration_with_a_unit(dataflow, recorded, tmp_path: Path) -> None:
+    for words in (("--start", "0.1", "--end", "0.2"), ("--start", "100ms", "--end", "200ms")):
+        dataflow("convert", recorded[0], tmp_path / words[1], "--to", "csv", "--stream", "left/fast", *words)
+    assert len({file.read_text() for file in tmp_path.rglob("*.csv")}) == 1
+
+    assert "unknown unit" in dataflow("replay", recorded[0], "--start", "2m", code=2).stderr
+    assert "expected a number and a unit" in dataflow("verify", recorded[0], "--start", "soon", code=2).stderr

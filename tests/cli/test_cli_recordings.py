@@ -111,8 +111,17 @@ def test_a_view_that_cannot_be_is_refused(
 
 
 def test_a_recording_that_nothing_can_be_drawn_of_is_refused(dataflow, data_dir: Path, tmp_path: Path) -> None:
-    foreign = data_dir / "bags" / "nav2_turtlebot.mcap"
+    foreign = data_dir / "bags" / "ros2_cdr_test.mcap"
 
     told = dataflow("view", foreign, "--to", tmp_path / "x.rrd", code=2)
 
     assert "holds no stream that can be drawn" in told.stderr
+
+
+def test_info_names_streams_without_a_message_in_one_line(dataflow, repository: Path) -> None:
+    told = dataflow("info", repository / "recordings" / "demo.mcap").stdout
+
+    table, _, silent = told.partition("without messages: ")
+    assert "robot/imu " in table
+    assert "robot/radar_scan" not in table
+    assert "robot/fix, robot/image, robot/landmark_map" in " ".join(silent.split())

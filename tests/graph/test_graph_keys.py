@@ -11,7 +11,7 @@ import zenoh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.graph.keys import canonical, intersect, key_fault, matching, may_reach, name_fault
+from dataflow.graph.keys import as_expression, canonical, intersect, key_fault, matching, may_reach, name_fault
 
 CHUNKS = st.sampled_from(["a", "b", "ab", "ba", "*", "**", "$*", "a$*", "$*b", "a$*b", "$*a$*"])
 PATTERNS = st.lists(CHUNKS, min_size=1, max_size=4).map("/".join)
@@ -77,6 +77,17 @@ def test_an_expression_without_fault_is_one_to_zenoh(text: str) -> None:
         except zenoh.ZError:
             return
         raise AssertionError(f"Zenoh takes {text!r}, we say: {key_fault(text)}")
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.text(alphabet="ab*$/", min_size=1, max_size=8))
+def test_a_pattern_of_people_becomes_an_expression_and_an_expression_stays(text: str) -> None:
+    if key_fault(text) is None:
+        assert as_expression(text) == text
+    if "$" not in text and "**" not in text and key_fault(text.replace("*", "x")) is None:
+        made = as_expression(text)
+        assert key_fault(made) is None
+        assert intersect(canonical(made), text.replace("*", "any"))
 
 
 @settings(max_examples=200, deadline=None)

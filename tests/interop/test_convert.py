@@ -318,7 +318,7 @@ def test_a_choice_that_must_be_made_is_named(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", two, STATIC)
     with (
         Material(path) as material,
-        pytest.raises(RecordingError, match=r"choose with --stream among camera/pose, odom"),
+        pytest.raises(RecordingError, match=r"leave out with --without all but one of camera/pose, odom"),
     ):
         DATASETS["tum"](material, tmp_path / "out", Exported())
 

@@ -10,6 +10,7 @@ from typer.testing import CliRunner
 
 from dataflow.cli.main import app
 from dataflow.lint.contract import ContractError, load_contract
+from dataflow.recording import RecordingWriter
 
 
 def call(*words: object, code: int = 0):
@@ -50,6 +51,12 @@ def test_the_contract_on_the_page_can_be_read(repository: Path, tmp_path: Path) 
     assert contract.terms_of("robot1/robot/imu", "robot1").max_gap == pytest.approx(0.03)
     assert contract.terms_of("robot1/camera/left", "robot1").allow == ("gap",)
     assert contract.clocks.max_offset == pytest.approx(0.01)
+
+
+def test_a_recording_without_a_stream_is_not_called_sound(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "empty.mcap", metadata={}):
+        pass
+    assert "there is no stream that could be looked at" in call("lint", tmp_path / "empty.mcap").stdout
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,8 @@ from typing import Self
 from dataflow.interop.bag import Bag, Stored, Topic
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign, open_bag
-from dataflow.interop.playing import readings_of
-from dataflow.interop.streams import BagStreams, Played
+from dataflow.interop.playing import readable
+from dataflow.interop.streams import BagStreams
 from dataflow.messages import Message
 from dataflow.recording import Recorded, Recording, RecordingError, StreamInfo
 from dataflow.recording.layout import RECORDING
@@ -38,13 +38,7 @@ class Material:
         self.start, self.end = start, end
         try:
             if self.foreign:
-                readings = [r for r in readings_of(self.bag) if r.playable and r.topic.count]
-                played = {
-                    r.topic.name: Played(r.topic.name, r.read_as.SCHEMA)
-                    for r in readings
-                    if r.read_as is not None and (topics is None or r.topic.name in topics)
-                }
-                self._source = BagStreams(self.path, played, clock)
+                self._source = readable(self.bag, self.path, clock, topics)
                 namespace = ""
             else:
                 self._source = Recording(self.path)
@@ -95,7 +89,9 @@ class Material:
         if not found:
             raise RecordingError(f"{self.path}: {what} takes a stream of {kinds}; there is none among those chosen")
         names = ", ".join(self.names[name] for name in found)
-        raise RecordingError(f"{self.path}: {what} takes one stream of {kinds}; choose with --stream among {names}")
+        raise RecordingError(
+            f"{self.path}: {what} takes one stream of {kinds}; leave out with --without all but one of {names}"
+        )
 
     def close(self) -> None:
         """Closes the files. Idempotent."""

@@ -147,7 +147,7 @@ def test_the_terminal_shows_the_score_and_how_to_use_the_file(tmp_path: Path) ->
     assert "6 images" not in first.stderr  # one was set aside, and it says so
     assert "set aside" in first.stderr
     second = dataflow_command("train", "detector", str(data), *options)
-    assert second.returncode == 1
+    assert second.returncode == 2
     assert "exist already" in second.stderr
     assert "--resume" in second.stderr
 
@@ -168,7 +168,7 @@ def test_a_network_is_scored_on_the_images_that_its_own_training_set_aside(tmp_p
 def test_an_error_keeps_its_square_brackets(tmp_path: Path) -> None:
     missing = tmp_path / "v[old]"
     failed = dataflow_command("train", "detector", str(missing), "--out", str(tmp_path / "a.onnx"))
-    assert failed.returncode == 1
+    assert failed.returncode == 2
     assert f"error: no data folder {str(missing)!r}" in failed.stderr
 
 

@@ -102,10 +102,10 @@ def test_equal_images_give_equal_boxes(learned: Path) -> None:
 
 def test_a_file_is_not_replaced_unasked_and_an_unknown_class_is_named(labelled: Path, learned: Path) -> None:
     again = CliRunner().invoke(command, ["object", "sign", str(labelled), "--out", str(learned)])
-    assert again.exit_code == 1
+    assert again.exit_code == 2
     assert "exists already" in again.output
     other = CliRunner().invoke(command, ["object", "signal", str(labelled), "--out", str(learned) + ".x"])
-    assert other.exit_code == 1
+    assert other.exit_code == 2
     assert "no class 'signal'" in other.output
 
 

@@ -132,3 +132,25 @@ def test_neighbours_whose_boxes_overlap_each_keep_their_points() -> None:
     np.testing.assert_array_equal(images.boxes, wider)
     center = transform_points(pose.matrix(), boxes.centers)
     assert abs(center[1, 1] - center[0, 1]) == pytest.approx(0.052, abs=0.015)
+
+
+def test_a_body_whose_box_is_too_small_is_as_high_as_its_mask() -> None:
+    pose = camera(1)
+    tall: Solid = ((3.0, 0.0, 0.75), (0.4, 0.5, 1.3), 0.0, 0)
+    cloud, detections, segmentation = look(pose, [tall])
+    left, upper, right, lower = detections.boxes[0]
+    cut = np.array([[left, upper + 0.25 * (lower - upper), right, lower]], np.float32)
+    short = detections.replace(boxes=cut, scores=np.array([0.25], np.float32))
+    streams = {"detections": [short], "cloud": [cloud], "image_info": [INFO], "pose": [pose]}
+
+    def height(**streams_and_params: Any) -> list[float]:
+        streams_now = streams | streams_and_params.pop("more")
+        (boxes,) = play(ObjectLifter(**streams_and_params), streams_now, static=["image_info"])["boxes"]
+        assert isinstance(boxes, Boxes3D)
+        return boxes.sizes[:, 2].tolist()
+
+    masked = {"segmentation": [segmentation]}
+    assert height(more=masked, bodies=["box"]) == pytest.approx([1.3], abs=0.1)
+    assert height(more=masked, bodies=["box"], min_body_score=0.3) == []
+    assert height(more=masked, min_score=0.2) < [1.15]
+    assert height(more={}, bodies=["box"]) == []  # so weak a box needs a mask that agrees

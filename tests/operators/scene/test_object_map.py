@@ -136,6 +136,58 @@ def test_background_that_shows_through_a_small_thing_is_not_taken_for_a_large_on
     assert only(known).size.max() < 0.3
 
 
+def carrying(*, portable: bool, lifted: int = 5) -> ObjectMap:
+    """The map after a mug stood beside somebody, who then has it before the mouth."""
+    body = Usual((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), on_floor=True)
+    mug = Usual((0.1, 0.1, 0.1), (0.2, 0.2, 0.2), True)
+    known = ObjectMap(3, [BOX], MapSettings(), {BOX: (body,), MUG: (mug,)}, None, [BOX], [MUG] if portable else [])
+    somebody: Solid = ((2.0, 0.0, 0.4), (0.4, 0.5, 1.6))
+    T = looking(0.0)
+    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 2, 90)), axis=-1).reshape(-1, 3)
+    for k in range(8 + lifted):
+        held: Solid = ((1.7, 0.45, 0.1) if k < 8 else (1.7, 0.1, 0.85), (0.1, 0.1, 0.1))
+        seen = [observation(somebody, BOX, T), observation(held, MUG, T)]
+        points = np.concatenate([wall, *(each.points for each in seen)])
+        known.update((k + 1) * SECOND // 4, seen, RangeView((points - T[:3, 3]) @ T[:3, :3], T, 0.012))
+    return known
+
+
+def test_a_mug_in_a_hand_is_the_mug_that_stood_there() -> None:
+    (held,), (left,) = (
+        [o for o in carrying(portable=portable, lifted=2).confirmed() if o.class_id == MUG]
+        for portable in (True, False)
+    )
+    assert held.center[2] > 0.75
+    assert held.views == 10
+    assert left.center[2] < 0.2  # what is in a hand is new, and not yet sure
+
+
+def test_a_mug_farther_away_than_an_arm_reaches_is_another() -> None:
+    known = carrying(portable=True, lifted=0)
+    T = looking(0.0)
+    other: Solid = ((1.7, -1.4, 0.3), (0.1, 0.1, 0.1))
+    for k in range(9, 14):
+        each = observation(other, MUG, T)
+        known.update((k + 1) * SECOND // 4, [each], RangeView((each.points - T[:3, 3]) @ T[:3, :3], T, 0.012))
+    assert len([o for o in known.confirmed() if o.class_id == MUG]) == 2
+
+
+def test_how_high_somebody_is_over_the_floor_tells_how_deep() -> None:
+    standing = Usual((0.4, 0.57, 1.64), (0.3, 0.2, 0.1), True, on_floor=True)
+    sitting = Usual((0.56, 0.7, 1.38), (0.2, 0.2, 0.1), True, on_floor=True)
+
+    def depth(top: float) -> float:
+        known = ObjectMap(1, [BOX], MapSettings(), {BOX: (standing, sitting)})
+        known.floor = -0.4
+        T = looking(0.0)
+        trunk: Solid = ((2.0, 0.0, top - 0.35), (0.3, 0.5, 0.7))
+        for k in range(4):
+            known.update((k + 1) * SECOND // 4, [observation(trunk, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
+        return float(only(known).size[:2].max())
+
+    assert depth(1.3) < 0.6 < depth(0.95)
+
+
 def test_what_was_seen_beside_what_is_in_the_snapshot() -> None:
     beside: Solid = ((2.0, 0.13, 0.1), THING[1])
     known = after([[(THING, BOX), (beside, MUG)]] * 5)

@@ -118,6 +118,28 @@ def test_the_command_answers_from_a_recording(recording: Path) -> None:
     assert "holding" in asked(str(recording), "--nodes")[1]
 
 
+def test_an_export_is_not_replaced_unasked(recording: Path, tmp_path: Path) -> None:
+    file = tmp_path / "out" / "scene.json"
+    words = (str(recording), "--export", str(file))
+    assert asked(*words)[0] == 0
+    made = file.read_bytes()
+    file.write_text("mine")
+    code, out = asked(*words)
+    assert (code, file.read_text()) == (2, "mine")
+    assert "--overwrite" in out
+    assert asked(*words, "--overwrite")[0] == 0
+    assert file.read_bytes() == made
+    assert asked(*words[:2], str(tmp_path))[0] == 2  # a folder
+
+
+def test_a_recording_without_a_scene_graph_says_what_makes_one(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "run.mcap", metadata={}):
+        pass
+    code, out = asked(str(tmp_path / "run.mcap"))
+    assert code == 2
+    assert "holds no scene graph" in " ".join(out.split())
+
+
 def test_without_a_question_the_command_tells_the_graph_in_short(recording: Path) -> None:
     code, out = asked(str(recording))
     assert code == 0

@@ -159,6 +159,39 @@ def test_a_saved_map_has_the_same_bytes_each_time(tmp_path: Path) -> None:
     assert len(read_visual_map(tmp_path / "a.npz")) > 2
 
 
+def tiled_floor(poses: Sequence[Matrix], period: float = 1.2) -> list[Frame]:
+    """A floor, z = 0, whose pattern of a few hundred patches comes again at every `period` metres."""
+    pattern = np.random.default_rng(4).integers(30, 226, (40, 40), np.uint8)
+    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
+    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.shape)], axis=-1)
+    seen = []
+    for k, T in enumerate(poses):
+        depth = -T[2, 3] / (rays @ T[2, :3])
+        at = (T[:3, 3] + (rays * depth[..., None]) @ T[:3, :3].T)[..., :2] / period % 1.0
+        cells = (40 * at).astype(np.int64)
+        noise = np.random.default_rng(k).standard_normal(depth.shape)
+        grey = pattern[cells[..., 0], cells[..., 1]]
+        seen.append((np.repeat(grey[..., None], 3, axis=2), (depth + 0.0015 * depth**2 * noise).astype(np.float32)))
+    return seen
+
+
+def over_floor(first: float, count: int) -> list[Matrix]:
+    """A camera that looks down aslant and moves along x."""
+    return [
+        look_at(np.array([first + 0.05 * k, 0.0, 1.2]), np.array([first + 0.05 * k + 0.5, 0.1, 0.0]))
+        for k in range(count)
+    ]
+
+
+def test_a_floor_that_repeats_is_no_place_to_be_found_at(tmp_path: Path) -> None:
+    file = tmp_path / "floor.npz"
+    mapped = run(tiled_floor(over_floor(0.0, 14)), save=str(file))
+    assert texts(mapped)[-1].startswith("mapped")
+    assert len(read_visual_map(file)) > 2
+    tried = run(tiled_floor(over_floor(1.22, 10)), map_file=str(file))  # 1.2 m off it sees the same
+    assert {text.split(":")[0] for text in texts(tried)} == {"searching"}
+
+
 @pytest.mark.parametrize("content", [b"", b"no archive", b"PK\x03\x04 cut off"])
 def test_a_file_that_is_no_map_is_refused(tmp_path: Path, content: bytes) -> None:
     file = tmp_path / "wrong.npz"

@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert
 from operators.geometry import se3
@@ -15,7 +16,7 @@ from operators.odometry.fitting import Fitter
 from operators.odometry.noise import Noise
 from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
-from operators.slam.visual_view import STRIDE, Judge, Sight, View, sight
+from operators.slam.visual_view import STRIDE, Judge, Sight, View, relief, sight
 from operators.sources.room import Room, camera_path, look_at
 
 K = np.array([[158.0, 0.0, 95.5], [0.0, 158.0, 71.5], [0.0, 0.0, 1.0]])
@@ -69,9 +70,33 @@ def test_a_view_of_something_else_is_not_believed(other: Matrix, seed: int, lit:
     assert seen is None or Judge().doubt(seen)
 
 
+def on_floor(count: int, off: float = 0.0) -> NDArray[np.float64]:
+    """Points on the floor with a centimetre of noise, or some way off it."""
+    rng = np.random.default_rng(count)
+    return np.column_stack([rng.uniform(-2, 2, (count, 2)), off + rng.normal(0, 0.01, count)])
+
+
+def test_relief_counts_the_features_off_the_plane_of_most() -> None:
+    assert relief(on_floor(60)) <= 1
+    assert relief(np.concatenate([on_floor(60), on_floor(13, 0.4)])) == pytest.approx(13, abs=1)
+    tilted = se3.exp(np.array([0.3, 0.1, 2.0, 0.7, -0.4, 0.2]))
+    assert relief(on_floor(60) @ tilted[:3, :3].T + tilted[:3, 3]) <= 1
+
+
+@pytest.mark.parametrize("points", [np.zeros((0, 3)), np.zeros((20, 3)), np.outer(np.arange(9.0), [1, 2, 3])])
+def test_points_that_span_no_plane_have_no_relief(points: NDArray[np.float64]) -> None:
+    assert relief(points) == 0
+
+
+def test_a_view_of_a_room_has_relief() -> None:
+    seen = sight(view(FIRST), view(BESIDE), FITTER, 20)
+    assert seen is not None
+    assert seen.relief >= Judge().relief
+
+
 def test_doubts_have_reasons() -> None:
     def doubt(inliers: int, overlap: float, agreement: float) -> str:
-        return Judge().doubt(Sight(np.eye(4), np.eye(6), 99, inliers, overlap, agreement))
+        return Judge().doubt(Sight(np.eye(4), np.eye(6), 99, inliers, 50, overlap, agreement))
 
     assert doubt(19, 0.9, 0.9) == "too few features agree"
     assert doubt(99, 0.1, 0.9) == "too little of the depth overlaps"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -52,9 +53,23 @@ def test_data_is_given_to_the_parameter_that_is_for_it(
     assert data_settings(parameters, data) == found
 
 
+def test_a_graph_that_comes_with_dataflow_is_called_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    called: list[list[str]] = []
+
+    def run(words: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        called.append(words)
+        return subprocess.CompletedProcess(words, 0, json.dumps({"summaries": {"metrics": {"matched": 5}}}))
+
+    monkeypatch.setattr(subprocess, "run", run)
+    ran = CliRunner().invoke(evaluate, ["graph", "synthetic_rgbd", "--json"])
+
+    assert ran.exit_code == 0, ran.output
+    assert called[0][4].endswith("graphs/synthetic_rgbd.yaml")
+
+
 def test_a_graph_without_data_is_named() -> None:
     with pytest.raises(ValueError, match=r"none of data, path.*its parameters: seed"):
         data_settings({"seed": 1}, ["here"])
     ran = CliRunner().invoke(evaluate, ["graph", "nowhere.yaml"])
-    assert ran.exit_code == 1
+    assert ran.exit_code == 2
     assert "no graph file 'nowhere.yaml'" in ran.stderr.replace("\n", " ")

@@ -13,6 +13,8 @@ from operators.recognition.activity_model import ActivityModel
 from operators.recognition.activity_score import macro_f1
 from operators.recognition.agent_features import COUNT
 from operators.recognition.episodes import Episode
+from operators.recognition.sensed_people import SensedTrack, write_tracks
+from operators.sources.simulator.classes import ACTIVITIES
 from operators.training.simulated_people import TRAINING, VALIDATION, read_episodes, watched, worlds, write_episodes
 
 pytest.importorskip("torch", reason="training needs the extra [train]")
@@ -75,6 +77,21 @@ def test_the_activity_network_is_trained_scored_and_written(folder: Path, tmp_pa
     np.testing.assert_allclose(alone[0], probabilities[0], rtol=1e-5)
 
 
+def test_tracks_as_sensors_gave_them_are_trained_on_and_scored(folder: Path, tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    labels = np.repeat([-1, 1, 3], [2, 6, 6])
+    right = np.zeros((14, len(ACTIVITIES)), bool)
+    right[np.arange(14), np.maximum(labels, 0)] = True
+    features = rng.normal(0, 1, (14, COUNT)).astype(np.float32)
+    sensed = tmp_path / "sensed"
+    sensed.mkdir()
+    write_tracks(sensed / "1.npz", [SensedTrack(features, labels, labels, right, labels >= 0)])
+    words = ["activity", str(folder), "--out", str(tmp_path / "a.onnx"), *WORDS, "--epochs", "1", "--json"]
+    done = CliRunner().invoke(train, [*words, "--sensed", str(sensed), "--sensed-validation", str(sensed)])
+    assert done.exit_code == 0, done.output
+    assert 0 <= json.loads(done.stdout)["scores"]["sensed"] <= 1
+
+
 def test_equal_seeds_give_equal_networks(folder: Path, tmp_path: Path) -> None:
     answers = []
     for file in (tmp_path / "a.onnx", tmp_path / "b.onnx"):
@@ -90,7 +107,7 @@ def test_an_earlier_network_is_not_lost(folder: Path, tmp_path: Path) -> None:
     out = tmp_path / "activity.onnx"
     out.write_bytes(b"mine")
     done = CliRunner().invoke(train, ["activity", str(folder), "--out", str(out), *WORDS])
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert out.read_bytes() == b"mine"
 
 

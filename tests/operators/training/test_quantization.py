@@ -104,5 +104,5 @@ def test_the_command_scores_both_files(trained: Path, worlds: Path, tmp_path: Pa
     assert all(0 <= scores[score] <= 1 and scores["images"] == 4 for scores in compared.values())
     assert read_facts(tmp_path / "small.onnx")["calibration_images"] == 2
     again = CliRunner().invoke(app, arguments)
-    assert again.exit_code == 1
+    assert again.exit_code == 2
     assert "exists already" in again.output

@@ -143,7 +143,7 @@ def test_what_is_wrong_is_said_in_one_line(
     monkeypatch.chdir(tmp_path)
     shutil.copytree(data, tmp_path / "DATA")
     done = CliRunner().invoke(train, ["torchvision", *words])
-    assert done.exit_code == 1
+    assert done.exit_code == 2
     assert told in " ".join(done.output.split())
 
 

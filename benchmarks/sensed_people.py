@@ -1,0 +1,49 @@
+"""Tracks of people as the shipped networks, depth and the map give them, to train the activity network on.
+
+    python benchmarks/sensed_people.py CACHE OUT --seeds 42000 42001 ...
+
+Drives through worlds as sensed_worlds.py does, which keeps what the networks gave in CACHE, and writes the tracks of
+each to OUT: features, what the agent did, whether it was in view. `dataflow train activity --sensed OUT` takes them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from scene_graph import acts
+from semantic_map import mapped
+from sensed_worlds import World, sensed
+
+from operators.recognition.sensed_people import SensedTrack, sensed_tracks, write_tracks
+from operators.sources.simulator.classes import ACTIVITIES
+
+
+def tracks_of(world: World) -> list[SensedTrack]:
+    frames = world.frames
+    return sensed_tracks(
+        mapped(world, true=False),
+        [frame.base for frame in frames],
+        [frame.scene for frame in frames],
+        [acts(frame.activities) for frame in frames],
+        [set(frame.objects.ids[frame.objects.visible >= 0.3].tolist()) for frame in frames],
+        ACTIVITIES,
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cache", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seeds", type=int, nargs="+", required=True)
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    for seed in options.seeds:
+        for world in sensed(range(seed, seed + 1), options.cache):
+            tracks = tracks_of(world)
+            write_tracks(options.out / f"{seed}.npz", tracks)
+            print(f"{world.name}: {len(tracks)} tracks, {sum(int(t.plain.sum()) for t in tracks)} moments in view")
+
+
+if __name__ == "__main__":
+    main()

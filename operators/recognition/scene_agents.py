@@ -1,0 +1,46 @@
+"""Scene graphs as the features of agents take them: bodies that matter, and when each node was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from dataflow.messages import Odometry, Pose, SceneGraph
+from dataflow.messages.geometry import yaw_of
+from operators.recognition.agent_features import AGENTS, MATTERING
+from operators.recognition.tracked_people import Moment
+from operators.scene.bodies import Body
+
+
+def seen_times(nodes: SceneGraph) -> dict[int, int]:
+    """Returns when each node was last seen, ns; the graph's own stamp where it does not say."""
+    times = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
+    return dict(zip(nodes.ids.tolist(), times.tolist(), strict=True))
+
+
+def mattering(nodes: SceneGraph) -> tuple[list[Body], int]:
+    """Returns the nodes that features are made of as upright bodies, and how many of these are not usable."""
+    labels = [nodes.class_names[c] if nodes.class_names else "" for c in nodes.class_ids.tolist()]
+    rows = [k for k, label in enumerate(labels) if label in MATTERING and nodes.ids[k] > 0]
+    finite = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
+    usable = np.asarray(finite & (nodes.sizes >= 0).all(axis=1), bool)
+    yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
+    still = np.zeros(3)
+    bodies = [
+        Body(
+            int(nodes.ids[k]), labels[k], nodes.positions[k], nodes.sizes[k], float(yaws[k]), still, labels[k] in AGENTS
+        )
+        for k in rows
+        if usable[k]
+    ]
+    return bodies, len(rows) - len(bodies)
+
+
+def scene_moments(graphs: Sequence[SceneGraph], robots: Sequence[Pose | Odometry]) -> Iterator[Moment]:
+    """Yields scene graphs, with the robot at each, as the recogniser takes them; a row is the number of the graph."""
+    for row, (nodes, robot) in enumerate(zip(graphs, robots, strict=True)):
+        bodies, _ = mattering(nodes)
+        seen = seen_times(nodes)
+        unseen = {b.id: (nodes.stamp - seen[b.id]) * 1e-9 for b in bodies if b.agent}
+        yield Moment(nodes.stamp * 1e-9, tuple(bodies), unseen, robot.matrix()[:2, 3], row)

@@ -1,0 +1,125 @@
+"""Bags of others on the command line: viewed, converted, replayed through a graph by name; streams by pattern."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_bags import SECOND, header, ros, write_ros1, write_ros2, xyz, xyzw
+
+START = 1_700_000_000 * SECOND
+
+
+def poses(topics: tuple[str, ...]) -> list[tuple[str, int, object]]:
+    rows: list[tuple[str, int, object]] = []
+    for i in range(20):
+        stamp = START + i * SECOND // 10
+        place = ros("geometry_msgs/Pose", position=xyz(0.1 * i, 0, 0, "Point"), orientation=xyzw(0, 0, 0, 1))
+        rows += [(t, stamp, ros("geometry_msgs/PoseStamped", header=header(stamp, "map"), pose=place)) for t in topics]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two trajectories of one robot."""
+    return write_ros2(tmp_path_factory.mktemp("bags") / "drive", poses(("/estimate", "/truth")))
+
+
+def test_a_bag_is_drawn_as_a_recording_is(dataflow, bag: Path, tmp_path: Path) -> None:
+    dataflow("view", bag, "--to", tmp_path / "a.rrd", "--without", "/truth", "--end", "1")
+    told = dataflow("convert", bag, tmp_path / "b.rrd", "--to", "rrd", "--json").stdout
+
+    assert (tmp_path / "a.rrd").stat().st_size > 1000
+    assert json.loads(told) == {"files": [str(tmp_path / "b.rrd")], "messages": 40, "not_drawn": 0}
+
+
+def test_a_ros_1_bag_is_drawn_too(dataflow, tmp_path: Path) -> None:
+    from made_bags import ROS1
+
+    text = ros("std_msgs/String", ROS1, data="hello")
+    file = write_ros1(tmp_path / "old.bag", [("/said", START + k * SECOND, text) for k in range(3)])
+
+    assert "3 messages" in dataflow("view", file, "--to", tmp_path / "old.rrd").stdout
+
+
+def test_a_dataset_takes_what_is_left_without_the_other_streams_of_a_kind(dataflow, bag: Path, tmp_path: Path) -> None:
+    refused = dataflow("convert", bag, tmp_path / "a", "--to", "tum", code=2).stderr
+    assert "--without all but one of /estimate, /truth" in " ".join(refused.split())
+
+    dataflow("convert", bag, tmp_path / "a", "--to", "tum", "--without", "/estim*")
+
+    assert np.loadtxt(tmp_path / "a" / "groundtruth.txt").shape == (20, 8)
+    assert (
+        "no stream is left" in dataflow("convert", bag, tmp_path / "b", "--to", "csv", "--without", "**", code=2).stderr
+    )
+
+
+def test_a_graph_that_comes_with_dataflow_is_named_for_a_bag_too(dataflow, bag: Path) -> None:
+    refused = dataflow("replay", bag, "--graph", "synthetic_rgbd", code=2).stderr
+
+    assert "which topics feed the graph must be said with --map" in " ".join(refused.split())
+
+
+def test_a_star_within_a_part_stands_for_any_characters(dataflow, recorded, tmp_path: Path) -> None:
+    told = dataflow("filter", recorded[0], "--stream", "left/*st", "-o", tmp_path / "part.mcap", "--json").stdout
+
+    assert "test/left/fast" in told
+    assert "test/left/slow" not in told
+
+
+def test_the_former_name_of_the_choice_of_streams_works_and_says_so(dataflow, recorded, tmp_path: Path) -> None:
+    from dataflow.cli import plugins
+
+    plugins.renamed.cache_clear()
+    told = dataflow("filter", recorded[0], "--streams", "left/*", "-o", tmp_path / "part.mcap").stderr
+
+    assert "--streams is now --stream" in told
+
+
+@pytest.mark.parametrize("to", ["csv", "tum", "ros2"])
+def test_a_conversion_that_fails_or_is_interrupted_leaves_nothing(
+    dataflow, bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str
+) -> None:
+    from dataflow.interop.export.report import Exported
+
+    def interrupted(self: Exported, name: str) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Exported, "count", interrupted)
+        dataflow("convert", bag, tmp_path / "out", "--to", to, "--stream", "/truth", code=130)
+    assert not list(tmp_path.iterdir())
+
+    dataflow("convert", bag, tmp_path / "out", "--to", to, "--stream", "/truth")
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_recording_may_be_converted_in_its_place(dataflow, recorded, tmp_path: Path) -> None:
+    file = tmp_path / "run.mcap"
+    file.write_bytes(recorded[0].read_bytes())
+
+    dataflow("convert", file, file, "--to", "mcap", "--overwrite")
+
+    assert json.loads(dataflow("info", file, "--json").stdout)["messages"] > 0
+
+
+@pytest.mark.parametrize("command", ["latency", "verify", "diff"])
+def test_a_ros_1_bag_where_a_recording_is_expected_is_answered_with_what_makes_one(
+    dataflow, tmp_path: Path, command: str
+) -> None:
+    from made_bags import ROS1
+
+    file = write_ros1(tmp_path / "old.bag", [("/said", START, ros("std_msgs/String", ROS1, data="hello"))])
+    words = (command, file, file) if command == "diff" else (command, file)
+
+    assert f"`dataflow convert {file} OUT.mcap --to mcap`" in dataflow(*words, code=2).stderr
+
+
+def test_latencies_of_a_file_without_firing_records_are_refused_with_the_reason(
+    dataflow, bag: Path, tmp_path: Path
+) -> None:
+    dataflow("convert", bag, tmp_path / "drive.mcap", "--to", "mcap")
+
+    assert "holds no firing records" in dataflow("latency", tmp_path / "drive.mcap", code=2).stderr
