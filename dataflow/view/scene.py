@@ -49,6 +49,8 @@ class ViewOptions:
     - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
       have had a point in a cell, so that what moves leaves none.
     - `trail`: trails get a vertex every so many metres at least.
+    - `pose_step`: event time (ns) from which a pose of a stream is drawn again; its frames are placed, and its curves
+      go on, with every message.
     - `track_history`: event time (ns) for which the paths of tracks are drawn.
     """
 
@@ -59,6 +61,7 @@ class ViewOptions:
     kept_step: float = 0.05
     kept_after: int = 4
     trail: float = 0.01
+    pose_step: int = 0
     track_history: int = 5_000_000_000
 
     def __post_init__(self) -> None:
@@ -117,6 +120,14 @@ class SceneState:
         if self.remembered.get((entity, key), self) == value:
             return False
         self.remembered[entity, key] = value
+        return True
+
+    def due(self, entity: str, stamp: int) -> bool:
+        """Tells whether a pose is to be drawn at `entity`: the last one is `pose_step` old. Then this is the last."""
+        last = self.remembered.get((entity, "pose"))
+        if last is not None and 0 <= stamp - last < self.options.pose_step:
+            return False
+        self.remembered[entity, "pose"] = stamp
         return True
 
     def once(self, stream: str, what: str) -> bool:

@@ -268,12 +268,14 @@ def test_a_recording_is_played_with_its_static_streams_whole(tmp_path: Path) -> 
         writer.add_stream("r/c/truth", Pose)
         writer.write("r/c/info", info, seq=0)
         for t in range(10):
-            writer.write("r/c/truth", pose(STAMP + t, float(t)), seq=t)
+            writer.write("r/c/truth", pose(STAMP + t * SECOND, float(t)), seq=t)
     with Recording(tmp_path / "a.mcap") as recording, ViewerSink(Save(tmp_path / "a.rrd")) as sink:
-        assert from_recording(recording, sink, start=STAMP + 3, end=STAMP + 5) == 4
+        assert from_recording(recording, sink, start=STAMP + 3 * SECOND, end=STAMP + 5 * SECOND) == 4
     found = rows(tmp_path / "a.rrd")
     assert [row.stamp for row in at(found, "/r/c/info", "Pinhole:resolution")] == [None]
-    assert [r.stamp - STAMP for r in at(found, "/r/c/truth/space/axes", "Arrows3D:vectors")] == [3, 4, 5]
+    assert [r.stamp for r in at(found, "/r/c/truth/space/axes", "Arrows3D:vectors")] == [
+        STAMP + t * SECOND for t in (3, 4, 5)
+    ]
 
 
 @pytest.mark.parametrize("by_graph", [True, False])

@@ -220,6 +220,16 @@ def test_a_moving_robot_carries_its_sensors_and_leaves_a_trail(tmp_path: Path) -
     assert [row.stamp for row in trail] == [STAMP + 1, STAMP + 3]
 
 
+def test_poses_in_quick_succession_are_drawn_seldom_but_their_frames_placed_with_each(tmp_path: Path) -> None:
+    lost = odometry(5, np.nan)
+    told = [*(odometry(t, float(t)) for t in (0, 1, 2, 3, 4)), lost, odometry(6, 6.0)]
+    found = draw(tmp_path, *[("w/odom", each) for each in told], options=ViewOptions(pose_step=3))
+    axes = at(found, "/w/odom/space/axes", "Arrows3D:origins")
+    assert [row.stamp - STAMP for row in axes if row.values] == [0, 3, 6]  # where it was lost it is drawn at once
+    placed = at(found, "/frames/base", "Transform3D:translation")
+    assert {row.stamp - STAMP for row in placed} >= {0, 1, 2, 3, 4, 6}
+
+
 @pytest.mark.parametrize("late", [-5, 0, 5])
 @pytest.mark.parametrize("order", list(permutations(["color", "depth", "odom", "mounts"])), ids="-".join)
 def test_mounts_hold_whenever_they_are_told(tmp_path: Path, order: tuple[str, ...], late: int) -> None:

@@ -119,6 +119,9 @@ def _moving(
         canvas.clear("space/covariance")
         canvas.clear("space/name")
         canvas.scene.trails.pop(canvas.entity, None)
+        canvas.scene.remembered.pop((canvas.entity, "pose"), None)
+        return
+    if not canvas.scene.due(canvas.entity, canvas.stamp):
         return
     canvas.draw("space/axes", frame, _axes(T_frame_child, _AXIS))
     position = T_frame_child[:3, 3]
