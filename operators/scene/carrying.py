@@ -7,7 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from operators.scene.cells import Cells
+from operators.scene.kinds import Kinds
 from operators.scene.map_object import MapObject
+from operators.scene.matching import Observation
+from operators.scene.range_view import RangeView
 
 Array = NDArray[np.float64]
 
@@ -15,6 +19,41 @@ _ARM = 0.35  # metres beyond a body's box on the ground, up to which its hands a
 _HAND = 0.55  # metres above the foot of a body from which its hands are
 _REACH = 1.0  # metres on the ground that a hand takes a thing in a short while
 _AWAY = 0.12  # metres from its place, from which a thing is carried
+
+
+def carried(
+    seen: Sequence[Observation],
+    cells: Sequence[Cells],
+    joined: Mapping[int, int],
+    view: RangeView,
+    objects: Mapping[int, MapObject],
+    kinds: Kinds,
+    views: int,
+) -> dict[int, int]:
+    """Returns the object's id of each observation that is of none where it lay, but of one in somebody's hand.
+
+    `joined` holds the object's ids of the other observations, `views` how often a thing must have been seen. Notes with
+    the things whether they are held now.
+    """
+    free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in kinds.portable]
+    hands = [objects[i] for k, i in joined.items() if seen[k].class_id in kinds.carriers]
+    if not free or not (hands or any(o.held for o in objects.values())):
+        return {}
+    there = set(joined.values())
+    things = [
+        o for i, o in sorted(objects.items()) if i not in there and o.class_id in kinds.portable and o.views >= views
+    ]
+    shown = view.may_show(np.array([o.center for o in things]).reshape(-1, 3), np.zeros(len(things)))
+    usable = [o.id for o, plain in zip(things, shown.tolist(), strict=True) if plain]
+    found: dict[int, int] = {}
+    for k in free:
+        id = taken(cells[k].middle, seen[k].class_id, objects, usable)
+        held = in_hand(cells[k].middle, hands)
+        if id is not None and (held or objects[id].held):  # what was in a hand may be put anywhere in reach
+            found[k] = id
+            objects[id].held = held
+            usable.remove(id)
+    return found
 
 
 def in_hand(place: Array, bodies: Sequence[MapObject]) -> bool:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.carrying import in_hand, taken
+from operators.scene.carrying import carried
 from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
@@ -91,11 +91,11 @@ class ObjectMap:
             for each in seen
         ]
         joined = self._joined(seen, cells, stamp, view)
-        carried = self._carried(seen, cells, joined, view)
+        in_hands = carried(seen, cells, joined, view, self.objects, self._kinds, s.views)
         for k, each in enumerate(seen):
-            if k in carried:
-                self._see(self.objects[carried[k]], each, cells[k], stamp, view.origin, moved=True)
-                joined[k] = carried[k]
+            if k in in_hands:
+                self._see(self.objects[in_hands[k]], each, cells[k], stamp, view.origin, moved=True)
+                joined[k] = in_hands[k]
             elif k in joined:
                 self._see(self.objects[joined[k]], each, cells[k], stamp, view.origin)
             else:
@@ -148,31 +148,6 @@ class ObjectMap:
                 if moves[j] or left[j]:
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
-
-    def _carried(
-        self, seen: Sequence[Observation], cells: Sequence[Cells], joined: Mapping[int, int], view: RangeView
-    ) -> dict[int, int]:
-        """Returns the object's id of each observation that is of none where it lay, but of one in somebody's hand."""
-        free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in self._kinds.portable]
-        hands = [self.objects[i] for k, i in joined.items() if seen[k].class_id in self._kinds.carriers]
-        if not free or not (hands or any(o.held for o in self.objects.values())):
-            return {}
-        there = set(joined.values())
-        things = [
-            o for i, o in sorted(self.objects.items())
-            if i not in there and o.class_id in self._kinds.portable and o.views >= self._settings.views
-        ]  # fmt: skip
-        shown = view.may_show(np.array([o.center for o in things]).reshape(-1, 3), np.zeros(len(things)))
-        usable = [o.id for o, plain in zip(things, shown.tolist(), strict=True) if plain]
-        found: dict[int, int] = {}
-        for k in free:
-            id = taken(cells[k].middle, seen[k].class_id, self.objects, usable)
-            held = in_hand(cells[k].middle, hands)
-            if id is not None and (held or self.objects[id].held):  # what was in a hand may be put anywhere in reach
-                found[k] = id
-                self.objects[id].held = held
-                usable.remove(id)
-        return found
 
     def _see(
         self, object: MapObject, each: Observation, cells: Cells, stamp: int, eye: Array, *, moved: bool = False
