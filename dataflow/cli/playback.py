@@ -1,4 +1,4 @@
-"""Pauses, steps and paces runs that are not live: by keys in their terminal, by `dataflow playback` from another."""
+"""Keys in the terminal of a run; pauses, steps and paces those that are not live by `dataflow playback`, too."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
@@ -22,15 +23,20 @@ from dataflow.cli.quantities import speed_text
 if TYPE_CHECKING:
     from dataflow.supervision.supervisor import Supervisor
 
-Pressed = Literal["toggle", "step", "faster", "slower", "quit"]
+Pressed = Literal["toggle", "step", "faster", "slower", "keep", "quit"]
 KEYS: dict[bytes, Pressed] = {
     b" ": "toggle",
     b"n": "step", b"\x1b[C": "step", b"\x1bOC": "step",  # →
     b"+": "faster", b"=": "faster", b"\x1b[A": "faster", b"\x1bOA": "faster",  # ↑
     b"-": "slower", b"\x1b[B": "slower", b"\x1bOB": "slower",  # ↓
+    b"k": "keep",
     b"q": "quit",
 }  # fmt: skip
-HELP = "space: pause and go on · → or n: one step · + and -: twice and half as fast · q: end"
+PLAYING, KEEPING, ENDING = (
+    "space: pause and go on · → or n: one step · + and -: twice and half as fast",
+    "k: keep what was",
+    "q: end",
+)
 ACTIONS = ("pause", "resume", "step", "speed", "status")
 
 
@@ -44,11 +50,18 @@ def pressed(typed: bytes) -> Iterator[Pressed]:
         at += 1 if key is None else len(key)
 
 
-def keys(quiet: bool) -> Callable[[Supervisor], AbstractContextManager[None]] | None:
-    """Returns what steers a run by keys, where there is a terminal; None elsewhere."""
-    if quiet or not err.is_terminal or not sys.stdin.isatty():
+def keys(
+    quiet: bool, *, live: bool = False, flight: bool = False
+) -> Callable[[Supervisor], AbstractContextManager[None]] | None:
+    """Returns what steers a run by keys, where there is a terminal; None elsewhere, and where no key could do a thing.
+
+    One that is `live` cannot be paused; one with a `flight` recorder keeps what was.
+    """
+    helps = [*([] if live else [PLAYING]), *([KEEPING] if flight else [])]
+    if not helps or quiet or not err.is_terminal or not sys.stdin.isatty():
         return None
-    return _steered if _in_foreground(sys.stdin.fileno()) else None
+    helps.append(ENDING)
+    return partial(_steered, " · ".join(helps)) if _in_foreground(sys.stdin.fileno()) else None
 
 
 def _in_foreground(terminal: int) -> bool:
@@ -60,7 +73,7 @@ def _in_foreground(terminal: int) -> bool:
 
 
 @contextmanager
-def _steered(supervisor: Supervisor) -> Iterator[None]:
+def _steered(help: str, supervisor: Supervisor) -> Iterator[None]:
     """Reads keys on a thread of its own while a run lasts; the terminal is as before afterwards."""
     import termios
     import tty
@@ -80,11 +93,14 @@ def _steered(supervisor: Supervisor) -> Iterator[None]:
             for key in pressed(typed):
                 if key == "quit":
                     supervisor.stop()
-                else:
+                elif key == "keep":
+                    if KEEPING in help:
+                        supervisor.trigger("the key k")
+                elif PLAYING in help:
                     supervisor.play(key)
 
     reader = threading.Thread(target=read, name="keys", daemon=True)
-    say(f"[dim]{HELP}[/]")
+    say(f"[dim]{help}[/]")
     try:
         tty.setcbreak(stdin)
         reader.start()

@@ -78,7 +78,7 @@ def run(
     that.
 
     A graph with `record: {keep: 60s}` has a flight recorder, unless --record keeps everything: what was is kept on a
-    trigger, or with `dataflow trigger`.
+    trigger, with `dataflow trigger`, or by the key k.
 
     Examples:
 
@@ -113,8 +113,10 @@ def run(
         loaded = load_graph(file, settings=settings or (), live=live)
         outputs = checked_outputs(record, view, open_view, overwrite)
         options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-        options |= {"live": live, "paused": step, "controls": None if live else keys(quiet or json)}
-        if loaded.record.flight is not None and record is None:
+        flight = loaded.record.flight is not None and record is None
+        controls = keys(quiet or json, live=live, flight=flight)
+        options |= {"live": live, "paused": step, "controls": controls}
+        if flight and loaded.record.flight is not None:
             options["flight"] = Path(loaded.record.flight.folder)
             options["flight"].mkdir(parents=True, exist_ok=True)
         if chaos is not None:

@@ -28,6 +28,7 @@ from dataflow.supervision.events import (
     Said,
     StopAsked,
     Tick,
+    TriggerAsked,
 )
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.log_keeper import LogKeeper
@@ -79,6 +80,9 @@ class Core:
             case PlaybackAsked(action, steps, speed):
                 if self._closing is None and self.run.phase is not Phase.STARTING and not self.run.plan.live:
                     self.run.send_all("playback", action=action, steps=steps, speed=speed)
+            case TriggerAsked(text):
+                if self._closing is None and self.run.phase is not Phase.STARTING:
+                    self.run.tell_recorder("event", name="trigger", stamp=self.run.event_time(), data={"text": text})
             case Aborted(why, interrupted):
                 raise RunFailed(why, interrupted=interrupted)
             case Said(label, kind, fields):

@@ -44,6 +44,13 @@ class PlaybackAsked:
 
 
 @dataclass(frozen=True, slots=True)
+class TriggerAsked:
+    """The user asks the flight recorder to keep what was."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class Aborted:
     """The program around the core cannot go on."""
 

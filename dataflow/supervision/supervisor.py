@@ -69,7 +69,7 @@ class Supervisor:
         self._over: commands.Over | None = None
         self._woken, self._waking = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._stops = 0
-        self._asked: deque[events.PlaybackAsked] = deque()
+        self._asked: deque[events.PlaybackAsked | events.TriggerAsked] = deque()
 
     @property
     def status(self) -> Status:
@@ -84,6 +84,12 @@ class Supervisor:
     def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
         """Pauses, resumes, steps what is not live, or changes its speed; on any thread."""
         self._asked.append(events.PlaybackAsked(action, steps, speed))
+        with contextlib.suppress(BlockingIOError, OSError):
+            os.write(self._waking, b"!")
+
+    def trigger(self, text: str) -> None:
+        """Has the flight recorder keep what was; on any thread."""
+        self._asked.append(events.TriggerAsked(text))
         with contextlib.suppress(BlockingIOError, OSError):
             os.write(self._waking, b"!")
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from dataflow.cli.playback import _steered, keys, looped, pressed
+from dataflow.cli.playback import ENDING, KEEPING, PLAYING, _steered, keys, looped, pressed
 from dataflow.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
@@ -91,7 +91,18 @@ def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     assert list(pressed(typed)) == meant
 
 
-def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("help", "meant"),
+    [
+        ((PLAYING, KEEPING, ENDING), ["toggle", "step", "the key k", "step", "stop"]),
+        ((PLAYING, ENDING), ["toggle", "step", "step", "stop"]),
+        ((KEEPING, ENDING), ["the key k", "stop"]),
+    ],
+    ids=["flight recorder", "no flight recorder", "live"],
+)
+def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
+    monkeypatch: pytest.MonkeyPatch, help: tuple[str, ...], meant: list[str]
+) -> None:
     master, slave = pty.openpty()
     done: list[str] = []
     came = threading.Event()
@@ -100,6 +111,9 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.Mon
         def play(self, action: str) -> None:
             done.append(action)
 
+        def trigger(self, text: str) -> None:
+            done.append(text)
+
         def stop(self) -> None:
             done.append("stop")
             came.set()
@@ -107,13 +121,13 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(monkeypatch: pytest.Mon
     with os.fdopen(slave, "r") as terminal:
         monkeypatch.setattr("sys.stdin", terminal)
         before = termios.tcgetattr(terminal)
-        with _steered(Steered()):  # type: ignore[arg-type]
-            os.write(master, b" n\x1b[Cq")
+        with _steered(" · ".join(help), Steered()):  # type: ignore[arg-type]
+            os.write(master, b" nk\x1b[Cq")
             assert came.wait(10)
         after = termios.tcgetattr(terminal)
     os.close(master)
 
-    assert done == ["toggle", "step", "step", "stop"]
+    assert done == meant
     assert after == before
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from dataflow.client.trigger import trigger
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.supervision.run import run
+from dataflow.supervision.supervisor import Supervisor
 from dataflow.verification.verify import verify
 
 GRAPH = """
@@ -57,6 +60,27 @@ def test_what_somebody_asks_for_is_kept_and_verifies(tmp_path: Path) -> None:
         assert "near the door" in kept.metadata["dataflow:flight"]["triggers"]
     report = verify(file)
     assert {v.verdict for v in report.operators} == {"identical"}
+
+
+def test_who_steers_the_run_has_it_keep_what_was(tmp_path: Path) -> None:
+    @contextmanager
+    def controls(supervisor: Supervisor) -> Iterator[None]:
+        def press() -> None:
+            find_running("flying", wait=30)
+            while "second" not in supervisor.status.operators:
+                pause.wait(0.01)
+            supervisor.trigger("the key k")
+
+        pause, thread = threading.Event(), threading.Thread(target=press)
+        thread.start()
+        yield
+        thread.join()
+
+    _, files = flown(tmp_path, controls=controls)
+
+    (file,) = files
+    with Recording(file) as kept:
+        assert "the key k" in kept.metadata["dataflow:flight"]["triggers"]
 
 
 def test_an_operator_that_fails_keeps_what_led_to_it(tmp_path: Path) -> None:
