@@ -124,6 +124,7 @@ Event = (
     | Tick
     | StopAsked
     | PlaybackAsked
+    | TriggerAsked
     | Aborted
     | Said
     | Printed
