@@ -39,7 +39,7 @@ def draw_recording(
     from dataflow.recording.layout import RECORDING
     from dataflow.view import Serve, from_recording
 
-    with _opened(path, clock) as opened:
+    with opened_streams(path, clock) as opened:
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         if not readable:
             raise fail(f"{path} holds no stream that can be drawn; see: dataflow info {path}")
@@ -79,8 +79,8 @@ def draw_recording(
     return sink, complete
 
 
-def _opened(path: Path, clock: Choice) -> Recording | BagStreams:
-    """A recording, or every topic of a bag that a message type fits."""
+def opened_streams(path: Path, clock: Choice) -> Recording | BagStreams:
+    """Opens a recording, or a bag with every topic that a message type fits; says which clock its stamps are of."""
     from dataflow.interop.opening import is_foreign, open_bag
     from dataflow.recording import Recording
 

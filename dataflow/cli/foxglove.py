@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import End, Start, chosen_streams, existing_recording, number, span, window
+from dataflow.cli.arguments import Clock, End, Start, chosen_streams, existing_recording, number, span, window
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
 
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from dataflow.client.playback import Steering
     from dataflow.client.replay_bar import ReplayBar
     from dataflow.foxglove.server import FoxgloveServer
+    from dataflow.interop.clocks import Choice
     from dataflow.recording import Recorded
 
 PORT = 8765
@@ -28,7 +29,7 @@ PORT = 8765
 def foxglove(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="RECORDING", help="A recording (.mcap). Without one: the running graph."),
+        typer.Argument(metavar="RECORDING", help="A recording or a bag. Without one: the running graph."),
     ] = None,
     port: Annotated[int, typer.Option("--port", metavar="PORT", help="Where to listen; 0: a free one.")] = PORT,
     host: Annotated[
@@ -44,6 +45,7 @@ def foxglove(
     ] = 1.0,
     start: Start = None,
     end: End = None,
+    clock: Clock = "auto",
     graph: GraphName = None,
     wait: Wait = 0.0,
 ) -> None:
@@ -59,6 +61,7 @@ def foxglove(
 
       dataflow foxglove
       dataflow foxglove run.mcap --start 5 --speed 0.5
+      dataflow foxglove drive.bag
       dataflow foxglove --stream "camera/*" --port 9000
       dataflow foxglove --wait 10
     """
@@ -71,24 +74,32 @@ def foxglove(
             if recording is not None:
                 if graph is not None or wait:
                     raise fail("--graph and --wait are about a running graph; leave them out to play a recording")
-                _play(existing_recording(recording), host, port, streams, speed, start, end)
+                _play(existing_recording(recording), host, port, streams, speed, start, end, clock)
             else:
-                if start is not None or end is not None or speed != 1.0:
-                    raise fail("--start, --end and --speed are about a recording; name one")
+                if start is not None or end is not None or speed != 1.0 or clock != "auto":
+                    raise fail("--start, --end, --speed and --clock are about a recording; name one")
                 _follow(host, port, streams, graph, wait)
         except FoxgloveError as error:
             raise fail(str(error)) from error
 
 
 def _play(
-    path: Path, host: str, port: int, words: list[str] | None, speed: float, start: float | None, end: float | None
+    path: Path,
+    host: str,
+    port: int,
+    words: list[str] | None,
+    speed: float,
+    start: float | None,
+    end: float | None,
+    stamps: Choice,
 ) -> None:
-    from dataflow.foxglove.player import Clock, play
+    from dataflow.cli.drawing import opened_streams
+    from dataflow.foxglove.player import Clock as Place
+    from dataflow.foxglove.player import play
     from dataflow.foxglove.server import FoxgloveServer
-    from dataflow.recording import Recording
     from dataflow.recording.layout import RECORDING
 
-    with Recording(path) as opened:
+    with opened_streams(path, stamps) as opened:
         readable = [name for name, info in opened.streams.items() if info.message_type is not None]
         namespace = opened.metadata.get(RECORDING, {}).get("namespace", "")
         chosen = chosen_streams(words, readable, namespace)
@@ -96,7 +107,7 @@ def _play(
         if whole is None:
             raise fail(f"{path} holds no message of {', '.join(chosen) or 'a type that is known here'}")
         begin, finish = window(whole, start, end, path)
-        clock = Clock(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
+        clock = Place(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
         with FoxgloveServer(
             path.name, namespace=namespace, host=host, port=port, controls=clock, span=(clock.first, clock.last)
         ) as server:

@@ -5,8 +5,12 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-from dataflow.recording import Recorded, Recording
+from dataflow.recording import Recorded
+
+if TYPE_CHECKING:
+    from dataflow.view.playback import RecordedStreams
 
 LOOK_BACK = (500_000_000, 5_000_000_000)
 """Spans before a place (ns) in which each stream's last message is looked for: the near one first: it is quick."""
@@ -87,7 +91,7 @@ class Clock:
 
 
 def play(
-    recording: Recording,
+    recording: RecordedStreams,
     streams: Sequence[str],
     clock: Clock,
     show: Callable[[Recorded], None],
@@ -123,7 +127,7 @@ def play(
             return
 
 
-def _before(recording: Recording, streams: Sequence[str], place: int) -> list[Recorded]:
+def _before(recording: RecordedStreams, streams: Sequence[str], place: int) -> list[Recorded]:
     """The last message of each stream at or before `place`, in the order of their stamps."""
     found: dict[str, Recorded] = {}
     for back in LOOK_BACK:

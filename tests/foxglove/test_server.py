@@ -20,6 +20,7 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from made_bags import ROS1, SECOND, ros, write_ros1
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -51,7 +52,7 @@ class Client:
             for message in self._socket:
                 if isinstance(message, str):
                     self.said.put(said := json.loads(message))
-                    if "unknown channel" in said.get("message", ""):  # it was advertised a moment too early
+                    if "unknown channel" in said.get("message", "").lower():  # it was advertised a moment too early
                         self._socket.send(json.dumps(self._asked))
                 elif message[0] == 1:
                     subscription, stamp = struct.unpack_from("<IQ", message, 1)
@@ -194,6 +195,27 @@ def test_the_command_plays_a_recording_until_it_is_interrupted(repository: Path)
 
     assert stamp > 0
     assert CompressedImage.FromString(data).format == "jpeg"
+
+
+def test_a_bag_is_played_as_a_recording_is(tmp_path: Path) -> None:
+    text = ros("std_msgs/String", ROS1, data="hello")
+    bag = write_ros1(tmp_path / "old.bag", [("/said", STAMP + k * SECOND // 10, text) for k in range(20)])
+    command = [sys.executable, "-m", "dataflow.cli.main", "foxglove", str(bag), "--port", "0"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    try:
+        assert process.stderr is not None
+        client = Client(next(line.split()[-1] for line in process.stderr if "ws://" in line))
+        client.subscribe("/said", 1)
+        said = json.loads(client.data.get(timeout=WITHIN)[2])
+        client.close()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(WITHIN) == 0
+    finally:
+        process.kill()
+        process.wait(WITHIN)
+        process.stderr.close()
+
+    assert said["text"] == "hello"
 
 
 def test_a_port_that_is_taken_is_an_error_that_says_so(server: FoxgloveServer) -> None:
