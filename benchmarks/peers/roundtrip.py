@@ -67,7 +67,7 @@ def ours(tree: Path) -> Callable[[int, int], list[float]]:
             f"graph = load_graph({str(HERE / 'roundtrip.yaml')!r}, settings=settings, live=True)\n"
             "print(run(graph, live=True).summaries['pong']['took'])\n"
         )
-        return parsed(finished([sys.executable, "-c", code], PYTHONPATH=str(tree)))
+        return parsed(finished([sys.executable, "-P", "-c", code], PYTHONPATH=str(tree)))
 
     return run
 
