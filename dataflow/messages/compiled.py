@@ -338,7 +338,7 @@ def _dtype_bytes(dtype: np.dtype[Any]) -> bytes:
     return b"\x01" + dtype.str.encode()
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=128)  # compressed images have a length of their own each
 def _shape_bytes(shape: tuple[int, ...]) -> bytes:
     return struct.pack(f"<B{len(shape)}q", len(shape), *shape)
 
