@@ -68,7 +68,7 @@ class Orders:
                 process.feeding.finish("interrupted")
                 process.live.finish("interrupted")
             case "gone":
-                process.outlet.consumer_gone(fields["ring"])
+                process.outlet.consumer_gone(fields["ring"], fields["life"])
             case "lacks":
                 process.outlet.send_again(fields["operator"])
             case "leave":

@@ -121,7 +121,7 @@ class RunState:
         process.since = self.steady
         kind, config = self.configs[process.label]
         self.command(Spawn(process.label))
-        self.command(Send(process.label, kind, config | more))
+        self.command(Send(process.label, kind, config | {"life": process.life_number} | more))
 
     def send(self, process: Supervised, kind: str, /, *, replaces: bool = False, **fields: Any) -> None:
         """Sends to a process, if there is one."""

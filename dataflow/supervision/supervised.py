@@ -48,6 +48,11 @@ class Supervised:
         return self.plan.nodes
 
     @property
+    def life_number(self) -> int:
+        """Tells which process in this place it is; the first is 1."""
+        return self.attempt + 1
+
+    @property
     def is_sink(self) -> bool:
         return self.plan.sink is not None
 
