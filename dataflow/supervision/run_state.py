@@ -151,6 +151,10 @@ class RunState:
             if process.plan.sink == "record":
                 self.send(process, kind, **fields)
 
+    def trigger(self, text: str) -> None:
+        """Has the flight recorder keep what was."""
+        self.tell_recorder("event", name="trigger", stamp=self.event_time(), data={"text": text})
+
     def event(self, name: str, text: str, /, **data: Any) -> None:
         """Tells the user and the recording something that both must know."""
         self.note(text)
