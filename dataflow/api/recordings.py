@@ -8,6 +8,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from dataflow.api.asof import Direction, asof
+from dataflow.api.html import recording_html
 from dataflow.api.join import Joined
 from dataflow.api.names import StreamNameError, stream_named, streams_named
 from dataflow.api.stream import RecordedStream
@@ -192,9 +193,8 @@ class RecordedStreams(Mapping[str, RecordedStream]):
         return f"<recording {self.path}: {len(self)} streams, {self.duration:.3f} s>"
 
     def _repr_html_(self) -> str:
-        from dataflow.api.html import recording_html
-
-        return recording_html(self)
+        streams = [self[name].facts() for name in self]
+        return recording_html(self.path, self.start, self.duration, f"{self.namespace}/", streams)
 
     def _ipython_key_completions_(self) -> list[Any]:
         prefix = f"{self.namespace}/"

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from dataflow.api import frames
 from dataflow.api.columns import Column, column, elements, is_narrow, parallel_fields
+from dataflow.api.html import StreamFacts, stream_html
 from dataflow.arguments import checked
 from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Field, Message
@@ -191,15 +192,20 @@ class RecordedStream(Sequence[Message]):
 
     # ------------------------------------------------------------------------------------------------- display
 
+    def facts(self) -> StreamFacts:
+        """Sums up the stream, or this part of it."""
+        info, count = self.info, len(self)
+        if count in (0, info.count):
+            return StreamFacts(self.name, info, count, info.first, info.last)
+        return StreamFacts(self.name, info, count, int(self.stamps.min()), int(self.stamps.max()))
+
     def __repr__(self) -> str:
         found = self.info.message_type
         kind = found.SCHEMA if found is not None else self.info.schema or self.info.encoding
         return f"<{self.name}: {len(self):,} × {kind}>"
 
     def _repr_html_(self) -> str:
-        from dataflow.api.html import stream_html
-
-        return stream_html(self)
+        return stream_html(self.facts())
 
 
 def _stamp(seconds: float | None, origin: int) -> int | None:

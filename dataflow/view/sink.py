@@ -26,7 +26,7 @@ from dataflow.messages import Message
 from dataflow.view import process
 from dataflow.view.backlog import Backlog, Bounds
 from dataflow.view.blueprint import blueprint_of
-from dataflow.view.canvas import visualize
+from dataflow.view.drawing import visualize
 from dataflow.view.layout import layout
 from dataflow.view.process import LOOPBACK, ViewerError
 from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, SceneState, ViewOptions, entity_of
