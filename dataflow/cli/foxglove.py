@@ -94,8 +94,7 @@ def _play(
     stamps: Choice,
 ) -> None:
     from dataflow.cli.drawing import opened_streams
-    from dataflow.foxglove.player import Clock as Place
-    from dataflow.foxglove.player import play
+    from dataflow.foxglove import player
     from dataflow.foxglove.server import FoxgloveServer
     from dataflow.recording.layout import RECORDING
 
@@ -107,7 +106,7 @@ def _play(
         if whole is None:
             raise fail(f"{path} holds no message of {', '.join(chosen) or 'a type that is known here'}")
         begin, finish = window(whole, start, end, path)
-        clock = Place(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
+        clock = player.Clock(begin or whole[0], whole[1] if finish is None else min(finish, whole[1]), speed=speed)
         with FoxgloveServer(
             path.name, namespace=namespace, host=host, port=port, controls=clock, span=(clock.first, clock.last)
         ) as server:
@@ -126,7 +125,7 @@ def _play(
                 say("at its end; the playback bar of Foxglove goes back, Ctrl-C ends")
 
             try:
-                play(opened, chosen, clock, show, arrived=arrived, ended=ended)
+                player.play(opened, chosen, clock, show, arrived=arrived, ended=ended)
             except KeyboardInterrupt:
                 say("ended")
     out.print(f"shown: {plural(server.shown, 'message')}")

@@ -7,8 +7,9 @@ import os
 import select
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -32,11 +33,22 @@ KEYS: dict[bytes, Pressed] = {
     b"k": "keep",
     b"q": "quit",
 }  # fmt: skip
-PLAYING, KEEPING, ENDING = (
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """Some keys that do something in a run, and what its terminal says of them."""
+
+    help: str
+    does: frozenset[Pressed]
+
+
+PLAYING = Offer(
     "space: pause and go on · → or n: one step · + and -: twice and half as fast",
-    "k: keep what was",
-    "q: end",
+    frozenset({"toggle", "step", "faster", "slower"}),
 )
+KEEPING = Offer("k: keep what was", frozenset({"keep"}))
+ENDING = Offer("q: end", frozenset({"quit"}))
 ACTIONS = ("pause", "resume", "step", "speed", "status")
 
 
@@ -57,11 +69,10 @@ def keys(
 
     One that is `live` cannot be paused; one with a `flight` recorder keeps what was.
     """
-    helps = [*([] if live else [PLAYING]), *([KEEPING] if flight else [])]
-    if not helps or quiet or not err.is_terminal or not sys.stdin.isatty():
+    offers = [*([] if live else [PLAYING]), *([KEEPING] if flight else [])]
+    if not offers or quiet or not err.is_terminal or not sys.stdin.isatty():
         return None
-    helps.append(ENDING)
-    return partial(_steered, " · ".join(helps)) if _in_foreground(sys.stdin.fileno()) else None
+    return partial(_steered, [*offers, ENDING]) if _in_foreground(sys.stdin.fileno()) else None
 
 
 def _in_foreground(terminal: int) -> bool:
@@ -73,7 +84,7 @@ def _in_foreground(terminal: int) -> bool:
 
 
 @contextmanager
-def _steered(help: str, supervisor: Supervisor) -> Iterator[None]:
+def _steered(offers: Sequence[Offer], supervisor: Supervisor) -> Iterator[None]:
     """Reads keys on a thread of its own while a run lasts; the terminal is as before afterwards."""
     import termios
     import tty
@@ -81,6 +92,7 @@ def _steered(help: str, supervisor: Supervisor) -> Iterator[None]:
     stdin = sys.stdin.fileno()
     before = termios.tcgetattr(stdin)
     over, ending = os.pipe()
+    acting: frozenset[Pressed] = frozenset().union(*(offer.does for offer in offers))
 
     def read() -> None:
         while True:
@@ -91,16 +103,11 @@ def _steered(help: str, supervisor: Supervisor) -> Iterator[None]:
             if not typed:
                 return
             for key in pressed(typed):
-                if key == "quit":
-                    supervisor.stop()
-                elif key == "keep":
-                    if KEEPING in help:
-                        supervisor.trigger("the key k")
-                elif PLAYING in help:
-                    supervisor.play(key)
+                if key in acting:
+                    _do(key, supervisor)
 
     reader = threading.Thread(target=read, name="keys", daemon=True)
-    say(f"[dim]{help}[/]")
+    say(f"[dim]{' · '.join(offer.help for offer in offers)}[/]")
     try:
         tty.setcbreak(stdin)
         reader.start()
@@ -112,6 +119,16 @@ def _steered(help: str, supervisor: Supervisor) -> Iterator[None]:
             termios.tcsetattr(stdin, termios.TCSADRAIN, before)
         os.close(over)
         os.close(ending)
+
+
+def _do(key: Pressed, supervisor: Supervisor) -> None:
+    match key:
+        case "quit":
+            supervisor.stop()
+        case "keep":
+            supervisor.trigger("the key k")
+        case _:
+            supervisor.play(key)
 
 
 def playback(

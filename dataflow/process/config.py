@@ -10,11 +10,13 @@ from typing import Any
 @dataclass(frozen=True, slots=True)
 class Resumed:
     """Says where an operator had got to when its process died: the next incarnation (0: none had died), the last stamp
-    of each port, the parameters that were changed, and how often it has been restarted."""
+    of each port, the parameters that were changed, the place (incarnation, number) of the message that each port would
+    have made next, and how often it has been restarted."""
 
     incarnation: int = 0
     last: Mapping[str, int] = field(default_factory=dict)
     changed: Mapping[str, Any] = field(default_factory=dict)
+    places: Mapping[str, Sequence[int]] = field(default_factory=dict)
     restarts: int = 0
 
 
@@ -30,7 +32,8 @@ class ProcessConfig:
     one that died: for each operator, where it had got to (`Resumed`, as plain values). `warm`: the recording and the
     stamp from which on it is replayed, with the operators' states of that moment. `rings_out` and `rings_in`: for each
     link to and from another process the keys of its channels, after whether messages may be dropped for a consumer that
-    takes nothing; their descriptors were handed down in this order.
+    takes nothing; their descriptors were handed down in this order. `life`: how many processes have had its place, with
+    this one.
     `snapshots`: nanoseconds of event time between two snapshots of an operator.
     """
 
@@ -52,6 +55,7 @@ class ProcessConfig:
     warm: dict[str, Any] | None = None
     rings_out: Sequence[tuple[bool, Sequence[str]]] = ()
     rings_in: Sequence[Sequence[str]] = ()
+    life: int = 1
 
     def resumed(self, operator: str) -> Resumed:
         """Tells where an operator had got to in the process before this one."""

@@ -36,7 +36,7 @@ def take_handed(descriptors: Sequence[int], config: Mapping[str, Any]) -> Handed
         (keys, Outgoing(*_three(rest), bound if lossy else None)) for lossy, keys in config.get("rings_out", ())
     ]
     pools = PoolReader()
-    incoming = [Incoming(*_three(rest), keys, pools) for keys in config["rings_in"]]
+    incoming = [Incoming(*_three(rest), keys, pools, config.get("life", 1)) for keys in config["rings_in"]]
     return Handed(wake, outgoing, incoming, next(rest, None))
 
 

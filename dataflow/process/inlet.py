@@ -115,7 +115,9 @@ class Inlet:
             raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")
         if verdict.gap is not None:
             self._lost(stream, *verdict.gap)
-        if verdict.taken is None:
+        if verdict.repeats:
+            self.received += 1
+        elif verdict.taken is None:
             self.refuse(stream, _described(envelope))
         else:
             self.received += 1

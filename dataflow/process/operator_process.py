@@ -27,7 +27,7 @@ from dataflow.process.live_sources import LiveSources, Step
 from dataflow.process.making import Making
 from dataflow.process.network import network_config
 from dataflow.process.orders import Orders
-from dataflow.process.outlet import Network, Outlet, incarnations_of
+from dataflow.process.outlet import Network, Outlet, incarnations_of, left_by
 from dataflow.process.pace import Pace
 from dataflow.process.progress import Progress
 from dataflow.process.requests import Requests
@@ -85,6 +85,8 @@ class OperatorProcess:
             live=config.live,
             from_start=config.live and config.resume is None,
         )
+        before = {name: config.resumed(name) for name in config.resume or ()}
+        outputs = {name: node.outputs for name, node in self.graph.nodes.items()}
         pool_bytes = POOL_BYTES if self.graph.network.shared_memory else 0
         self.outlet = Outlet(
             channel,
@@ -95,9 +97,8 @@ class OperatorProcess:
             live=config.live,
             box=None if box is None else open_box(box, config, self.graph),
             firings=config.firings,
-            incarnations=incarnations_of(
-                config.resume or {}, {name: node.outputs for name, node in self.graph.nodes.items()}
-            ),
+            incarnations=incarnations_of(before, outputs),
+            left=left_by(before, outputs),
         )
         self.progress = Progress(channel, self.runners, self.feeding, self.live, paced=config.live)
         self.requests = Requests(

@@ -84,7 +84,7 @@ class Orders:
                 self._feeding.finish("interrupted")
                 self._live.finish("interrupted")
             case "gone":
-                self._outlet.consumer_gone(fields["ring"])
+                self._outlet.consumer_gone(fields["ring"], fields["life"])
             case "lacks":
                 self._outlet.send_again(fields["operator"])
             case "leave":

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel
+from dataflow.process.config import Resumed
 from dataflow.process.recent import RecentFirings
+from dataflow.process.stream_order import Place
 from dataflow.records.black_box import BlackBox
 from dataflow.records.firing import FiringRecord, consecutive, encode_batch
 from dataflow.sync import NEVER, Entry
@@ -63,7 +65,8 @@ class Outlet:
 
     `fanout`: the links to the others. `live`: the supervisor is told that a stream has ended. `box`: what keeps the
     latest firing records should this process die. `firings`: whether a recorder takes the firing records.
-    `incarnations`: by stream, the ones that begin above 0.
+    `incarnations`: by stream, the ones that begin above 0. `left`: by stream, the place of the message that the process
+    before this one would have made next: who lacks messages before it has lost them.
     """
 
     def __init__(
@@ -78,6 +81,7 @@ class Outlet:
         box: BlackBox | None,
         firings: bool,
         incarnations: Mapping[str, int],
+        left: Mapping[str, Place],
     ) -> None:
         self.sent = 0
         self.recent = RecentFirings()
@@ -88,7 +92,8 @@ class Outlet:
         self._once: dict[str, list[Envelope]] = {}
         """The messages of static streams: a consumer that was started again gets it again."""
         self._held: list[tuple[str, Envelope | bytes, bool]] | None = []
-        self._next = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
+        self._next: dict[str, Place] = {stream: (incarnation, 0) for stream, incarnation in incarnations.items()}
+        self._left = left
         self._publishers: Mapping[str, StreamPublisher] = {}
         self._logs: dict[str, list[FiringRecord]] = {}
         self._unnoted: FiringRecord | None = None
@@ -102,6 +107,10 @@ class Outlet:
     def release(self) -> None:
         """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
         held, self._held = self._held or [], None
+        for stream, (incarnation, number) in self._left.items():
+            if stream not in self._static:
+                parts = encode_parts(Envelope(Kind.FRONTIER, stream, incarnation, number, NEVER))
+                self.sent += self._fanout.send(stream, parts, droppable=False)
         for key, said, droppable in held:
             if isinstance(said, Envelope):
                 self._send(key, said, droppable=droppable)
@@ -136,9 +145,9 @@ class Outlet:
         while not self._fanout.flush() and time.monotonic() < deadline:
             time.sleep(0.001)
 
-    def consumer_gone(self, number: int) -> None:
-        """The process at the other end of a link has died."""
-        self._fanout.take_leave(number)
+    def consumer_gone(self, number: int, life: int) -> None:
+        """The process at the other end of a link has died (`Outgoing.take_leave`)."""
+        self._fanout.take_leave(number, life)
 
     def counters(self) -> dict[str, int]:
         """Returns what was sent to other processes (`Fanout.counters`)."""
@@ -290,10 +299,15 @@ class Outlet:
             self._network.bus.session.put(stream, payload)
 
 
-def incarnations_of(resumed: Mapping[str, Any], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
+def incarnations_of(resumed: Mapping[str, Resumed], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, int]:
     """The incarnations that streams begin with, by stream; `outputs`: by operator, its ports and their streams."""
+    return {stream: before.incarnation for operator, before in resumed.items() for stream in outputs[operator].values()}
+
+
+def left_by(resumed: Mapping[str, Resumed], outputs: Mapping[str, Mapping[str, str]]) -> dict[str, Place]:
+    """The places that streams had reached in the process before this one, by stream (`outputs` as above)."""
     return {
-        stream: int(fields["incarnation"])
-        for operator, fields in resumed.items()
-        for stream in outputs.get(operator, {}).values()
+        outputs[operator][port]: (incarnation, number)
+        for operator, before in resumed.items()
+        for port, (incarnation, number) in before.places.items()
     }

@@ -152,7 +152,9 @@ def open_box(descriptor: int, config: ProcessConfig, graph: Graph) -> BlackBox:
     ports = {name: tuple(graph.nodes[name].outputs) for name in config.nodes}
     before = {name: config.resumed(name) for name in config.nodes}
     reached = {
-        name: Reached(r.incarnation - 1, dict(r.last), dict(r.changed)) for name, r in before.items() if r.incarnation
+        name: Reached(r.incarnation - 1, dict(r.last), dict(r.changed), {k: (p[0], p[1]) for k, p in r.places.items()})
+        for name, r in before.items()
+        if r.incarnation
     }
     return BlackBox(descriptor, ports, reached)
 

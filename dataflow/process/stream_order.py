@@ -25,6 +25,8 @@ class Verdict:
     """The envelope to take in its place; None: it does not count."""
     gap: tuple[int, int] | None = None
     """The numbers that were lost before it: first and following."""
+    repeats: bool = False
+    """It promises nothing new, and need not be taken."""
     damaged: str = ""
     """Why a message that may well be the stream's own had to be refused."""
 
@@ -76,6 +78,8 @@ class StreamOrder:
             self._next = envelope.incarnation, envelope.seq + 1
         elif due is not None and (envelope.incarnation == due[0] or gap is not None):
             self._next = place
+        if kind is Kind.FRONTIER and envelope.stamp <= self._promised:
+            return Verdict(gap=gap, repeats=True)
         if self._ended:
             return Verdict(gap=gap)
         if kind is Kind.MESSAGE and envelope.stamp <= self._promised:

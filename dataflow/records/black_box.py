@@ -13,7 +13,7 @@ import mmap
 import os
 import struct
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from typing import Any
 
 import msgpack
@@ -31,12 +31,13 @@ _GENERATION, _OFFSET, _CAPACITY, _LENGTH = range(4)
 
 @dataclass(slots=True)
 class Reached:
-    """Says where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, and
-    the parameters that were changed."""
+    """Says where an operator has got to by its firing records: its incarnation, the last stamp (ns) of each port, the
+    parameters that were changed, and the place (incarnation, number) of the next message of each port."""
 
     incarnation: int = 0
     last: dict[str, int] = field(default_factory=dict)
     changed: dict[str, Any] = field(default_factory=dict)
+    places: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def take(self, record: FiringRecord, ports: Sequence[str]) -> None:
         """Goes on by the next record; `ports` are the operator's outputs as declared."""
@@ -50,6 +51,7 @@ class Reached:
         for port, emission in zip(ports, record.outputs, strict=False):
             if emission is not None and emission.seq != WITHHELD and kind != "setup":
                 self.last[port] = emission.stamp
+                self.places[port] = record.incarnation, emission.seq + 1
 
 
 class BlackBox:
@@ -99,7 +101,7 @@ class BlackBox:
 
     def _begin(self, segment: int, generation: int, *, least: int) -> None:
         """Begins to write a segment anew, with a checkpoint; enlarges it so that `least` bytes fit behind that."""
-        checkpoint: bytes = msgpack.packb({n: [r.incarnation, r.last, r.changed] for n, r in self._reached.items()})
+        checkpoint: bytes = msgpack.packb({n: list(astuple(r)) for n, r in self._reached.items()})
         needed = 2 * _FRAME.size + len(checkpoint) + least
         words, first = self._words, 4 * segment
         words[first + _LENGTH] = 0
@@ -159,8 +161,8 @@ def read_black_box(descriptor: int, ports: Mapping[str, Sequence[str]]) -> Remai
     reached = {name: Reached() for name in ports}
     for kind, data in _frames(descriptor):
         if kind == _CHECKPOINT:
-            for name, (incarnation, last, changed) in msgpack.unpackb(data).items():
-                reached[name] = Reached(incarnation, last, changed)
+            for name, (incarnation, last, changed, places) in msgpack.unpackb(data).items():
+                reached[name] = Reached(incarnation, last, changed, {port: tuple(p) for port, p in places.items()})
             continue
         for record in decode_batch(data).records:
             batches[record.operator].append(data)

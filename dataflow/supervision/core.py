@@ -82,7 +82,7 @@ class Core:
                     self.run.send_all("playback", action=action, steps=steps, speed=speed)
             case TriggerAsked(text):
                 if self._closing is None and self.run.phase is not Phase.STARTING:
-                    self.run.tell_recorder("event", name="trigger", stamp=self.run.event_time(), data={"text": text})
+                    self.run.trigger(text)
             case Aborted(why, interrupted):
                 raise RunFailed(why, interrupted=interrupted)
             case Said(label, kind, fields):
@@ -181,9 +181,8 @@ class Core:
             case "seen":
                 process.unseen.discard(fields["stream"])
             case "ended":
-                if not process.take(Step.END, now):
+                if not process.end(fields["report"], now):
                     return
-                process.report = fields["report"]
             case "closed":
                 if process.take(Step.CLOSE, now):
                     process.facts = fields["facts"]

@@ -59,4 +59,9 @@ class RemainsPart(Part):
     def resumed(self, operator: str) -> dict[str, Any]:
         """Returns what the next process of this operator begins with: fields of `Resumed`, as plain values."""
         reached = self._reached.get(operator, Reached())
-        return {"incarnation": reached.incarnation + 1, "last": reached.last, "changed": reached.changed}
+        return {
+            "incarnation": reached.incarnation + 1,
+            "last": reached.last,
+            "changed": reached.changed,
+            "places": reached.places,
+        }

@@ -100,7 +100,7 @@ class LiveRestarts(RestartPolicy):
         for label, producer in self.run.processes.items():
             consumers = [consumer for maker, consumer in self._pairs if maker == label]
             if process.label in consumers:
-                self.run.send(producer, "gone", ring=consumers.index(process.label))
+                self.run.send(producer, "gone", ring=consumers.index(process.label), life=process.life_number)
 
     def tick(self) -> None:
         for process in self.run.processes.values():

@@ -121,7 +121,7 @@ class RunState:
         process.since = self.steady
         kind, config = self.configs[process.label]
         self.command(Spawn(process.label))
-        self.command(Send(process.label, kind, config | more))
+        self.command(Send(process.label, kind, config | {"life": process.life_number} | more))
 
     def send(self, process: Supervised, kind: str, /, *, replaces: bool = False, **fields: Any) -> None:
         """Sends to a process, if there is one."""
@@ -150,6 +150,10 @@ class RunState:
         for process in self.processes.values():
             if process.plan.sink == "record":
                 self.send(process, kind, **fields)
+
+    def trigger(self, text: str) -> None:
+        """Has the flight recorder keep what was."""
+        self.tell_recorder("event", name="trigger", stamp=self.event_time(), data={"text": text})
 
     def event(self, name: str, text: str, /, **data: Any) -> None:
         """Tells the user and the recording something that both must know."""

@@ -78,19 +78,20 @@ class Supervisor:
     def stop(self) -> None:
         """Asks for an orderly end: sources stop, everything drains. A second call ends at once."""
         self._stops += 1
-        with contextlib.suppress(BlockingIOError, OSError):  # full: it will wake up; closed: it is over
-            os.write(self._waking, b"!")
+        self._wake_up()
 
     def play(self, action: Action, steps: int = 1, speed: float | None = None) -> None:
         """Pauses, resumes, steps what is not live, or changes its speed; on any thread."""
         self._asked.append(events.PlaybackAsked(action, steps, speed))
-        with contextlib.suppress(BlockingIOError, OSError):
-            os.write(self._waking, b"!")
+        self._wake_up()
 
     def trigger(self, text: str) -> None:
         """Has the flight recorder keep what was; on any thread."""
         self._asked.append(events.TriggerAsked(text))
-        with contextlib.suppress(BlockingIOError, OSError):
+        self._wake_up()
+
+    def _wake_up(self) -> None:
+        with contextlib.suppress(BlockingIOError, OSError):  # full: it will wake up; closed: it is over
             os.write(self._waking, b"!")
 
     def pid_of(self, label: str) -> int:

@@ -20,4 +20,4 @@ class TriggersPart(Part):
     def said(self, process: Supervised, kind: str, fields: Mapping[str, Any]) -> None:
         if kind == "trigger" and fields["id"] not in self._seen:
             self._seen.add(fields["id"])
-            self.run.tell_recorder("event", name="trigger", stamp=self.run.event_time(), data={"text": fields["text"]})
+            self.run.trigger(fields["text"])

@@ -102,9 +102,9 @@ class Fanout:
                 found.append((keys, link))
         return found
 
-    def take_leave(self, number: int) -> None:
-        """The process at the other end of a link has died."""
-        self._links[number].take_leave()
+    def take_leave(self, number: int, life: int) -> None:
+        """The process at the other end of a link has died (`Outgoing.take_leave`)."""
+        self._links[number].take_leave(life)
 
     def counters(self) -> dict[str, int]:
         """Counts envelopes and bytes that were sent, those of them that went through the pool, the large ones that

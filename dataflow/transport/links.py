@@ -89,9 +89,13 @@ class Outgoing:
     def waiting(self) -> bool:
         return bool(self._waiting)
 
-    def take_leave(self) -> None:
-        """The consumer has died: what was meant for it is not sent any more."""
-        if not self._new_reader():
+    def take_leave(self, life: int) -> None:
+        """The consumer that was the process `life` in its place has died: what was meant for it is not sent any more.
+
+        This may be heard late, when another process is there already.
+        """
+        self._new_reader()
+        if self._reader <= life:
             self.away = True
             self._begin_anew()
 
@@ -206,10 +210,10 @@ class Outgoing:
 
 
 class Incoming:
-    """The consumer's end of a link, with the keys of its channels."""
+    """The consumer's end of a link, with the keys of its channels. `life`: which process in its place this is."""
 
-    def __init__(self, ring: int, wake: int, board: int, keys: Sequence[str], pools: PoolReader) -> None:
-        self._ring = RingReader(ring, wake)
+    def __init__(self, ring: int, wake: int, board: int, keys: Sequence[str], pools: PoolReader, life: int) -> None:
+        self._ring = RingReader(ring, wake, life)
         self.arrived, self.sleep, self.awake = self._ring.arrived, self._ring.sleep, self._ring.awake
         self._board = Board(board)
         self._keys, self._pools = keys, pools

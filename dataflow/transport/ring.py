@@ -4,7 +4,7 @@ One writer, one reader, each on one thread. Whoever starts both makes the memory
 else on the machine can write to it: what comes out of a ring comes from the process at its other end. Five words are
 shared, each with one writer: `head` and `tail` count the bytes ever written and read, `asleep` is set by a reader that
 is about to wait, `blocked` by a writer that found no room,
-`readers` counts the readers that there were. A frame counts once `head` includes it, which is written
+`readers` names the reader that came last, by number. A frame counts once `head` includes it, which is written
 last; so a writer that is killed leaves whole frames, and its successor goes on with the same ring. A reader that takes
 the place of another skips what was meant for that one.
 
@@ -84,7 +84,7 @@ class RingWriter(_End):
         """Bytes of the largest frame that can pass, once there is room."""
 
     def reader(self) -> int:
-        """Returns which reader is at the other end, by number; 0: there was none yet."""
+        """Returns which reader came last to the other end, by number; 0: there was none yet."""
         return int(self._words[READERS])
 
     @property
@@ -140,14 +140,17 @@ class RingWriter(_End):
 
 
 class RingReader(_End):
-    """The reading end. `wake` is the writer's eventfd, for when it waits for room. Skips what is there already."""
+    """The reading end. `wake` is the writer's eventfd, for when it waits for room. Skips what is there already.
 
-    def __init__(self, descriptor: int, wake: int) -> None:
+    `number`: one more than that of the reader before; the first is 1.
+    """
+
+    def __init__(self, descriptor: int, wake: int, number: int) -> None:
         super().__init__(descriptor)
         self._wake = wake
         self._tail = self._words[_HEAD]
         self._words[_TAIL] = self._tail
-        self._words[READERS] += 1
+        self._words[READERS] = number
         self._words[_BLOCKED] = 0
 
     def arrived(self) -> bool:

@@ -61,14 +61,14 @@ class _Origin:
         """
         messages = counts[0]
         end = messages + 1 if sync else messages
+        while self.lost and self.lost[0] < end - window:
+            self.lost.popleft()
         self.lost.extend(range(max(self.received[0] + 1, end - window), end))
         self.received, self.skipped = counts, skipped
 
-    def acknowledgement(self, window: int) -> bytes:
+    def acknowledgement(self) -> bytes:
         """Acknowledges what was taken, with the numbers of those that were lost before it."""
         self.acked = self.taken
-        while self.lost and self.lost[0] <= self.taken[0] - window:
-            self.lost.popleft()
         return write_acknowledgement(self.epoch, *self.taken, [n for n in self.lost if n <= self.taken[0]])
 
 
@@ -228,7 +228,7 @@ class TapClient:
             enough = messages * 4 >= self.window.messages or nbytes * 4 >= self.window.bytes
             if sync or (messages and (enough or not self._queue)):
                 key = runtime_key(self._namespace, "ack", process_text(other), self.id)
-                due.append((key, state.acknowledgement(self.window.messages)))
+                due.append((key, state.acknowledgement()))
         return due
 
 

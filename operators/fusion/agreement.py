@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Diagnostics
 from dataflow.messages.diagnostics import Level
 from operators.fusion.combination import contradicts
+from operators.status import Row, status_of_rows
 
 T = TypeVar("T")
 Array = NDArray[np.float64]
@@ -82,7 +83,7 @@ class Agreement:
     def status(self, stamp: int, ignored: Mapping[str, int]) -> Diagnostics:
         """Returns a status for the whole and one for every sensor, and forgets the doubts it tells of."""
         text = "sensors contradict each other" if self._doubted else "sensors agree"
-        rows: list[tuple[str, str, Level, dict[str, str]]] = [
+        rows: list[Row] = [
             ("fusion", text, Level.WARN if self._doubted else Level.OK, {k: str(n) for k, n in sorted(ignored.items())})
         ]
         for sensor in sorted(set(self._used) | set(self._doubted)):
@@ -94,16 +95,7 @@ class Agreement:
             values = {"used": str(self._used[sensor]), "doubted": str(doubted), "noise": f"{noise:.2f}"}
             rows.append((sensor, text, level, values))
         self._doubted.clear()
-        pairs = [(key, value, k) for k, row in enumerate(rows) for key, value in row[3].items()]
-        return Diagnostics(
-            stamp=stamp,
-            names=tuple(row[0] for row in rows),
-            messages=tuple(row[1] for row in rows),
-            levels=np.array([row[2] for row in rows], np.uint8),
-            keys=tuple(key for key, _, _ in pairs),
-            values=tuple(value for _, value, _ in pairs),
-            owners=np.array([owner for _, _, owner in pairs], np.int32) if pairs else None,
-        )
+        return status_of_rows(stamp, rows)
 
     @property
     def doubted(self) -> bool:

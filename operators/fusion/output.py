@@ -12,6 +12,7 @@ from dataflow.messages.diagnostics import Level
 from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, SIZE, VELOCITY, State, cross
 from operators.fusion.gate import Health
 from operators.geometry.se3 import skew
+from operators.status import Row, status_of_rows
 
 Array = NDArray[np.float64]
 
@@ -55,9 +56,7 @@ def diagnostics(
     it says.
     """
     text = "one hypothesis" if hypotheses == 1 else f"{hypotheses} headings in question"
-    rows: list[tuple[str, str, Level, dict[str, int | str]]] = [
-        ("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))
-    ]
+    rows: list[Row] = [("filter", text, Level.OK if hypotheses == 1 else Level.WARN, dict(ignored))]
     for name, h in sorted(health.items()):
         silent = h.last_used is None or stamp - h.last_used > 2e9
         if h.doubts and silent:
@@ -74,16 +73,7 @@ def diagnostics(
             values |= {"offset, s": f"{found[0]:.4f}", "offset sigma, s": f"{found[1]:.4f}"}
         rows.append((name, text, level, values))
     rows += [(name, text, Level.WARN, {}) for name, text in sorted(warnings.items())]
-    pairs = [(key, str(value), k) for k, row in enumerate(rows) for key, value in row[3].items()]
-    return Diagnostics(
-        stamp=stamp,
-        names=tuple(row[0] for row in rows),
-        messages=tuple(row[1] for row in rows),
-        levels=np.array([row[2] for row in rows], np.uint8),
-        keys=tuple(key for key, _, _ in pairs),
-        values=tuple(value for _, value, _ in pairs),
-        owners=np.array([owner for _, _, owner in pairs], np.int32) if pairs else None,
-    )
+    return status_of_rows(stamp, rows)
 
 
 def figures(

@@ -12,6 +12,7 @@ from dataflow.messages.diagnostics import Level
 from operators.localization.estimate import Estimate, apart
 from operators.localization.says import CONSISTENT
 from operators.localization.vote import Vote
+from operators.status import Row, status_of_rows
 
 Array = NDArray[np.float64]
 _LEVELS = {
@@ -38,7 +39,7 @@ def status_of(
         figures |= {"other place": written(fused.other), "likelier than the other": f"{filter.rival.lead:.1f} nats"}
     figures |= {f"ignored, {reason}": str(count) for reason, count in sorted(ignored.items())}
     said = "ambiguous: another place explains as much" if fused.other is not None else fused.word
-    rows: list[tuple[str, str, Level, dict[str, str]]] = [("filter", said, _LEVELS[fused.word], figures)]
+    rows: list[Row] = [("filter", said, _LEVELS[fused.word], figures)]
     counts = filter.says.counts(stamp)
     for sensor, fit in sorted(filter.fits().items()):
         ratio, count = filter.says.ratio(sensor), counts.get(sensor, 1.0)
@@ -56,13 +57,4 @@ def status_of(
             text = "contradicts the fused estimate" if off else own.word
             places = {"pose": written(own.mean)} | ({} if own.other is None else {"other place": written(own.other)})
             rows.append((f"{name} alone", text, Level.WARN if off else Level.OK, places))
-    pairs = [(key, value, k) for k, row in enumerate(rows) for key, value in row[3].items()]
-    return Diagnostics(
-        stamp=stamp,
-        names=tuple(row[0] for row in rows),
-        messages=tuple(row[1] for row in rows),
-        levels=np.array([row[2] for row in rows], np.uint8),
-        keys=tuple(key for key, _, _ in pairs),
-        values=tuple(value for _, value, _ in pairs),
-        owners=np.array([owner for _, _, owner in pairs], np.int32),
-    )
+    return status_of_rows(stamp, rows)

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from dataflow.cli.playback import ENDING, KEEPING, PLAYING, _steered, keys, looped, pressed
+from dataflow.cli.playback import ENDING, KEEPING, PLAYING, Offer, _steered, keys, looped, pressed
 from dataflow.feeds.playback import ACTIONS, FASTEST, SLOWEST, Playback
 
 
@@ -92,7 +92,7 @@ def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("help", "meant"),
+    ("offers", "meant"),
     [
         ((PLAYING, KEEPING, ENDING), ["toggle", "step", "the key k", "step", "stop"]),
         ((PLAYING, ENDING), ["toggle", "step", "step", "stop"]),
@@ -101,7 +101,7 @@ def test_keys_mean_what_the_help_says(typed: bytes, meant: list[str]) -> None:
     ids=["flight recorder", "no flight recorder", "live"],
 )
 def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
-    monkeypatch: pytest.MonkeyPatch, help: tuple[str, ...], meant: list[str]
+    monkeypatch: pytest.MonkeyPatch, offers: tuple[Offer, ...], meant: list[str]
 ) -> None:
     master, slave = pty.openpty()
     done: list[str] = []
@@ -121,7 +121,7 @@ def test_keys_in_a_terminal_steer_and_leave_it_as_it_was(
     with os.fdopen(slave, "r") as terminal:
         monkeypatch.setattr("sys.stdin", terminal)
         before = termios.tcgetattr(terminal)
-        with _steered(" · ".join(help), Steered()):  # type: ignore[arg-type]
+        with _steered(offers, Steered()):  # type: ignore[arg-type]
             os.write(master, b" nk\x1b[Cq")
             assert came.wait(10)
         after = termios.tcgetattr(terminal)

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -176,15 +177,15 @@ def test_a_jump_that_is_refused_moves_nothing_and_is_said() -> None:
     assert (current, did_seek) == (STAMP, 0)
 
 
-def test_the_command_plays_a_recording_until_it_is_interrupted(repository: Path) -> None:
-    command = [sys.executable, "-m", "dataflow.cli.main", "foxglove", str(repository / "recordings" / "demo.mcap")]
-    process = subprocess.Popen([*command, "--port", "0", "--start", "2"], stderr=subprocess.PIPE, text=True)
+@contextmanager
+def playing(*options: str) -> Iterator[Client]:
+    """A client of `dataflow foxglove`, which ends in order when it is interrupted."""
+    command = [sys.executable, "-m", "dataflow.cli.main", "foxglove", *options, "--port", "0"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     try:
         assert process.stderr is not None
-        address = process.stderr.readline().split()[-1]
-        client = Client(address)
-        client.subscribe("/robot/image_jpeg", 1)
-        _, stamp, data = client.data.get(timeout=WITHIN)
+        client = Client(next(line.split()[-1] for line in process.stderr if "ws://" in line))
+        yield client
         client.close()
         process.send_signal(signal.SIGINT)
         assert process.wait(WITHIN) == 0
@@ -192,6 +193,12 @@ def test_the_command_plays_a_recording_until_it_is_interrupted(repository: Path)
         process.kill()
         process.wait(WITHIN)
         process.stderr.close()
+
+
+def test_the_command_plays_a_recording_until_it_is_interrupted(repository: Path) -> None:
+    with playing(str(repository / "recordings" / "demo.mcap"), "--start", "2") as client:
+        client.subscribe("/robot/image_jpeg", 1)
+        _, stamp, data = client.data.get(timeout=WITHIN)
 
     assert stamp > 0
     assert CompressedImage.FromString(data).format == "jpeg"
@@ -200,20 +207,9 @@ def test_the_command_plays_a_recording_until_it_is_interrupted(repository: Path)
 def test_a_bag_is_played_as_a_recording_is(tmp_path: Path) -> None:
     text = ros("std_msgs/String", ROS1, data="hello")
     bag = write_ros1(tmp_path / "old.bag", [("/said", STAMP + k * SECOND // 10, text) for k in range(20)])
-    command = [sys.executable, "-m", "dataflow.cli.main", "foxglove", str(bag), "--port", "0"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    try:
-        assert process.stderr is not None
-        client = Client(next(line.split()[-1] for line in process.stderr if "ws://" in line))
+    with playing(str(bag)) as client:
         client.subscribe("/said", 1)
         said = json.loads(client.data.get(timeout=WITHIN)[2])
-        client.close()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(WITHIN) == 0
-    finally:
-        process.kill()
-        process.wait(WITHIN)
-        process.stderr.close()
 
     assert said["text"] == "hello"
 

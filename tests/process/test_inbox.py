@@ -23,7 +23,7 @@ class Wired:
     def __init__(self) -> None:
         self.ring, self.board = make_ring(4096), make_board()
         self.wake, self.back = (os.eventfd(0, os.EFD_NONBLOCK) for _ in range(2))
-        incoming = Incoming(self.ring, self.back, self.board, ["a", "b"], PoolReader())
+        incoming = Incoming(self.ring, self.back, self.board, ["a", "b"], PoolReader(), 1)
         self.inbox = Inbox(self.wake, [incoming])
         self.producer = Outgoing(self.ring, self.wake, self.board, None)
 

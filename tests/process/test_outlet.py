@@ -37,12 +37,15 @@ class Linked:
             box=None,
             firings=False,
             incarnations={},
+            left={},
         )
+        self.lives = 0
         self.start()
 
     def start(self) -> None:
         """The consumer, or what takes its place, begins to listen."""
-        self.consumer = Incoming(*self.descriptors, [INFO, FAST], PoolReader())
+        self.lives += 1
+        self.consumer = Incoming(*self.descriptors, [INFO, FAST], PoolReader(), self.lives)
 
     def taken(self) -> list[tuple[str, str, int]]:
         found = []
@@ -78,7 +81,7 @@ def test_who_was_started_again_is_sent_the_static_messages_again_and_they_count_
     linked.outlet.end(INFO, None, "over")
     linked.outlet.message(FAST, entry(FAST, 10, 0))
     first = linked.taken()
-    linked.outlet.consumer_gone(0)
+    linked.outlet.consumer_gone(0, 1)
     linked.outlet.message(FAST, entry(FAST, 20, 1))  # for nobody
     linked.start()
     assert linked.taken() == [("constant", "MESSAGE", 0), ("constant", "END", 1)]
@@ -110,9 +113,15 @@ def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_m
         box=None,
         firings=False,
         incarnations={INFO: 2, FAST: 2},
+        left={INFO: (1, 1), FAST: (1, 7)},
     )
     linked.outlet.release()
     linked.outlet.message(INFO, entry(INFO, 0, 0))
     linked.outlet.end(INFO, None, "static")
     linked.outlet.message(FAST, entry(FAST, 10, 0, incarnation=2))
-    assert linked.taken() == [("constant", "MESSAGE", 0), ("constant", "END", 1), ("fast", "MESSAGE", 0)]
+    assert linked.taken() == [
+        ("fast", "FRONTIER", 7),  # where the process before it had got to
+        ("constant", "MESSAGE", 0),
+        ("constant", "END", 1),
+        ("fast", "MESSAGE", 0),
+    ]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from process_doubles import end, frontier, message
 
 from dataflow.process.stream_order import StreamOrder, Verdict
-from dataflow.sync import FOREVER
+from dataflow.sync import FOREVER, NEVER
 from dataflow.transport import Envelope, Kind
 
 
@@ -79,6 +79,19 @@ def test_what_a_new_incarnation_lost_first_is_said_once() -> None:
 
     later = [frontier(3, 2000, incarnation=1), message(3, 2001, incarnation=1), message(4, 2002, incarnation=1)]
     assert take_all(order, later) == (later, [(0, 3)])
+
+
+def test_a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_of_that_is_lost() -> None:
+    said_by_successor = frontier(4, NEVER)
+
+    order = StreamOrder((0, 0))
+    take_all(order, [message(0), message(1)])
+    assert order.take(said_by_successor) == Verdict(gap=(2, 4), repeats=True)
+    assert take_all(order, [message(0, 2000, incarnation=1)])[1] == []
+
+    whole = StreamOrder((0, 0))
+    take_all(whole, stream_of(4))  # and it has ended
+    assert whole.take(said_by_successor) == Verdict(repeats=True)
 
 
 def test_an_end_after_a_jump_back_is_no_earlier_than_what_was_promised() -> None:

@@ -60,7 +60,7 @@ def test_the_latest_records_are_kept_and_older_ones_leave_where_they_led(memory:
     assert all(b == a + 1 for a, b in pairwise(indices))
     remains = read_black_box(memory, PORTS)
     assert not remains.batches["detector"]
-    assert remains.reached["detector"] == Reached(0, {"boxes": 101}, {"gain": 1})
+    assert remains.reached["detector"] == Reached(0, {"boxes": 101}, {"gain": 1}, {"boxes": (0, 2)})
     assert remains.reached["camera"].last == {"image": 139}
 
 

@@ -35,12 +35,20 @@ def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
     told = play.tell()
     assert ("after", {"streams": ["test/smooth/mean"], "absent": True}) in sent(told, "absent")
     assert [len(fields["batches"]) for label, fields in sent(told, "records")] == [2]
+    assert {fields["life"] for _, fields in sent(told, "gone")} == {1}
     assert play.core.status.restarts == {"smooth": 1}
     told = play.wait(0.3)
 
     assert spawned(told) == ["smooth"]
     ((_, config),) = sent(told, "operators")
-    assert config["resume"]["smooth"] == {"incarnation": 1, "last": {"mean": 7}, "changed": {}, "restarts": 1}
+    assert config["resume"]["smooth"] == {
+        "incarnation": 1,
+        "last": {"mean": 7},
+        "changed": {},
+        "places": {"mean": (0, 2)},
+        "restarts": 1,
+    }
+    assert config["life"] == 2
     assert [label for label, _ in sent(told, "probe")] == ["smooth"]
     assert [label for label, _ in sent(told, "go")] == ["smooth"]
     assert play.core.status.notes == [
@@ -48,6 +56,23 @@ def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
         "process 'smooth' is back",
     ]
     assert play.ends().report is not None
+
+
+def test_a_recorder_that_has_ended_goes_on_when_a_process_comes_back() -> None:
+    play = robot(record="run.mcap").starts()
+    unaware = play.ended("@recorder")
+    play.dies("smooth", -9)
+    play.tell(play.ended("@recorder"))
+    told = play.wait(0.3)
+    assert [fields["times"] for _, fields in sent(told, "expect")] == [1]
+
+    play.tell(unaware)  # it had not heard of that yet
+    play.tell(*(play.ended(label) for label in play.processes if label != "@recorder"))
+    assert not sent(play.wait(1.0), "leave")
+    play.tell(play.ended("@recorder"))
+    play.wait(1.0)
+    assert play.over is not None
+    assert play.over.failure is None
 
 
 def test_restarts_come_to_an_end() -> None:

@@ -20,10 +20,13 @@ class Pair:
         self.ring, self.board = make_ring(capacity), make_board()
         self.wakes = [os.eventfd(0, os.EFD_NONBLOCK) for _ in range(2)]
         self.producer = Outgoing(self.ring, self.wakes[0], self.board, most)
+        self.lives = 0
         self.consumer = self.reader()
 
     def reader(self) -> Incoming:
-        return Incoming(self.ring, self.wakes[1], self.board, ["a", "b"], PoolReader())
+        """The consumer, or the next process in its place."""
+        self.lives += 1
+        return Incoming(self.ring, self.wakes[1], self.board, ["a", "b"], PoolReader(), self.lives)
 
     def send(self, content: bytes, channel: int = 0, *, droppable: bool = True) -> None:
         self.producer.send(channel, [content], len(content), droppable=droppable, block=None)
@@ -75,11 +78,32 @@ def test_the_oldest_messages_are_dropped_when_too_many_wait_and_ends_are_kept() 
 def test_what_was_meant_for_a_consumer_that_died_does_not_reach_its_successor(pair: Pair) -> None:
     for k in range(20):
         pair.send(bytes([k]) * 900)
-    pair.producer.take_leave()
+    pair.producer.take_leave(1)
     pair.send(b"to nobody")
     pair.consumer = pair.reader()
     pair.send(b"to the successor")
     assert pair.taken() == [("a", b"to the successor")]
+
+
+def test_a_death_that_is_heard_of_late_is_not_taken_for_that_of_the_successor(pair: Pair) -> None:
+    pair.consumer = pair.reader()
+    pair.send(b"to the successor")
+    pair.producer.take_leave(1)
+    pair.send(b"and this, too")
+    assert pair.taken() == [("a", b"to the successor"), ("a", b"and this, too")]
+
+
+def test_one_that_dies_unnoticed_after_another_is_gone_and_its_successor_is_served(pair: Pair) -> None:
+    pair.reader()
+    pair.producer.take_leave(1)
+    pair.producer.take_leave(2)
+    pair.send(b"to nobody")
+    assert not pair.producer.present()
+    pair.lives += 1  # the third dies before it listens
+    pair.producer.take_leave(3)
+    pair.consumer = pair.reader()
+    pair.send(b"to the fourth")
+    assert pair.taken() == [("a", b"to the fourth")]
 
 
 def test_a_successor_takes_no_rest_of_a_message_that_began_before_it(pair: Pair) -> None:
@@ -107,6 +131,6 @@ def test_a_block_is_free_when_its_consumer_dropped_released_or_died(pair: Pair) 
     assert held[1] is not None
     pair.producer.claim.drop(held[0])
     assert [block.free() for block in held if block] == [True, False]
-    pair.producer.take_leave()
+    pair.producer.take_leave(1)
     assert held[1].free()
     pool.close()

@@ -21,7 +21,7 @@ class Ends:
         self.descriptor = make_ring(capacity)
         self.to_reader, self.to_writer = os.eventfd(0, os.EFD_NONBLOCK), os.eventfd(0, os.EFD_NONBLOCK)
         self.writer = RingWriter(self.descriptor, self.to_reader)
-        self.reader = RingReader(self.descriptor, self.to_writer)
+        self.reader = RingReader(self.descriptor, self.to_writer, 1)
 
     def close(self) -> None:
         self.writer.close()
@@ -109,7 +109,7 @@ def test_a_writer_goes_on_where_its_predecessor_was_killed(ends: Ends) -> None:
 
 def test_a_reader_skips_what_was_meant_for_its_predecessor(ends: Ends) -> None:
     ends.writer.put(0, [b"before"])
-    successor = RingReader(ends.descriptor, ends.to_writer)
+    successor = RingReader(ends.descriptor, ends.to_writer, 2)
     ends.writer.put(0, [b"after"])
     assert successor.take(10) == [(0, b"after")]
     successor.close()

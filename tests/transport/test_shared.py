@@ -39,7 +39,9 @@ def depth_image(stamp: int, side: int = 256) -> DepthImage:
 def shared_files() -> set[str]:
     """Files in shared memory that could hold a block; other programs' semaphores come and go meanwhile."""
     folder = Path("/dev/shm")
-    return {f.name for f in folder.iterdir() if not f.name.startswith("sem.")} if folder.is_dir() else set()
+    if not folder.is_dir():
+        return set()
+    return {f.name for f in folder.iterdir() if f.is_file() and not f.name.startswith("sem.")}
 
 
 class Shared:
@@ -51,8 +53,8 @@ class Shared:
         self.fanout = Fanout([([DEPTH], link) for link in self.outgoing], pool_bytes=blocks * BLOCK)
         self.consumers = [self.consumer(k) for k in range(consumers)]
 
-    def consumer(self, number: int = 0) -> Incoming:
-        return Incoming(*self.descriptors[number], [DEPTH], PoolReader())
+    def consumer(self, number: int = 0, life: int = 1) -> Incoming:
+        return Incoming(*self.descriptors[number], [DEPTH], PoolReader(), life)
 
     def send(self, seq: int, side: int = 256) -> None:
         envelope = carrying(depth_image(seq, side), DEPTH, seq)
@@ -151,8 +153,8 @@ def test_where_nothing_may_be_lost_all_of_the_pool_may_be_held() -> None:
 
 def test_what_a_consumer_held_that_was_replaced_is_free(shared: Shared) -> None:
     held = [shared.passed(seq) for seq in range(4)]
-    shared.outgoing[0].take_leave()
-    shared.consumers[0] = shared.consumer()
+    shared.outgoing[0].take_leave(1)
+    shared.consumers[0] = shared.consumer(life=2)
     assert [shared.passed(seq) == depth_image(seq) for seq in range(4, 8)] == [True] * 4
     assert shared.fanout.counters()["shared_full"] == 0
     held.clear()

@@ -33,7 +33,7 @@ from dataflow.verification.report import VerifyReport
 from dataflow.verification.verify import verify
 from simulation.bindings import bound
 from simulation.run import Machine, Outcome, simulate
-from simulation.scenario import TIMEOUT, Scenario
+from simulation.scenario import PATIENCE, TICKING, TIMEOUT, Scenario
 from simulation.world import Violation
 
 
@@ -272,7 +272,13 @@ MOST_OF_A_STEP = 2
 
 
 def _may_replay(scenario: Scenario, report: RunReport) -> bool:
-    """Whether a replay is to give the same: not of a run that was stopped, nor of one whose clock went back."""
+    """Whether a replay is to give the same: not of a run that was stopped, nor of one whose clock went back.
+
+    Nor is one run whose timer would make up for a long silence: it makes more ticks than a simulated run has time for.
+    """
+    silent = any(happening.fields.get("span", 0) > PATIENCE for happening in scenario.happenings)
+    if scenario.graph == TICKING and silent:
+        return False
     return not report.interrupted and all(fault.kind != "jump" for fault in scenario.faults)
 
 
