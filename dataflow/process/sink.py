@@ -280,7 +280,7 @@ class SinkProcess:
                 raise ChannelClosed("the supervisor is gone")
 
     def _expect(self, keys: Sequence[str], times: int) -> None:
-        """Waits for the end of streams again, and for an operator's last firing records. Static streams have one end."""
+        """Waits for the ends of streams again, and for last firing records. Static streams end once."""
         self._expected, self._ended = times, False
         self._told.clear()
         self._open.update(key for key in keys if key in self.frontiers and not self.graph.streams[key].static)

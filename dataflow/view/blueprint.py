@@ -15,8 +15,9 @@ from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCl
 from dataflow.view.canvas import Role
 from dataflow.view.drawing import plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
-from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, Outlook, entity_of
+from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, entity_of
 from dataflow.view.scores import SCORES
+from dataflow.view.viewpoint import Outlook
 from dataflow.view.visualizers.scene_tree import HEIGHT, WIDTH
 
 _BACKGROUND = (24, 27, 33)
