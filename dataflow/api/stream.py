@@ -192,21 +192,22 @@ class RecordedStream(Sequence[Message]):
 
     # ------------------------------------------------------------------------------------------------- display
 
-    def facts(self) -> StreamFacts:
-        """Sums up the stream, or this part of it."""
-        info, count = self.info, len(self)
-        if count in (0, info.count):
-            return StreamFacts(self.name, info, count, info.first, info.last)
-        return StreamFacts(self.name, info, count, int(self.stamps.min()), int(self.stamps.max()))
-
     def __repr__(self) -> str:
         found = self.info.message_type
         kind = found.SCHEMA if found is not None else self.info.schema or self.info.encoding
         return f"<{self.name}: {len(self):,} × {kind}>"
 
     def _repr_html_(self) -> str:
-        return stream_html(self.facts())
+        return stream_html(facts_of(self))
 
 
 def _stamp(seconds: float | None, origin: int) -> int | None:
     return None if seconds is None else origin + round(seconds * 1e9)
+
+
+def facts_of(stream: RecordedStream) -> StreamFacts:
+    """Sums up a stream, or a part of one."""
+    info, count = stream.info, len(stream)
+    if count in (0, info.count):
+        return StreamFacts(stream.name, info, count, info.first, info.last)
+    return StreamFacts(stream.name, info, count, int(stream.stamps.min()), int(stream.stamps.max()))
