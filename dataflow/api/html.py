@@ -26,7 +26,7 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 class StreamFacts(NamedTuple):
-    """What is shown of a stream, or of a part of it."""
+    """One row of the table of streams: of a stream, or of a part of it."""
 
     name: str
     info: StreamInfo

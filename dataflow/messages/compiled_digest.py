@@ -140,4 +140,4 @@ NAMES: Mapping[str, Any] = {
     "_updated": _updated,
     "_words": _words_bytes,
 }
-"""What the text of a digest refers to, besides what belongs to its class."""
+"""Names that the text of a digest refers to, besides those that belong to its class."""

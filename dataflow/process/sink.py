@@ -101,7 +101,7 @@ class SinkProcess:
         self._open = set(config.streams)
         """Streams whose end has not come yet."""
         self._expected = 0
-        """How often it was told that streams begin anew, since the process that makes them was started again."""
+        """Counts how often streams were said to begin anew: the process that makes them was started again."""
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
         self.inlet = Inlet(

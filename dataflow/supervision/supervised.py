@@ -37,7 +37,7 @@ class Supervised:
     silent: bool = False
     """It gives no sign of life, and the others go on without it."""
     expected: int = 0
-    """How often it was told to expect streams anew; the end that it says before it has heard of that is none."""
+    """Counts how often it was told to expect streams anew; an end said before it has heard of that is none."""
     hung_up: float | None = None
     """When it closed its channel."""
 

@@ -25,7 +25,7 @@ class Outlook:
 
 @dataclass(slots=True)
 class Viewpoint:
-    """What is known of where things are."""
+    """Frames, ranges and positions that messages have told of so far."""
 
     optical: dict[str, None] = field(default_factory=dict)
     """Optical frames, in the order in which they came."""
