@@ -7,9 +7,10 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
+from dataflow.api.graphs import GraphLike, resolved
 from dataflow.api.handed import HandedFeed
 from dataflow.api.local import Emitting, Recorder, config_of, make_here, step_each
-from dataflow.api.runs import GraphLike, metadata_of, resolved
+from dataflow.api.runs import metadata_of
 from dataflow.arguments import checked
 from dataflow.firing.calls import summary_of
 from dataflow.firing.failure import OperatorFailure
