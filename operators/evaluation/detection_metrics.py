@@ -46,8 +46,6 @@ class DetectionMetrics(Operator):
     out: str | None = Param(None, doc="JSON file for the figures and a table of the classes; its folder is made")
 
     def setup(self) -> None:
-        import pycocotools.cocoeval  # noqa: F401  a missing package shows now, not at the end of the run
-
         self._detections, self._truth = ObjectLog(), ObjectLog()
         self._known: set[str] = set()
         self._classes: set[str] = set()
