@@ -256,8 +256,7 @@ class Supervisor:
             self._feed(events.Printed(label, each))
 
     def _tick(self) -> None:
-        now = time.monotonic()
-        deserted = not self._nursery_lives
+        now, deserted = time.monotonic(), not self._nursery_lives
         for label, child in list(self._children.items()):
             stuck = now - self._taken_at.get(label, now)
             if stuck > NOT_READING_AFTER or child.channel.overflowed:

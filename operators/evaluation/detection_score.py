@@ -200,7 +200,7 @@ def _iou(a: Floats, a_area: Floats, b: Floats, b_area: Floats) -> Floats:
 
 
 def _curves(matched: Flags, left_out: Flags, positives: int) -> Floats:
-    """Returns the precision at each of COCO's recalls (overlaps, recalls), of detections in the order of their scores."""
+    """Returns the precision at each recall of COCO (overlaps, recalls), of detections in the order of their scores."""
     hits = np.cumsum(matched & ~left_out, axis=1).astype(np.float64)
     alarms = np.cumsum(~matched & ~left_out, axis=1).astype(np.float64)
     reached = hits / positives
