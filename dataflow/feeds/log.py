@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from dataflow.feeds.playable import PlayableStreams
 from dataflow.feeds.promises import promises
@@ -16,12 +17,16 @@ from dataflow.recording import Recorded
 from dataflow.records.firing import Emission
 from dataflow.sync import FOREVER, NEVER, Entry
 
+_NO_DETAIL: Mapping[str, Any] = {}
+
 
 @dataclass(slots=True)
 class _LoggedStream:
     name: str
     node: str
     final: int
+    place: int | None
+    """The place of its port among those of its node; None where it is none of them."""
     promises: Sequence[int] | None = None
     """The frontier that may be promised, by the number of messages given; None where its clock never went back."""
     promised: int = NEVER
@@ -67,7 +72,9 @@ class LogFeed:
         self._records = {node: FiringLog(node, emitter) for node in sorted(set(streams.values()))}
         self._static = {s for s in streams if recording.streams[s].static}
         self._streams = {
-            name: _LoggedStream(name, node, self._final(name, finals, end), self._promises(name, start, end))
+            name: _LoggedStream(
+                name, node, self._final(name, finals, end), self._place(name, node), self._promises(name, start, end)
+            )
             for name, node in streams.items()
             if name not in self._static
         }
@@ -94,6 +101,10 @@ class LogFeed:
         last = self.recording.streams[name].last
         final = max(finals.get(name, NEVER), NEVER if last is None else last)
         return final if end is None else min(final, end)
+
+    def _place(self, name: str, node: str) -> int | None:
+        ports = self._ports[node]
+        return ports.index(name) if name in ports else None
 
     def _least_final(self) -> int:
         return min((state.final for state in self._streams.values() if not state.ended), default=FOREVER)
@@ -144,7 +155,7 @@ class LogFeed:
         step, self._step = self._step, []
         stamp = step[0].message.stamp
         self._end_before(stamp)
-        by_node: dict[str, dict[str, Emission]] = {}
+        by_node: dict[str, list[Emission | None]] = {}
         nbytes = 0
         for item in step:
             state = self._streams[item.stream]
@@ -156,13 +167,17 @@ class LogFeed:
             self.emitter.message(
                 item.stream, Entry(stamp, item.message, item.seq, item.incarnation, digest, item.stream)
             )
-            by_node.setdefault(state.node, {})[item.stream] = Emission(item.seq, stamp, digest)
+            outputs = by_node.get(state.node)
+            if outputs is None:
+                outputs = by_node[state.node] = [None] * len(self._ports[state.node])
+            if state.place is not None:
+                outputs[state.place] = Emission(item.seq, stamp, digest)
         self.last = stamp
         self.firings += 1
         self.emitted += len(step)
         started = time.time_ns()
-        for node, emitted in by_node.items():
-            self._records[node].add("fire", stamp, started, outputs=tuple(emitted.get(s) for s in self._ports[node]))
+        for node, outputs in by_node.items():
+            self._records[node].add_step(stamp, started, tuple(outputs), _NO_DETAIL)
         return len(step), nbytes
 
     def promise(self) -> None:

@@ -167,8 +167,8 @@ def canonical_scalar(kind: ScalarKind, value: Any) -> Scalar | None:
         case "strs":
             if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
                 return None
-            words = tuple(str(v) for v in value if isinstance(v, str) and _is_utf8(v))
-            return words if len(words) == len(value) else None
+            words = tuple([str(v) for v in value if isinstance(v, str)])
+            return words if len(words) == len(value) and _is_utf8("".join(words)) else None
 
 
 def _is_utf8(text: str) -> bool:

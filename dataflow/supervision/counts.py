@@ -13,6 +13,7 @@ from dataflow.supervision.supervised import Supervised
 
 MISSED = "missed"
 """The reason of messages that were lost on their way to a process that did not take them."""
+_NOTHING: Counter[tuple[str, str]] = Counter()
 
 
 class Counts(Part):
@@ -38,14 +39,14 @@ class Counts(Part):
                 self._miss(process, fields["stream"], fields["following"] - fields["first"])
 
     def _take(self, fields: Mapping[str, Any]) -> None:
-        for name, values in fields["counts"].items():
+        counts, drops, waits = fields["counts"], fields.get("drops", {}), fields.get("waits", {})
+        for name, values in counts.items():
             self._reported[name] = OperatorCounts(*values)
-            self._update(name)
-        for name, found in fields.get("drops", {}).items():
+        for name, found in drops.items():
             self._reported_drops[name] = Counter({(input_name, why): n for input_name, why, n in found})
-            self._update(name)
-        for name, found in fields.get("waits", {}).items():
+        for name, found in waits.items():
             self._reported_waits[name] = Counter({(input_name, what): n for input_name, what, n in found})
+        for name in dict.fromkeys((*counts, *drops, *waits)):
             self._update(name)
 
     def _miss(self, process: Supervised, stream: str, number: int) -> None:
@@ -62,15 +63,14 @@ class Counts(Part):
 
     def _update(self, name: str) -> None:
         status = self.run.status
-        missed = self._missed.get(name, Counter())
-        counts = self._reported.get(name, OperatorCounts())
+        missed = self._missed.get(name)
+        counts = self._reported.get(name) or OperatorCounts()
         if (base := self._base.get(name)) is not None:
             counts = counts.after(base)
-        status.operators[name] = counts.after(OperatorCounts(dropped=missed.total()))
-        drops = self._reported_drops.get(name, Counter()) + self._base_drops.get(name, Counter()) + missed
-        if drops:
+        status.operators[name] = counts if not missed else counts.after(OperatorCounts(dropped=missed.total()))
+        if drops := _sum(self._reported_drops.get(name), self._base_drops.get(name), missed):
             status.drops[name] = drops
-        if waits := self._reported_waits.get(name, Counter()) + self._base_waits.get(name, Counter()):
+        if waits := _sum(self._reported_waits.get(name), self._base_waits.get(name)):
             status.waits[name] = waits
 
     def away(self, process: Supervised) -> None:
@@ -79,3 +79,12 @@ class Counts(Part):
                 self._base[name] = reported.after(self._base.get(name, OperatorCounts()))
             self._base_drops[name] = self._base_drops.get(name, Counter()) + self._reported_drops.pop(name, Counter())
             self._base_waits[name] = self._base_waits.get(name, Counter()) + self._reported_waits.pop(name, Counter())
+
+
+def _sum(*counters: Counter[tuple[str, str]] | None) -> Counter[tuple[str, str]]:
+    """Adds what there is; mostly that is nothing, and then no counter is made of it."""
+    found = _NOTHING
+    for counter in counters:
+        if counter:
+            found = found + counter
+    return found

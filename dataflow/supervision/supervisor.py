@@ -256,13 +256,13 @@ class Supervisor:
             self._feed(events.Printed(label, each))
 
     def _tick(self) -> None:
-        now = time.monotonic()
+        now, deserted = time.monotonic(), not self._nursery_lives
         for label, child in list(self._children.items()):
             stuck = now - self._taken_at.get(label, now)
             if stuck > NOT_READING_AFTER or child.channel.overflowed:
                 waiting, overflowed = child.channel.waiting, child.channel.overflowed
                 self._feed(events.NotReading(label, stuck, waiting, overflowed))
-            if child.dead and not self._nursery_lives:
+            if deserted and child.dead:
                 self._ended(label, None)
         self._feed(events.Tick())
 
