@@ -33,7 +33,7 @@ PIXELS = 3.0  # working pixels by which a recognised feature may be off
 FIRST = 8  # features that a first pose may rest on, by which others are looked for
 FOUND = 6.0  # working pixels around where a first pose has a feature, in which it is looked for
 EXPECTED = 20.0  # the same around where the map has it
-PLENTY = 80  # features in agreement that need no others
+PLENTY = 40  # features in agreement that need no others
 FLAT = 0.05  # metres by which features of one plane may be off it
 TRIPLES = 64  # planes that are tried
 
@@ -120,22 +120,17 @@ class Judge:
 def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matrix | None = None) -> Sight | None:
     """Measures the pose of a view in the depth camera of a known one; None where fewer than `fewest` features agree.
 
-    RANSAC PnP on features matched where the map expects them or else anywhere, once more on those matched where that
-    pose puts them, then reprojections and point-to-plane distances together.
+    RANSAC PnP on matched descriptors; where few agree, on those matched where the map expects them, and once more where
+    the first pose puts them; then reprojections and point-to-plane distances together.
     """
-    sighting, matched = None, 0
-    if T_expected is not None:
-        sighting, matched = _guided(known, seen, T_expected, fitter, EXPECTED)
+    pairs = match(known.description, seen.description)
+    sighting, matched = _solved(known, seen, pairs, fitter), len(pairs)
+    if T_expected is not None and (sighting is None or len(sighting.pixels) < fewest):
+        sighting, matched = _more(sighting, matched, *_guided(known, seen, T_expected, fitter, EXPECTED))
+    if sighting is not None and len(sighting.pixels) < PLENTY:
+        again = _guided(known, seen, sighting.T_world_camera, fitter, FOUND)
+        sighting, matched = _more(sighting, matched, *again)
     if sighting is None or len(sighting.pixels) < fewest:
-        pairs = match(known.description, seen.description)
-        sighting, matched = _solved(known, seen, pairs, fitter), len(pairs)
-    if sighting is None:
-        return None
-    if len(sighting.pixels) < PLENTY:
-        again, more = _guided(known, seen, sighting.T_world_camera, fitter, FOUND)
-        if again is not None and len(again.pixels) > len(sighting.pixels):
-            sighting, matched = again, more
-    if len(sighting.pixels) < fewest:
         return None
     T = sighting.T_world_camera
     fit = fitter.refine(
@@ -155,6 +150,13 @@ def _guided(
 ) -> tuple[Sighting | None, int]:
     pairs = guided_pairs(known, seen, T_known_seen, fitter.camera, window)
     return _solved(known, seen, pairs, fitter), len(pairs)
+
+
+def _more(a: Sighting | None, matched_a: int, b: Sighting | None, matched_b: int) -> tuple[Sighting | None, int]:
+    """Returns the one of two in which more features agree."""
+    if b is None or (a is not None and len(a.pixels) >= len(b.pixels)):
+        return a, matched_a
+    return b, matched_b
 
 
 def _solved(known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -> Sighting | None:
