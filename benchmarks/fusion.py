@@ -49,7 +49,7 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
     """RMSE outside of outages (m), the error at every outage's end, and what became of the fixes."""
     from dataflow.messages import Pose
     from operators.fusion import EkfFusion
-    from operators.fusion.sensors import SensorSettings
+    from operators.fusion.sensor_settings import SensorSettings
 
     samples, truth = recorded(folder)
     stamps = np.array([t.stamp for t in truth])
@@ -167,7 +167,7 @@ def simulator(seed: int) -> tuple[list[float], list[list[float]], list[float]]:
     from dataflow.messages.geometry import quaternion_to_matrix
     from operators.fusion import EkfFusion
     from operators.fusion.error_state import log_rotation
-    from operators.fusion.sensors import SensorSettings
+    from operators.fusion.sensor_settings import SensorSettings
 
     samples, fixes, truth, extrinsics, heading = driven(seed, 36)
     operator = EkfFusion(

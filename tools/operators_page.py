@@ -9,8 +9,11 @@ import importlib
 import inspect
 import json
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
+
+from ruamel.yaml import YAML
 
 from dataflow.graph.catalogue import (
     BUILT_IN,
@@ -44,6 +47,31 @@ _KIND = {"in": "In", "sampled": "Sampled", "batch": "Batch"}
 LONGEST = 90
 """Characters of a default that stand in the table as they are."""
 
+GRAPHS_INTRODUCTION = """\
+Files of `graphs/`; what stands in a nested graph is counted to the graphs that hold it. Operators that are not listed
+are sources of recordings, videos and devices, what `PerceptionSystem` puts in place of sensors, and alternatives to
+those that are."""
+
+GRAPHS = Path(__file__).resolve().parent.parent / "graphs"
+
+
+def graphs_of(folder: Path = GRAPHS) -> dict[str, list[str]]:
+    """The graph files directly in a folder by the operators (`module:Class`) in them, nested graphs included."""
+    found: dict[str, list[str]] = {}
+    for file in sorted(folder.glob("*.yaml")):
+        for use in set(_uses(file)):
+            found.setdefault(use, []).append(file.name)
+    return dict(sorted(found.items()))
+
+
+def _uses(file: Path) -> Iterator[str]:
+    for operator in YAML(typ="safe").load(file)["operators"].values():
+        use = operator["use"]
+        if use.endswith(".yaml"):
+            yield from _uses(file.parent / use)
+        else:
+            yield use
+
 
 def markdown(catalogue: Catalogue) -> str:
     """The whole page for the operators of `catalogue`; modules that could not be imported are not on it."""
@@ -52,11 +80,23 @@ def markdown(catalogue: Catalogue) -> str:
         groups.setdefault(use.partition(":")[0], {})[use] = cls
     contents = ["| operator | takes | gives | what it does |", "| --- | --- | --- | --- |"]
     contents += [_contents_row(cls) for group in groups.values() for cls in group.values()]
-    parts = [INTRODUCTION, "\n".join(contents) + "\n"]
+    parts = [INTRODUCTION, "\n".join(contents) + "\n", _table_of_graphs(catalogue)]
     for module, group in groups.items():
         parts.append(f"## {_title(module)}\n")
         parts += [section(use, cls) for use, cls in group.items()]
     return "\n".join(parts)
+
+
+def _table_of_graphs(catalogue: Catalogue) -> str:
+    """Which operator stands in which of the graphs that come with the project."""
+    lines = ["## Which operator stands in which graph", "", GRAPHS_INTRODUCTION]
+    lines += ["", "| operator | graphs |", "| --- | --- |"]
+    for use, files in graphs_of().items():
+        if use in catalogue.operators:
+            name = catalogue.operators[use].spec.name
+            graphs = ", ".join(f"[{Path(file).stem}](../graphs/{file})" for file in files)
+            lines.append(f"| [{name}](#{name.lower()}) | {graphs} |")
+    return "\n".join(lines) + "\n"
 
 
 def section(use: str, cls: type[Operator]) -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
+from dataflow.api.graphs import GraphBuilder
 from dataflow.arguments import checked, require
 from dataflow.graph import load_text
 from dataflow.graph.model import Graph as ResolvedGraph
@@ -22,7 +23,7 @@ FILE = "graph.yaml"
 """The name by which error messages call the text of a graph that was built here."""
 
 
-class Graph:
+class Graph(GraphBuilder):
     """A graph under construction: operators are added, then their inputs are connected to streams.
 
         graph = Graph("watch").add("camera", MyCamera, rate=10).add("alarm", BrightnessAlarm)

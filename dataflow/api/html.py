@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
+from dataflow.recording import StreamInfo
 from dataflow.sync import format_stamp
 
 if TYPE_CHECKING:
-    from dataflow.api.recordings import RecordedStreams
-    from dataflow.api.stream import RecordedStream
     from dataflow.graph.model import Graph
     from dataflow.supervision.report import RunReport
     from dataflow.verification.report import VerifyReport
@@ -25,42 +25,47 @@ def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def recording_html(recording: RecordedStreams) -> str:
-    """Lists what a recording holds: a row for each stream that has messages; the empty ones are named below."""
-    prefix = f"{recording.namespace}/"
-    streams = [recording[name] for name in recording]
-    shown = [stream for stream in streams if len(stream)]
-    rows = [(stream.name.removeprefix(prefix), *_facts(stream)) for stream in shown]
-    empty = ", ".join(stream.name.removeprefix(prefix) for stream in streams if not len(stream))
-    title = (
-        f"<b>{escape(str(recording.path))}</b>, {recording.duration:.3f} s from {escape(format_stamp(recording.start))}"
-    )
+class StreamFacts(NamedTuple):
+    """One row of the table of streams: of a stream, or of a part of it."""
+
+    name: str
+    info: StreamInfo
+    messages: int
+    first: int | None
+    last: int | None
+
+    def words(self) -> tuple[str, str, str]:
+        """Type, number of messages, and rate in Hz by the timestamps."""
+        info, count = self.info, self.messages
+        kind = info.message_type.SCHEMA if info.message_type is not None else info.schema or info.encoding
+        if info.static:
+            return kind, f"{count:,}", "static"
+        span = 0 if self.first is None or self.last is None else self.last - self.first
+        return kind, f"{count:,}", f"{(count - 1) / (span * 1e-9):.2f}" if span > 0 else ""
+
+
+def recording_html(path: Path, start: int, duration: float, prefix: str, streams: Sequence[StreamFacts]) -> str:
+    """Lists what a recording holds: a row for each stream that has messages; the empty ones are named below.
+
+    `prefix`: the beginning of names that is not shown.
+    """
+    rows = [(stream.name.removeprefix(prefix), *stream.words()) for stream in streams if stream.messages]
+    empty = ", ".join(stream.name.removeprefix(prefix) for stream in streams if not stream.messages)
+    title = f"<b>{escape(str(path))}</b>, {duration:.3f} s from {escape(format_stamp(start))}"
     more = f"<p>without messages: {escape(empty)}</p>" if empty else ""
     return f"<div>{title}{table(('stream', 'type', 'messages', 'Hz'), rows)}{more}</div>"
 
 
-def stream_html(stream: RecordedStream) -> str:
+def stream_html(stream: StreamFacts) -> str:
     """Describes a stream: its fields with their type, unit and meaning."""
     from dataflow.messages.declaration import field_text
 
-    kind, count, rate = _facts(stream)
+    kind, count, rate = stream.words()
     title = f"<b>{escape(stream.name)}</b>: {count} {escape(kind)}{f', {rate} Hz' if rate else ''}"
     if stream.info.message_type is None:
         return f"<div>{title}</div>"
-    rows = [(f.name, field_text(f), getattr(f, "unit", ""), f.doc) for f in stream.message_type.FIELDS]
+    rows = [(f.name, field_text(f), getattr(f, "unit", ""), f.doc) for f in stream.info.message_type.FIELDS]
     return f"<div>{title}{table(('field', 'type', 'unit', 'meaning'), rows)}</div>"
-
-
-def _facts(stream: RecordedStream) -> tuple[str, str, str]:
-    """Type, number of messages, and rate in Hz by the timestamps."""
-    info = stream.info
-    kind = info.message_type.SCHEMA if info.message_type is not None else info.schema or info.encoding
-    if info.static:
-        return kind, f"{len(stream):,}", "static"
-    whole = len(stream) == info.count
-    first, last = (info.first, info.last) if whole else (int(stream.stamps.min()), int(stream.stamps.max()))
-    span = 0 if first is None or last is None else last - first
-    return kind, f"{len(stream):,}", f"{(len(stream) - 1) / (span * 1e-9):.2f}" if span > 0 else ""
 
 
 def graph_html(graph: Graph) -> str:

@@ -8,9 +8,10 @@ from types import TracebackType
 from typing import Any, Self
 
 from dataflow.api.asof import Direction, asof
+from dataflow.api.html import recording_html
 from dataflow.api.join import Joined
 from dataflow.api.names import StreamNameError, stream_named, streams_named
-from dataflow.api.stream import RecordedStream
+from dataflow.api.stream import RecordedStream, facts_of
 from dataflow.arguments import checked
 from dataflow.graph.model import Graph
 from dataflow.recording import Event, Recorded, Recording
@@ -192,9 +193,8 @@ class RecordedStreams(Mapping[str, RecordedStream]):
         return f"<recording {self.path}: {len(self)} streams, {self.duration:.3f} s>"
 
     def _repr_html_(self) -> str:
-        from dataflow.api.html import recording_html
-
-        return recording_html(self)
+        streams = [facts_of(self[name]) for name in self]
+        return recording_html(self.path, self.start, self.duration, f"{self.namespace}/", streams)
 
     def _ipython_key_completions_(self) -> list[Any]:
         prefix = f"{self.namespace}/"

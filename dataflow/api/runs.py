@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections.abc import Mapping, Sequence
@@ -10,7 +9,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dataflow.api.builder import Graph
+from dataflow.api.graphs import GraphLike, resolved
 from dataflow.api.html import run_html, verify_html
 from dataflow.api.local import LocalRun, Watch
 from dataflow.api.recordings import RecordedStreams, open
@@ -18,7 +17,6 @@ from dataflow.arguments import checked, evaluated, require
 from dataflow.editing.untouched import keep_untouched
 from dataflow.firing import seeding
 from dataflow.graph import Graph as ResolvedGraph
-from dataflow.graph import load_graph
 from dataflow.graph.problems import did_you_mean
 from dataflow.interop.clocks import Choice
 from dataflow.interop.opening import is_foreign
@@ -36,7 +34,6 @@ from dataflow.verification.report import VerifyReport
 NOTEBOOK = "__main__:"
 """The beginning of import paths of operators in a notebook or script: no other process finds them."""
 _SET_BY_LAUNCH = ("graph", "log", "record", "live", "overwrite", "faults")
-GraphLike = Graph | ResolvedGraph | str | Path
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,17 +224,6 @@ def verify(
         path, graph=built, tolerance=tolerance, start=start, first=first, only=chosen, jobs=jobs, workers=workers
     )
     return Verified(report)
-
-
-def resolved(graph: GraphLike, settings: Mapping[str, Any] | None = None) -> ResolvedGraph:
-    """The checked graph of a builder or a YAML file. Raises `GraphError`; `ValueError` for settings without a file."""
-    if isinstance(graph, str | Path):
-        given = {name: v if isinstance(v, str) else json.dumps(v) for name, v in (settings or {}).items()}
-        words = [f"{name}={value}" for name, value in given.items()]
-        return load_graph(graph, settings=words)
-    if settings:
-        raise ValueError("settings change a graph file; give parameters to Graph.add()")
-    return graph.build() if isinstance(graph, Graph) else graph
 
 
 def _plan_options(options: Mapping[str, Any]) -> dict[str, Any]:

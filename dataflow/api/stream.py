@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from dataflow.api import frames
 from dataflow.api.columns import Column, column, elements, is_narrow, parallel_fields
+from dataflow.api.html import StreamFacts, stream_html
 from dataflow.arguments import checked
 from dataflow.graph.problems import did_you_mean
 from dataflow.messages.base import Field, Message
@@ -197,10 +198,16 @@ class RecordedStream(Sequence[Message]):
         return f"<{self.name}: {len(self):,} × {kind}>"
 
     def _repr_html_(self) -> str:
-        from dataflow.api.html import stream_html
-
-        return stream_html(self)
+        return stream_html(facts_of(self))
 
 
 def _stamp(seconds: float | None, origin: int) -> int | None:
     return None if seconds is None else origin + round(seconds * 1e9)
+
+
+def facts_of(stream: RecordedStream) -> StreamFacts:
+    """Sums up a stream, or a part of one."""
+    info, count = stream.info, len(stream)
+    if count in (0, info.count):
+        return StreamFacts(stream.name, info, count, info.first, info.last)
+    return StreamFacts(stream.name, info, count, int(stream.stamps.min()), int(stream.stamps.max()))

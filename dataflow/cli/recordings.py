@@ -85,6 +85,7 @@ def info(
 
 
 def _facts(described: Description) -> Table:
+    from dataflow.recording.attachments import tells_of_run
     from dataflow.recording.cutting import cut_of
     from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.sync.stamps import format_stamp
@@ -128,6 +129,10 @@ def _facts(described: Description) -> Table:
     row("messages", count(described.messages))
     if described.firings:
         row("firings of", ", ".join(described.firings))
+    for each in described.attachments:
+        row("attachment", ", ".join(part for part in (each.name, each.media_type, size(each.bytes)) if part))
+    if told := [name for name in made if not tells_of_run(name)]:
+        row("metadata", f"{', '.join(told)} (--metadata prints it)")
     return grid
 
 

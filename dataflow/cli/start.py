@@ -1,45 +1,22 @@
 """The console script: makes the standard streams and signals safe, then loads the commands and calls one.
 
-Nothing else is imported here, so that Ctrl-C and a closed output are met in order from the first moment.
+Next to nothing else is imported here, so that Ctrl-C and a closed output are met in order from the first moment.
 """
 
 from __future__ import annotations
 
 import gc
-import io
 import os
 import signal
 import sys
 from types import FrameType
 
+from dataflow.cli.standard_output import Output, OutputFailed
+
 COULD_NOT_RUN = 2
 INTERRUPTED = 130
 COLLECT_AFTER = 20_000
 """Objects made between two searches for garbage: modules make many that stay, and 700 would cost a tenth of a start."""
-
-
-class OutputFailed(OSError):
-    """Standard output cannot be written."""
-
-
-class _Output(io.TextIOWrapper):
-    """Standard output, whose failure is told from that of any other file."""
-
-    def write(self, text: str) -> int:
-        try:
-            return super().write(text)
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise OutputFailed(error.errno, error.strerror) from None
-
-    def flush(self) -> None:
-        try:
-            super().flush()
-        except BrokenPipeError:
-            raise
-        except OSError as error:
-            raise OutputFailed(error.errno, error.strerror) from None
 
 
 def main() -> None:
@@ -49,7 +26,7 @@ def main() -> None:
         signal.signal(signal.SIGINT, _leave)  # while importing there is nothing to put in order
     _occupy_standard_streams()
     gc.set_threshold(COLLECT_AFTER)
-    from dataflow.cli.main import main as call
+    from dataflow.cli.app import call
 
     signal.signal(signal.SIGINT, interrupted)
     try:
@@ -89,7 +66,7 @@ def _occupy_standard_streams() -> None:
         sys.stdin = open(0, closefd=False)  # noqa: SIM115
     sys.stderr.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     encoding = sys.stdout.encoding
-    sys.stdout = _Output(
+    sys.stdout = Output(
         sys.stdout.detach(),  # type: ignore[union-attr]
         encoding,
         errors="backslashreplace",
@@ -124,6 +101,4 @@ def _discard_output() -> None:
 
 
 if __name__ == "__main__":
-    from dataflow.cli.start import main as start  # this module under its own name
-
-    start()
+    main()

@@ -14,6 +14,7 @@ from typing import Any
 
 from dataflow.firing.absent import without_absent
 from dataflow.firing.admission import AdmissionQueue, Arrival, Clock, EventClock, Patience, Promise, dropped
+from dataflow.firing.earlier import EarlierCounts
 from dataflow.firing.event_time import EventTime
 from dataflow.firing.failure import RAISED, OperatorFailure
 from dataflow.firing.log import FiringLog, unlisted
@@ -81,8 +82,7 @@ class LiveRunner(OperatorRunner):
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()
-        self._drops_before: Counter[tuple[str, str]] = Counter()  # of the aligners before a jump of the clock
-        self._late_before: Counter[str] = Counter()
+        self._earlier = EarlierCounts()
         self._static = static
         self._statics: dict[str, Entry] = {}
         self._on_failure, self._fault = on_failure, fault
@@ -97,7 +97,7 @@ class LiveRunner(OperatorRunner):
     @property
     def drops(self) -> Mapping[tuple[str, str], int]:
         withheld = {(f"→ {port}", "non_monotonic"): n for port, n in self.ports.withheld.items()}
-        return self._drops_before + Counter(self.aligner.drops) + self._log.counts + Counter(withheld)
+        return self._earlier.drops + Counter(self.aligner.drops) + self._log.counts + Counter(withheld)
 
     @property
     def timeouts(self) -> Mapping[str, int]:
@@ -105,7 +105,7 @@ class LiveRunner(OperatorRunner):
 
     @property
     def late(self) -> Mapping[str, int]:
-        return self._late_before + Counter(self.aligner.late)
+        return self._earlier.late + Counter(self.aligner.late)
 
     @property
     def refused(self) -> Mapping[str, int]:
@@ -293,11 +293,7 @@ class LiveRunner(OperatorRunner):
 
     def _begin_alignment(self, jumped: str) -> None:
         old = self.aligner
-        self._drops_before.update(old.drops)
-        self._late_before.update(old.late)
-        for held, count in old.buffered().items():
-            if count and self.spec.inputs[held].kind != "sampled":
-                self._drops_before[held, "reset"] += count
+        self._earlier.take(old, self.spec)
         self.aligner = make_aligner(old.spec)
         self._told = True
         for static in self._statics.values():

@@ -298,17 +298,19 @@ class Message(_Declared):
         """Pickled by value and remade by the constructor, so that the arrays come back frozen."""
         return _remake, (type(self), dict(self.items()))
 
+    def _picture(self) -> tuple[str, bytes] | None:
+        """The message as a picture, (format, file), for people; None for types that have none."""
+        return None
+
     def _repr_html_(self) -> str:
         """HTML for notebooks."""
         from dataflow.messages.display import message_html
 
-        return message_html(self)
+        return message_html(self.SCHEMA, self.items(), self._picture())
 
     def _repr_png_(self) -> bytes | None:
         """A PNG file for notebooks, of messages that can be drawn."""
-        from dataflow.messages.display import image_file
-
-        found = image_file(self)
+        found = self._picture()
         return found[1] if found is not None and found[0] == "png" else None
 
     def __repr__(self) -> str:

@@ -5,9 +5,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, F64, I32, I64, U8, U16
 from dataflow.messages.base import Message, array, scalar
 from dataflow.messages.checks import within_length
+from dataflow.messages.pictures import Picture
 
 
 class PointCloud(Message):
@@ -27,6 +29,9 @@ class PointCloud(Message):
     def count(self) -> int:
         """Number of points."""
         return len(self.points)
+
+    def _picture(self) -> Picture | None:
+        return pictures.of_points(self.points)
 
 
 class Clusters(Message):

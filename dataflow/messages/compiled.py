@@ -10,14 +10,12 @@ text's own names begin with an underscore, which no field's does.
 from __future__ import annotations
 
 import keyword
-import struct
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-import xxhash
 
+from dataflow.messages.compiled_digest import content_text, digest_text
 from dataflow.messages.fields import (
     INT64_MAX,
     INT64_MIN,
@@ -29,10 +27,6 @@ from dataflow.messages.fields import (
     scalar_value,
 )
 
-ONE_UPDATE = 1 << 14
-"""Bytes of an array up to which it is copied into the buffer that is digested, instead of being digested in place."""
-CACHED_TEXT = 64
-"""Characters of a text up to which its canonical bytes are kept: names of frames, models and classes come again."""
 _FROZEN, _FROZEN_IS = 0x401, 0x001
 """Of numpy's array flags C-contiguous and writeable, and what they are in a frozen array."""
 
@@ -70,47 +64,34 @@ def compile_class(
     names: dict[str, Any] = {
         "_bool": bool,
         "_cls": cls,
-        "_digest_of": xxhash.xxh3_128_digest,
-        "_dtype": _dtype_bytes,
         "_float": float,
         "_frozen": _FROZEN,
         "_frozen_is": _FROZEN_IS,
         "_general": general,
-        "_hasher": xxhash.xxh3_128,
         "_int": int,
-        "_join": b"".join,
         "_max": INT64_MAX,
         "_min": INT64_MIN,
         "_missing": MISSING,
         "_ndarray": np.ndarray,
         "_scalar": scalar_value,
         "_schema": schema,
-        "_shape": _shape_bytes,
-        "_small": ONE_UPDATE,
         "_stamp": canonical_stamp,
         "_str": str,
-        "_len": len,
-        "_long_text": _text_bytes,
-        "_no_words": _words_bytes(()),
-        "_short": CACHED_TEXT,
-        "_text": _short_text_bytes,
         "_tuple": tuple,
-        "_updated": _updated,
-        "_words": _words_bytes,
     }
     plain = all(f.name.isascii() and f.name.isidentifier() and not keyword.iskeyword(f.name) for f in fields)
     names["_construct"] = None
     text = [
         *(_construct(names, scalars, arrays, validates) if plain else []),
         *_adopt(names, scalars, arrays, validates),
-        *_digest(names, schema, scalars, arrays),
+        *digest_text(names, schema, scalars, arrays),
         "def _header(_self):",
         "    _state = _self.__dict__",
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in scalars)})",
         "def _arrays(_self):",
         "    _state = _self.__dict__",
         f"    return ({''.join(f'_state[{f.name!r}], ' for f in arrays)})",
-        *_content(names, scalars, arrays),
+        *content_text(names, scalars, arrays),
     ]
     exec(compile("\n".join(text), f"<message {schema!r}>", "exec"), names)
     construct, adopt, digest, header, held, content = (
@@ -191,83 +172,6 @@ def _adopt(
     return text
 
 
-def _digest(
-    names: dict[str, Any], schema: str, scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]
-) -> list[str]:
-    """One buffer for all that is small; arrays that are large are digested where they lie, in order."""
-    encoded = schema.encode()
-    names["_prefix"] = struct.pack("<I", len(encoded)) + encoded
-    names["_stamp_bytes"] = struct.Struct("<q").pack
-    names["_int_bytes"], names["_float_bytes"] = struct.Struct("<cq").pack, struct.Struct("<cd").pack
-    head = ["_prefix", "_stamp_bytes(_state['stamp'])"]
-    for spec in scalars:
-        value = f"_state[{spec.name!r}]"
-        canonical = {
-            "bool": f"(b'T' if {value} else b'F')",
-            "int": f"_int_bytes(b'i', {value})",
-            "float": f"_float_bytes(b'f', {value})",
-            "str": f"(_text({value}) if _len({value}) <= _short else _long_text({value}))",
-            "strs": f"(_words({value}) if {value} else _no_words)",
-        }[spec.kind]
-        head.append(f"(b'n' if {value} is None else {canonical})" if spec.optional else canonical)
-    text = ["def _digest(_self):", "    _state = _self.__dict__"]
-    if not arrays:
-        return [*text, f"    return _digest_of(_join(({', '.join(head)})))"]
-    text.append(f"    _parts = [{', '.join(head)}]")
-    text.append("    _hash = None")
-    for k, held in enumerate(arrays):
-        text += [
-            f"    _a = _state[{held.name!r}]",
-            "    if _a is None:",
-            "        _parts.append(b'\\x00')",
-            "    else:",
-            f"        _parts += ({_by_dtype(names, k, held, '_a', _dtype_bytes, '_dtype({})')}, _shape(_a.shape))",
-            "        if _a.nbytes <= _small:",
-            "            _parts.append(_a.tobytes())",
-            "        else:",
-            "            _hash = _hasher(_join(_parts)) if _hash is None else _updated(_hash, _join(_parts))",
-            "            _hash.update(_a.data.cast('B'))",
-            "            _parts.clear()",
-        ]
-    text += [
-        "    if _hash is None:",
-        "        return _digest_of(_join(_parts))",
-        "    _hash.update(_join(_parts))",
-        "    return _hash.digest()",
-    ]
-    return text
-
-
-def _content(names: dict[str, Any], scalars: tuple[ScalarField, ...], arrays: tuple[ArrayField, ...]) -> list[str]:
-    described = []
-    for k, spec in enumerate(arrays):
-        array = f"({_by_dtype(names, k, spec, f'_a{k}', _dtype_name, '{}.str')}, _a{k}.shape)"
-        described.append(f"None if _a{k} is None else {array}, " if spec.optional else f"{array}, ")
-    return [
-        "def _content(_self):",
-        "    _state = _self.__dict__",
-        *(f"    _a{k} = _state[{spec.name!r}]" for k, spec in enumerate(arrays)),
-        f"    _scalars = ({''.join(f'_state[{f.name!r}], ' for f in scalars)})",
-        f"    return (_schema, _scalars, ({''.join(described)})), ({''.join(f'_a{k}, ' for k in range(len(arrays)))})",
-    ]
-
-
-def _by_dtype(
-    names: dict[str, Any], k: int, spec: ArrayField, array: str, made: Callable[[np.dtype[Any]], Any], other: str
-) -> str:
-    """An expression for what `made` gives for the array's dtype: made beforehand for the first that is declared, by
-    the expression `other` of the dtype for any other."""
-    dtype = np.dtype(spec.dtypes[0].str)  # the one object that numpy has for it
-    names[f"_type{k}_0"] = dtype
-    names[f"{made.__name__}{k}"] = made(dtype)
-    return f"({made.__name__}{k} if {array}.dtype is _type{k}_0 else {other.format(f'{array}.dtype')})"
-
-
-def _updated(hasher: Any, data: bytes) -> Any:
-    hasher.update(data)
-    return hasher
-
-
 def _canonical(names: dict[str, Any], k: int, spec: ScalarField, value: str) -> str:
     """An expression for the canonical form of `value`; the general function where it is not in that form already."""
     names[f"_field{k}"] = spec
@@ -327,31 +231,3 @@ def _parallel(arrays: tuple[ArrayField, ...], given: list[str], k: int) -> list[
     ]
     conditions += [f"_e{k}[{i}] == _e{k}[{j}]" for i, one in own for j, other in own if i < j and one == other]
     return conditions
-
-
-def _dtype_name(dtype: np.dtype[Any]) -> str:
-    return dtype.str
-
-
-@lru_cache(maxsize=64)
-def _dtype_bytes(dtype: np.dtype[Any]) -> bytes:
-    return b"\x01" + dtype.str.encode()
-
-
-@lru_cache(maxsize=128)  # compressed images have a length of their own each
-def _shape_bytes(shape: tuple[int, ...]) -> bytes:
-    return struct.pack(f"<B{len(shape)}q", len(shape), *shape)
-
-
-def _text_bytes(text: str) -> bytes:
-    encoded = text.encode()
-    return b"s" + struct.pack("<I", len(encoded)) + encoded
-
-
-_short_text_bytes = lru_cache(maxsize=1024)(_text_bytes)
-
-
-def _words_bytes(words: tuple[str, ...]) -> bytes:
-    """The bytes of a list of strings: their number, then each with its length."""
-    encoded = [word.encode() for word in words]
-    return b"l" + struct.pack("<I", len(words)) + b"".join(struct.pack("<I", len(w)) + w for w in encoded)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, U8
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import finite, not_empty, positive
+from dataflow.messages.pictures import Picture
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 FORMATS = ("jpeg", "png", "webp")
@@ -34,6 +36,9 @@ class Image(Message):
         """Tells whether there are three channels."""
         return self.data.ndim == 3
 
+    def _picture(self) -> Picture | None:
+        return pictures.of_pixels(self.data)
+
 
 class CompressedImage(Message):
     """A colour or grey image as an encoded file."""
@@ -50,6 +55,9 @@ class CompressedImage(Message):
                 f"CompressedImage.data must hold a {self.format} file, got {len(self.data)} bytes that begin with "
                 f"{head.hex(' ')}" + (f", which is {found}" if found else "")
             )
+
+    def _picture(self) -> Picture | None:
+        return self.format, self.data.tobytes()
 
 
 class DepthImage(Message):
@@ -70,6 +78,9 @@ class DepthImage(Message):
     def width(self) -> int:
         """Columns."""
         return int(self.data.shape[1])
+
+    def _picture(self) -> Picture | None:
+        return pictures.of_depth(self.data)
 
 
 class RelativeDepth(Message):
@@ -96,6 +107,9 @@ class RelativeDepth(Message):
         """Columns."""
         return int(self.data.shape[1])
 
+    def _picture(self) -> Picture | None:
+        return pictures.of_nearness(self.data)
+
 
 class CompressedDepth(Message):
     """A depth image as a 16-bit grey PNG; the pixel value 0 is no return.
@@ -120,6 +134,9 @@ class CompressedDepth(Message):
                 f"CompressedDepth.data must hold a PNG file with one 16-bit channel, got {len(self.data)} bytes that "
                 f"begin with {head.hex(' ')}"
             )
+
+    def _picture(self) -> Picture | None:
+        return "png", self.data.tobytes()
 
 
 def _signature(head: bytes) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, F64, I8, I32, I64, U8, U32
 from dataflow.messages.base import Message, array, scalar
 from dataflow.messages.checks import (
@@ -13,6 +14,7 @@ from dataflow.messages.checks import (
     within_length,
 )
 from dataflow.messages.geometry import transform_matrix
+from dataflow.messages.pictures import Picture
 
 
 class OccupancyGrid(Message):
@@ -38,6 +40,9 @@ class OccupancyGrid(Message):
     def matrix(self) -> F64:
         """`T_frame_grid` (4, 4)."""
         return transform_matrix(self.position, (0.0, 0.0, 0.0, 1.0) if self.orientation is None else self.orientation)
+
+    def _picture(self) -> Picture | None:
+        return pictures.of_occupancy(self.cells)
 
 
 class Mesh(Message):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, I32, U8, U16
 from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import not_empty, within
+from dataflow.messages.pictures import Picture
 
 
 class SegmentationMap(Message):
@@ -35,3 +37,6 @@ class SegmentationMap(Message):
                     f"({self.void}), got {wrong[0]} in {wrong.size} pixels"
                 )
         within(self, 0.0, 1.0, "confidence", nan=True)
+
+    def _picture(self) -> Picture | None:
+        return pictures.of_classes(self.classes)

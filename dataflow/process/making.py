@@ -2,52 +2,77 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from dataflow.chaos.faults import OperatorFaults
 from dataflow.firing.failure import OperatorFailure
-from dataflow.graph.model import Node
-from dataflow.process.runners import make_log, make_runner, make_source
+from dataflow.graph.model import Graph, Node
+from dataflow.process.channel import Channel
+from dataflow.process.config import ProcessConfig
+from dataflow.process.feeding import Feeding
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.outlet import Outlet
+from dataflow.process.pace import Pace
+from dataflow.process.runners import Runners, make_log, make_runner, make_source
 from dataflow.remote import Remote
 
-if TYPE_CHECKING:
-    from dataflow.process.operator_process import OperatorProcess
 
+class Making:
+    """Puts what it makes where it belongs: among the runners, the feeds, or the live sources."""
 
-def make_operators(process: OperatorProcess) -> None:
-    """Makes all of them. Raises `OperatorFailure` for one that cannot be made."""
-    for name in process.config.nodes:
-        try:
-            _make(process, process.graph.nodes[name])
-        except OperatorFailure:
-            raise
-        except Exception as error:
-            raise OperatorFailure(name, "construction", error) from error
-    log = make_log(process.graph, process.config, process.outlet)
-    if log is not None:
-        process.feeding.feeds.append(log)
+    def __init__(
+        self,
+        config: ProcessConfig,
+        graph: Graph,
+        channel: Channel,
+        pace: Pace,
+        runners: Runners,
+        feeding: Feeding,
+        live: LiveSources,
+        outlet: Outlet,
+    ) -> None:
+        self._config, self._graph, self._channel, self._pace = config, graph, channel, pace
+        self._runners, self._feeding, self._live, self._outlet = runners, feeding, live, outlet
 
+    def make(self) -> None:
+        """Makes all of them. Raises `OperatorFailure` for one that cannot be made."""
+        for name in self._config.nodes:
+            try:
+                self._make(self._graph.nodes[name])
+            except OperatorFailure:
+                raise
+            except Exception as error:
+                raise OperatorFailure(name, "construction", error) from error
+        log = make_log(self._graph, self._config, self._outlet)
+        if log is not None:
+            self._feeding.feeds.append(log)
 
-def _make(process: OperatorProcess, node: Node) -> None:
-    config, runners = process.config, process.runners
-    if node.source:
-        source = make_source(node, process.graph, config, process.outlet)
-        if isinstance(source.source, Remote) and not config.live:
-            raise ValueError("messages from outside come by the clock, which only a live run has: run it with --live")
-        runners.sources.append(source)
-        if config.live:
-            process.live.add(source)
-        else:
-            process.feeding.feeds.append(source)
-        return
-
-    def tell(failure: OperatorFailure, pause: float) -> None:
-        process.channel.send(
-            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
+    def _make(self, node: Node) -> None:
+        if node.source:
+            self._make_source(node)
+            return
+        faults = self._runners.faults[node.name] = OperatorFaults()
+        self._runners.add(
+            make_runner(
+                node,
+                self._graph,
+                self._config,
+                self._outlet,
+                faults=faults,
+                event_clock=self._pace.event_time,
+                on_failure=self._tell,
+            )
         )
 
-    faults = runners.faults[node.name] = OperatorFaults()
-    clock = process.pace.event_time
-    runners.add(
-        make_runner(node, process.graph, config, process.outlet, faults=faults, event_clock=clock, on_failure=tell)
-    )
+    def _make_source(self, node: Node) -> None:
+        source = make_source(node, self._graph, self._config, self._outlet)
+        if isinstance(source.source, Remote) and not self._config.live:
+            raise ValueError("messages from outside come by the clock, which only a live run has: run it with --live")
+        self._runners.sources.append(source)
+        if self._config.live:
+            self._live.add(source)
+        else:
+            self._feeding.feeds.append(source)
+
+    def _tell(self, failure: OperatorFailure, pause: float) -> None:
+        self._channel.send(
+            "restarting", operator=failure.operator, when=failure.when, summary=failure.summary, pause=pause
+        )

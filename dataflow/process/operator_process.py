@@ -24,7 +24,7 @@ from dataflow.process.handed import BACKLOG
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet, StreamDamaged
 from dataflow.process.live_sources import LiveSources, Step
-from dataflow.process.making import make_operators
+from dataflow.process.making import Making
 from dataflow.process.network import network_config
 from dataflow.process.orders import Orders
 from dataflow.process.outlet import Network, Outlet, incarnations_of, left_by
@@ -111,8 +111,28 @@ class OperatorProcess:
             self.feeding,
             channel,
         )
-        self.orders = Orders(self)
-        self.standing = Standing(self)
+        self.orders = Orders(
+            (self.window, self.backlog),
+            self.runners,
+            self.feeding,
+            self.live,
+            self.inlet,
+            self.outlet,
+            self.requests,
+            self.release,
+        )
+        self._standing = Standing(
+            channel,
+            self.orders,
+            self.runners,
+            self.feeding,
+            self.live,
+            inbox,
+            self.inlet,
+            self.outlet,
+            self.progress,
+            self._counters_outside,
+        )
         self._watch: Watchdog | None = None
         self._running = False
 
@@ -156,7 +176,8 @@ class OperatorProcess:
 
     def make(self) -> None:
         """Makes the operators, and what stands in for sources. Raises `OperatorFailure` for one that cannot be made."""
-        make_operators(self)
+        parts = (self.pace, self.runners, self.feeding, self.live, self.outlet)
+        Making(self.config, self.graph, self.channel, *parts).make()
 
     def set_up(self) -> None:
         """Calls `setup()` of every operator, with as many library threads as the graph allows."""
@@ -195,7 +216,7 @@ class OperatorProcess:
         worked = self._work()
         self.outlet.flush_due()
         self.progress.report(idle=self.inbox.empty())
-        self.standing.answer(idle=not worked)  # after the work that was there
+        self._standing.answer(idle=not worked)  # after the work that was there
         return True
 
     def _in_place_of_main(self, act: Callable[[Step], None], step: Step) -> bool:
@@ -236,16 +257,19 @@ class OperatorProcess:
         if failures:
             raise failures[0]
 
+    def _counters_outside(self) -> dict[str, int]:
+        return self.bus.counters()
+
     # Inbox
 
     def _wait_time(self) -> float:
         if self.orders.probing:
             return PROBE_EVERY
         patient = self.runners.ready.next_due()
-        due = [IDLE_WAIT, self.next_feeding(), self.live.next_due(), self.progress.next_due(), patient]
+        due = [IDLE_WAIT, self._next_feeding(), self.live.next_due(), self.progress.next_due(), patient]
         return max(0.0, min(seconds for seconds in due if seconds is not None))
 
-    def next_feeding(self) -> float | None:
+    def _next_feeding(self) -> float | None:
         """Seconds until a feed may admit what is due by the clock; None where nothing waits for that."""
         return self.feeding.next_due() if self.orders.released else None
 
@@ -311,7 +335,7 @@ class OperatorProcess:
             if not self.inbox.empty():
                 break
         if self.orders.released:
-            self.standing.end_if_done()
+            self._standing.end_if_done()
         return worked
 
     def _step_all(self) -> bool:

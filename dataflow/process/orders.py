@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import Any
 
+from dataflow.feeds.window import Window
 from dataflow.process.channel import ChannelClosed
+from dataflow.process.feeding import Feeding
+from dataflow.process.inlet import Inlet
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.outlet import Outlet
 from dataflow.process.planned_faults import do_fault
+from dataflow.process.requests import Requests
+from dataflow.process.runners import Runners
 from dataflow.sync import FOREVER
-
-if TYPE_CHECKING:
-    from dataflow.process.operator_process import OperatorProcess
 
 
 class Orders:
     """The orders that one process was given."""
 
-    def __init__(self, process: OperatorProcess) -> None:
-        self._process = process
+    def __init__(
+        self,
+        windows: tuple[Window, Window],
+        runners: Runners,
+        feeding: Feeding,
+        live: LiveSources,
+        inlet: Inlet,
+        outlet: Outlet,
+        requests: Requests,
+        release: Callable[[int | None, float], None],
+    ) -> None:
+        """`windows`: what sources may be ahead, and what may wait for operators that drop; `release`: begins."""
+        self._window, self._backlog = windows
+        self._runners, self._feeding, self._live = runners, feeding, live
+        self._inlet, self._outlet, self._requests, self._release = inlet, outlet, requests, release
         self.probing = False
         """Probes are to be sent: consumers prove that they listen."""
         self.released = False
@@ -31,21 +48,20 @@ class Orders:
 
     def obey(self, kind: str, fields: Mapping[str, Any]) -> None:
         """Does what a message says. Raises `ChannelClosed` when the supervisor is gone."""
-        process = self._process
         match kind:
             case "covered":
-                process.window.cover(fields["frontier"])
-                process.backlog.cover(fields.get("backlog", FOREVER))
+                self._window.cover(fields["frontier"])
+                self._backlog.cover(fields.get("backlog", FOREVER))
             case "probe":
                 self.probing = True
             case "go":
                 self.probing, self.released = False, True
-                process.release(fields["first"], fields["at"])
+                self._release(fields["first"], fields["at"])
             case "absent":
                 self._mark(fields["streams"], absent=fields["absent"])
             case "ended_elsewhere":
                 for stream in fields["streams"]:
-                    for runner in process.runners.taking(stream):
+                    for runner in self._runners.taking(stream):
                         runner.end(stream, None, fields["reason"])
             case "fault":
                 kind, operator = fields["fault"], fields["operator"]
@@ -53,24 +69,24 @@ class Orders:
                     kind,
                     operator,
                     fields["fields"],
-                    runners=process.runners,
-                    live=process.live,
-                    outlet=process.outlet,
+                    runners=self._runners,
+                    live=self._live,
+                    outlet=self._outlet,
                 )
             case "grow":
-                process.window.grow()
+                self._window.grow()
             case "poll":
                 self.asked = fields["round"]
             case "playback":
-                process.requests.play(fields["action"], fields["steps"], fields["speed"])
+                self._requests.play(fields["action"], fields["steps"], fields["speed"])
             case "stop":
                 self.stopping = True
-                process.feeding.finish("interrupted")
-                process.live.finish("interrupted")
+                self._feeding.finish("interrupted")
+                self._live.finish("interrupted")
             case "gone":
-                process.outlet.consumer_gone(fields["ring"], fields["life"])
+                self._outlet.consumer_gone(fields["ring"], fields["life"])
             case "lacks":
-                process.outlet.send_again(fields["operator"])
+                self._outlet.send_again(fields["operator"])
             case "leave":
                 self.left = True
             case "lost":
@@ -79,7 +95,7 @@ class Orders:
     def _mark(self, streams: list[str], *, absent: bool) -> None:
         """Notes for whom takes some streams that nobody makes them at the moment, or that somebody does again."""
         for stream in streams:
-            for consumer in self._process.runners.taking(stream):
+            for consumer in self._runners.taking(stream):
                 (consumer.absent.add if absent else consumer.absent.discard)(stream)
         if not absent:
-            self._process.inlet.restarted(streams)
+            self._inlet.restarted(streams)

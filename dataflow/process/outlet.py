@@ -107,15 +107,18 @@ class Outlet:
     def release(self) -> None:
         """Sends what was emitted before the consumers were known to listen (static streams, `setup()` records)."""
         held, self._held = self._held or [], None
-        for stream, (incarnation, number) in self._left.items():
-            if stream not in self._static:
-                parts = encode_parts(Envelope(Kind.FRONTIER, stream, incarnation, number, NEVER))
-                self.sent += self._fanout.send(stream, parts, droppable=False)
+        for stream, place in self._left.items():
+            self._say_left(stream, place)
         for key, said, droppable in held:
             if isinstance(said, Envelope):
                 self._send(key, said, droppable=droppable)
             else:
                 self._send_bytes(key, said)
+
+    def _say_left(self, stream: str, place: Place) -> None:
+        """Says how far an incarnation of a stream has got that is over: who lacks messages of it has lost them."""
+        if stream not in self._static:
+            self._send(stream, Envelope(Kind.FRONTIER, stream, *place, NEVER), droppable=False)
 
     def probe(self) -> None:
         """Sends a probe on every key that another process takes."""
@@ -192,6 +195,9 @@ class Outlet:
         """Most messages go to other processes of the run and nowhere else: that way is the short one."""
         for consumer in self._consumers(stream):
             consumer.push(stream, entry)
+        before = self._next.get(stream)
+        if before is not None and before[0] != entry.incarnation:
+            self._say_left(stream, before)
         self._next[stream] = entry.incarnation, entry.seq + 1
         network, publisher = self._network, self._publishers.get(stream)
         tapped = network is not None and network.taps.active

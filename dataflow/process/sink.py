@@ -98,6 +98,10 @@ class SinkProcess:
         self._operator_of = {firings_key(self.graph.namespace, o): o for o in config.firings}
         self.firings_open = set(self._operator_of)
         """Keys on which an operator's last firing records have not come yet."""
+        self._open = set(config.streams)
+        """Streams whose end has not come yet."""
+        self._expected = 0
+        """Counts how often streams were said to begin anew: the process that makes them was started again."""
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
         self.inlet = Inlet(
@@ -187,6 +191,7 @@ class SinkProcess:
                 self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
             case Kind.END:
                 self.frontiers[key] = FOREVER
+                self._open.discard(key)
                 self.sink.end(key, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
 
     def _take_records(self, batch: Batch) -> bool:
@@ -227,9 +232,10 @@ class SinkProcess:
         if done != self._told:
             self._told = done
             self.channel.send("progress", done=done, counts=self._counts())
-        if not self._ended and all(f == FOREVER for f in self.frontiers.values()) and not self.firings_open:
+        if not self._ended and not self._open and not self.firings_open:
             self._ended = True
-            self.channel.send("ended", report={"counts": self._counts(), "transport": self.inbox.counters()})
+            report = {"counts": self._counts(), "transport": self.inbox.counters(), "expected": self._expected}
+            self.channel.send("ended", report=report)
 
     def _counts(self) -> dict[str, list[int]]:
         return {self.config.label: [0, self.written, 0, self._work.cpu_ns, self._done, self._work.wall_ns]}
@@ -252,6 +258,7 @@ class SinkProcess:
                     self._take_records(decode_batch(data))
             case "expect":
                 self.inlet.restarted(fields["streams"])
+                self._expect(fields["streams"], fields["times"])
             case "event":
                 assert self.sink is not None
                 self.sink.event(fields["name"], fields["stamp"], fields["data"])
@@ -271,6 +278,13 @@ class SinkProcess:
             case "lost":
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")
+
+    def _expect(self, keys: Sequence[str], times: int) -> None:
+        """Waits for the ends of streams again, and for last firing records. Static streams end once."""
+        self._expected, self._ended = times, False
+        self._told.clear()
+        self._open.update(key for key in keys if key in self.frontiers and not self.graph.streams[key].static)
+        self.firings_open.update(key for key in keys if key in self._operator_of)
 
     def _drain(self) -> None:
         """Takes what has arrived: all others have left, or nobody can say whether they have."""

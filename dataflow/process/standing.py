@@ -2,59 +2,77 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
-if TYPE_CHECKING:
-    from dataflow.process.operator_process import OperatorProcess
+from dataflow.process.channel import Channel
+from dataflow.process.feeding import Feeding
+from dataflow.process.inbox import Inbox
+from dataflow.process.inlet import Inlet
+from dataflow.process.live_sources import LiveSources
+from dataflow.process.orders import Orders
+from dataflow.process.outlet import Outlet
+from dataflow.process.progress import Progress
+from dataflow.process.runners import Runners
 
 
 class Standing:
     """Knows whether one process has ended, and whether anything is still to come there without news from outside."""
 
-    def __init__(self, process: OperatorProcess) -> None:
-        self._process = process
+    def __init__(
+        self,
+        channel: Channel,
+        orders: Orders,
+        runners: Runners,
+        feeding: Feeding,
+        live: LiveSources,
+        inbox: Inbox,
+        inlet: Inlet,
+        outlet: Outlet,
+        progress: Progress,
+        outside: Callable[[], dict[str, int]],
+    ) -> None:
+        """`outside`: the counts of what has passed between this process and programs outside the run."""
+        self._channel, self._orders, self._progress = channel, orders, progress
+        self._runners, self._feeding, self._live = runners, feeding, live
+        self._inbox, self._inlet, self._outlet, self._outside = inbox, inlet, outlet, outside
         self._ended = False
 
     def end_if_done(self) -> None:
         """Sends what came of everything, once, when all feeds, sources and operators have ended."""
-        process = self._process
-        if self._ended or not (process.feeding.ended and process.live.ended):
+        if self._ended or not (self._feeding.ended and self._live.ended):
             return
-        if all(runner.ended for runner in process.runners.operators):
+        if all(runner.ended for runner in self._runners.operators):
             self._ended = True
-            process.outlet.flush_all()
-            process.progress.report(idle=True)
-            process.channel.send("ended", report=process.progress.final_report(self._moved()))
+            self._outlet.flush_all()
+            self._progress.report(idle=True)
+            self._channel.send("ended", report=self._progress.final_report(self._moved()))
 
     def answer(self, *, idle: bool) -> None:
         """Answers the supervisor's poll, if there is one. `idle`: a look at everything has just found nothing to do."""
-        process = self._process
-        if process.orders.asked is None:
+        if self._orders.asked is None:
             return
-        asked, process.orders.asked = process.orders.asked, None
-        process.outlet.flush_all()
-        process.channel.send(
+        asked, self._orders.asked = self._orders.asked, None
+        self._outlet.flush_all()
+        self._channel.send(
             "state",
             round=asked,
-            idle=idle and process.inbox.empty() and not self._waits_for_clock() and process.live.ended,
-            sent=process.outlet.sent,
-            received=process.inlet.received,
-            full=process.feeding.full,
-            waiting=process.progress.waiting(),
-            due=process.feeding.next_due(),
-            **({"paused": process.feeding.playback.paused} if process.feeding.feeds else {}),
+            idle=idle and self._inbox.empty() and not self._waits_for_clock() and self._live.ended,
+            sent=self._outlet.sent,
+            received=self._inlet.received,
+            full=self._feeding.full,
+            waiting=self._progress.waiting(),
+            due=self._feeding.next_due(),
+            **({"paused": self._feeding.playback.paused} if self._feeding.feeds else {}),
         )
 
     def _waits_for_clock(self) -> bool:
-        process = self._process
         return (
-            (process.feeding.playback.holds and not process.feeding.ended)
-            or process.next_feeding() is not None
-            or any(runner.next_due() is not None for runner in process.runners.operators)
+            (self._feeding.playback.holds and not self._feeding.ended)
+            or (self._orders.released and self._feeding.next_due() is not None)
+            or any(runner.next_due() is not None for runner in self._runners.operators)
         )
 
     def _moved(self) -> dict[str, int]:
         """Counts what has passed between this process and others."""
-        process = self._process
-        refused = {"malformed": process.inlet.malformed, "misplaced": process.inlet.misplaced}
-        return process.outlet.counters() | process.inbox.counters() | process.bus.counters() | refused
+        refused = {"malformed": self._inlet.malformed, "misplaced": self._inlet.misplaced}
+        return self._outlet.counters() | self._inbox.counters() | self._outside() | refused

@@ -31,6 +31,15 @@ class StreamSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class AttachmentSummary:
+    """One file that the recording carries."""
+
+    name: str
+    media_type: str
+    bytes: int
+
+
+@dataclass(frozen=True, slots=True)
 class Description:
     """Result of `describe`. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
 
@@ -52,6 +61,7 @@ class Description:
     streams: tuple[StreamSummary, ...]
     firings: Mapping[str, int]
     events: Mapping[str, int]
+    attachments: tuple[AttachmentSummary, ...]
     metadata: Mapping[str, Mapping[str, str]]
 
     def as_json(self) -> dict[str, Any]:
@@ -60,11 +70,12 @@ class Description:
 
 
 def describe(recording: Recording) -> Description:
-    """The facts of a recording, from its index and metadata; only its events are read."""
+    """The facts of a recording, from its index and metadata; only its events and attachments are read."""
     streams = tuple(_summary(recording, name) for name in recording.streams)
     moving = [s for s in streams if not s.static]
     start = min((s.first for s in moving if s.first is not None), default=None)
     end = max((s.last for s in moving if s.last is not None), default=None)
+    attachments = tuple(AttachmentSummary(a.name, a.media_type, len(a.data)) for a in recording.attachments())
     events: dict[str, int] = {}
     for event in recording.events():
         events[event.name] = events.get(event.name, 0) + 1
@@ -83,6 +94,7 @@ def describe(recording: Recording) -> Description:
         streams=streams,
         firings=recording.firing_batches(),
         events=dict(sorted(events.items())),
+        attachments=attachments,
         metadata=recording.metadata,
     )
 

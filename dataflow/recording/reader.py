@@ -13,6 +13,7 @@ from mcap.records import Channel
 
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.access import StreamIndex
+from dataflow.recording.attachments import Attachment
 from dataflow.recording.codecs import codec_for
 from dataflow.recording.entries import Event, RawRecord, Recorded
 from dataflow.recording.errors import RecordingError
@@ -55,8 +56,7 @@ class Recording:
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end: its writer died. Everything up to the last whole chunk is
-        readable."""
+        """Tells whether the file has no proper end: its writer died. What lies before can be read."""
         return self._file.torn
 
     @property
@@ -67,10 +67,12 @@ class Recording:
     @property
     def damage(self) -> tuple[str, ...]:
         """Returns what in the file is damaged, for people: it was read by other means, or is left out as the note says.
-
-        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read.
-        """
+        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read."""
         return tuple(self._file.damage)
+
+    def attachments(self) -> Iterator[Attachment]:
+        """Yields the files that it carries, as far as they can be read; `damage` notes the others."""
+        return map(self._file.attachment, self._file.attachments)
 
     @property
     def library(self) -> str:

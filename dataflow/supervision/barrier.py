@@ -95,4 +95,5 @@ def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
         if not other.is_sink:
             run.send(other, "absent", streams=sorted(taken), absent=absent)
         elif not absent:
-            run.send(other, "expect", streams=sorted(taken))
+            other.expect(run.steady)
+            run.send(other, "expect", streams=sorted(taken), times=other.expected)

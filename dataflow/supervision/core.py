@@ -181,9 +181,8 @@ class Core:
             case "seen":
                 process.unseen.discard(fields["stream"])
             case "ended":
-                if not process.take(Step.END, now):
+                if not process.end(fields["report"], now):
                     return
-                process.report = fields["report"]
             case "closed":
                 if process.take(Step.CLOSE, now):
                     process.facts = fields["facts"]

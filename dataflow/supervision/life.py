@@ -6,7 +6,8 @@ A process is forked and told what to be (STARTING), has joined the network (JOIN
 sends probes until its edges are proven (PROBING), works (RUNNING), has handed in its report (ENDED), was told to leave
 (LEAVING), and has closed everything it had open (CLOSED). One that says that something failed may leave in order
 (FAILED); one that breaks a rule is killed (KILLED). Whatever happens, the last thing is its death (GONE); where its
-restart policy allows it, it then waits for its turn (AWAY) and starts again. Its operators share its life.
+restart policy allows it, it then waits for its turn (AWAY) and starts again. Its operators share its life. A sink that
+has ended goes on (RUNNING) when a process whose streams it takes is started again.
 
 Only this table changes a state. A step that it does not hold is out of turn and changes nothing: processes are other
 programs, and the news of a death may cross any message.
@@ -45,6 +46,7 @@ class Step(Enum):
     DIE = "die"
     PROBE = "probe"
     GO = "go"
+    GO_ON = "go on"
     LEAVE = "leave"
     LEAVE_FAILED = "leave, having failed"
     KILL = "kill"
@@ -61,7 +63,7 @@ TRANSITIONS: Mapping[Life, Mapping[Step, Life]] = {
     Life.READY: {Step.PROBE: Life.PROBING, **_ENDS},
     Life.PROBING: {Step.GO: Life.RUNNING, **_ENDS},
     Life.RUNNING: {Step.END: Life.ENDED, **_ENDS},
-    Life.ENDED: {**_ENDS},
+    Life.ENDED: {Step.GO_ON: Life.RUNNING, **_ENDS},
     Life.LEAVING: {Step.CLOSE: Life.CLOSED, Step.KILL: Life.KILLED, Step.DIE: Life.GONE},
     Life.FAILED: {Step.LEAVE: Life.LEAVING, Step.KILL: Life.KILLED, Step.DIE: Life.GONE},
     Life.CLOSED: {Step.KILL: Life.KILLED, Step.DIE: Life.GONE},

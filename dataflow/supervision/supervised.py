@@ -36,6 +36,8 @@ class Supervised:
     """The firing that took longer than a moment when it was last heard of: operator, stamp, seconds."""
     silent: bool = False
     """It gives no sign of life, and the others go on without it."""
+    expected: int = 0
+    """Counts how often it was told to expect streams anew; an end said before it has heard of that is none."""
     hung_up: float | None = None
     """When it closed its channel."""
 
@@ -75,6 +77,19 @@ class Supervised:
         self.words.clear()
         self.cause, self.report, self.work = "", None, None
         self.silent, self.hung_up = False, None
+
+    def expect(self, now: float) -> None:
+        """Takes back that it has ended: streams that it takes begin anew."""
+        self.expected += 1
+        if self.take(Step.GO_ON, now):
+            self.report = None
+
+    def end(self, report: dict[str, Any], now: float) -> bool:
+        """Takes its report; False where it has not heard yet what it is to expect, or the report is out of turn."""
+        if report.get("expected", 0) != self.expected or not self.take(Step.END, now):
+            return False
+        self.report = report
+        return True
 
     def describe(self) -> str:
         what = ", ".join(self.nodes)

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
-    from dataflow.view.canvas import Canvas, visualize, visualizer
+    from dataflow.view.canvas import Canvas, visualizer
+    from dataflow.view.drawing import visualize
     from dataflow.view.playback import as_alarm, from_recording
     from dataflow.view.process import ViewerError
     from dataflow.view.scene import SceneState, ViewOptions
@@ -18,7 +19,8 @@ else:
     __getattr__, __dir__ = lazily(
         __name__,
         {
-            "canvas": ("Canvas", "visualize", "visualizer"),
+            "canvas": ("Canvas", "visualizer"),
+            "drawing": ("visualize",),
             "playback": ("as_alarm", "from_recording"),
             "process": ("ViewerError",),
             "scene": ("SceneState", "ViewOptions"),

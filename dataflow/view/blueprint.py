@@ -12,10 +12,12 @@ from rerun.blueprint.api import VisualizerLike
 from dataflow.graph.model import Graph
 from dataflow.graph.sections import PANELS
 from dataflow.messages import Diagnostics, Message, NavSatFix, Odometry, PointCloud, Pose
-from dataflow.view.canvas import Role, plots_of, roles_of
+from dataflow.view.canvas import Role
+from dataflow.view.drawing import plots_of, roles_of
 from dataflow.view.layout import Camera, Layout, layout
-from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, Outlook, entity_of
+from dataflow.view.scene import SCENE, TIMELINE, VIEWER_LOG, entity_of
 from dataflow.view.scores import SCORES
+from dataflow.view.viewpoint import Outlook
 from dataflow.view.visualizers.scene_tree import HEIGHT, WIDTH
 
 _BACKGROUND = (24, 27, 33)

@@ -11,12 +11,11 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 import numpy.typing as npt
 import rerun as rr
-from rerun.error_utils import catch_and_log_exceptions
 
 from dataflow.messages import Message, Odometry, Pose, Transforms
 from dataflow.view import colors
 from dataflow.view.frames import FrameCycleError, Rank
-from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
+from dataflow.view.scene import VIEWER_LOG, SceneState
 
 NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
@@ -118,9 +117,9 @@ class Canvas:
 M = TypeVar("M", bound=Message)
 Visualizer = Callable[[Canvas, Any], None]
 
-_visualizers: dict[type[Message], Visualizer] = {}
-_roles: dict[type[Message], tuple[Role, ...]] = {}
-_plots: dict[type[Message], tuple[str, ...]] = {}
+VISUALIZERS: dict[type[Message], Visualizer] = {}
+ROLES: dict[type[Message], tuple[Role, ...]] = {}
+PLOTS: dict[type[Message], tuple[str, ...]] = {}
 
 
 def visualizer(
@@ -133,44 +132,9 @@ def visualizer(
     """
 
     def register(function: Callable[[Canvas, M], None]) -> Callable[[Canvas, M], None]:
-        _visualizers[message_type] = function
-        _roles[message_type] = roles
-        _plots[message_type] = plots
+        VISUALIZERS[message_type] = function
+        ROLES[message_type] = roles
+        PLOTS[message_type] = plots
         return function
 
     return register
-
-
-def roles_of(message_type: type[Message]) -> tuple[Role, ...]:
-    """In which views a type appears."""
-    _load()
-    return next((_roles[c] for c in message_type.__mro__ if c in _roles), ())
-
-
-def plots_of(message_type: type[Message]) -> tuple[str, ...]:
-    """The plots with axes of their own."""
-    _load()
-    return next((_plots[c] for c in message_type.__mro__ if c in _plots), ())
-
-
-def visualize(
-    recording: rr.RecordingStream, entity: str, message: Message, scene: SceneState, stream: str = ""
-) -> None:
-    """Draws `message` at `entity` on the timeline `stamp`; `stream` defaults to the entity's own name.
-
-    Sets the calling thread's time on `recording`. Raises whatever the visualiser raises: a message that cannot be drawn
-    must not pass for one that was drawn. Of a stream that is only to place frames nothing is drawn.
-    """
-    _load()
-    draw = next(_visualizers[c] for c in type(message).__mro__ if c in _visualizers)
-    recording.set_time(TIMELINE, timestamp=np.datetime64(message.stamp, "ns"))
-    canvas = Canvas(recording, entity, stream or entity.lstrip("/"), message.stamp, scene)
-    with catch_and_log_exceptions(strict=True):  # this thread only: Rerun otherwise turns errors into warnings
-        if canvas.stream in scene.layout.placing:
-            canvas.place_frames(message)
-        else:
-            draw(canvas, message)
-
-
-def _load() -> None:
-    import dataflow.view.visualizers  # noqa: F401  (registers the built-in ones)

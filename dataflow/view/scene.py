@@ -1,4 +1,4 @@
-"""Memory of a viewer between messages: frames, ends of trails, what it said already, where to look from."""
+"""Memory of a viewer between messages: frames, ends of trails, what it said already."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
 from dataflow.messages.geometry import split_matrix
@@ -15,8 +14,7 @@ from dataflow.view import colors
 from dataflow.view.frames import Attach, Change, Detach, FrameTree, NewRoot, Rank
 from dataflow.view.layout import Layout, is_truth
 from dataflow.view.unshown import Offer, Unshown
-
-Vector = npt.NDArray[np.float64]
+from dataflow.view.viewpoint import Vector, Viewpoint
 
 SCENE = "/scene"
 """Entity of the drawing frame: the origin of the 3-D view."""
@@ -29,9 +27,6 @@ TIMELINE = "stamp"
 
 VIEWER_LOG = "/viewer/log"
 """Entity of what the viewer itself has to say."""
-
-_ONE_SIDED = 0.5
-"""Length of the mean direction of points that lie more to one side of their sensor than all round it."""
 
 ASSUMPTION_GRACE = 1_000_000_000
 """Event time (ns) for which a frame may stay unplaced before the viewer says so."""
@@ -77,15 +72,6 @@ class ViewOptions:
             raise ValueError(f"max_points must be at least 1, got {self.max_points}")
 
 
-@dataclass(frozen=True, slots=True)
-class Outlook:
-    """A viewpoint in the drawing frame, metres. `up` is a unit vector along an axis."""
-
-    up: Vector
-    position: Vector | None = None
-    target: Vector | None = None
-
-
 @dataclass(slots=True)
 class Trail:
     """The last vertex of a trail that has been drawn."""
@@ -101,17 +87,12 @@ class SceneState:
     layout: Layout = field(default_factory=Layout)
     options: ViewOptions = field(default_factory=ViewOptions)
     tree: FrameTree = field(default_factory=FrameTree)
-    optical: dict[str, None] = field(default_factory=dict)
     trails: dict[str, Trail] = field(default_factory=dict)
     track_paths: dict[str, dict[int, deque[tuple[int, Vector]]]] = field(default_factory=dict)
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
     unshown: Unshown = field(default_factory=Unshown)
+    viewpoint: Viewpoint = field(default_factory=Viewpoint)
     _noted: set[tuple[str, str]] = field(default_factory=set)
-    _ranges: list[float] = field(default_factory=list)
-    _around: list[Vector] = field(default_factory=list)
-    _kept: list[Vector] = field(default_factory=list)
-    _ahead: Vector | None = None  # the direction in which one looks, decided once
-    _posed: dict[str, None] = field(default_factory=dict)
     _waiting: dict[str, int] = field(default_factory=dict)
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
 
@@ -170,7 +151,7 @@ class SceneState:
         """A message places `child` in `parent`; poses that are not finite are passed over."""
         if not np.isfinite(T_parent_child).all():
             return
-        self._posed.setdefault(child)
+        self.viewpoint.posed.setdefault(child)
         changes = self.tree.place(parent, child, T_parent_child, owner=stream, rank=rank, stamp=stamp)
         self.draw_frames(recording, changes, stamp, static=static)
         self._take_unshown(recording, parent, stamp)
@@ -272,74 +253,6 @@ class SceneState:
                     else f"frame {frame!r} is not placed by any stream: drawn at the origin of {assumed[frame]!r}"
                 )
         return words
-
-    def saw_range(self, distances: npt.ArrayLike) -> None:
-        """Distances (N,) in metres at which things were seen: they set how far back to look from."""
-        d = np.asarray(distances, np.float64)
-        d = d[np.isfinite(d) & (d > 0)]
-        if d.size and len(self._ranges) < 256:
-            self._ranges.append(float(np.median(d)))
-
-    def saw_points(self, frame: str, points: npt.ArrayLike) -> None:
-        """Points (N, 3) of a cloud in its sensor's frame: how far things are, where the place of a scan all round is.
-
-        Call it when the frame is known to the tree.
-        """
-        p = np.asarray(points, np.float64).reshape(-1, 3)
-        distances = np.linalg.norm(p, axis=1)
-        self.saw_range(distances)
-        p, distances = p[distances > 0], distances[distances > 0]
-        if len(p) < 16 or len(self._around) >= 16:
-            return
-        T = self.tree.pose(frame)
-        if T is not None and np.linalg.norm((p / distances[:, None]).mean(axis=0)) < _ONE_SIDED:
-            self._around.append(p @ T[:3, :3].T + T[:3, 3])
-
-    @property
-    def keeps(self) -> bool:
-        """Tells whether there are points that stay."""
-        return bool(self._kept)
-
-    def kept_points(self, points: npt.ArrayLike) -> None:
-        """Points (N, 3) in the root frame that stay: the viewpoint is so far off that they are in view."""
-        p = np.asarray(points, np.float64).reshape(-1, 3)
-        self._kept.append(p[:: max(len(p) // 64, 1)])
-
-    def outlook(self) -> Outlook:
-        """Chooses the viewpoint from which everything seen is in view.
-
-        From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
-        place is in view, since the robot will drive about in it. Up is +z (REP 103), unless the root is itself like an
-        optical frame (y down), as in data sets whose world is their first camera.
-        """
-        up = np.array([0.0, 0.0, 1.0])
-        cameras = [T for frame in self.optical if (T := self.tree.pose(frame)) is not None]
-        if cameras and all(T[1, 1] > 0.7 and T[2, 2] > 0.7 for T in cameras):
-            up = np.array([0.0, -1.0, 0.0])
-        if cameras:
-            at, ahead = cameras[0][:3, 3], cameras[0][:3, 2]
-        else:
-            robot = next((T for frame in self._posed if (T := self.tree.pose(frame)) is not None), None)
-            if robot is None and not self._ranges:
-                return Outlook(up)
-            at, ahead = (np.zeros(3), np.eye(3)[0]) if robot is None else (robot[:3, 3], robot[:3, 0])
-        level = ahead - up * (ahead @ up)
-        if np.linalg.norm(level) < 0.2:
-            level = np.eye(3)[0] - up * up[0]
-        level /= np.linalg.norm(level)
-        if self._ahead is None:
-            self._ahead = level
-        level = self._ahead
-        reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
-        side = np.cross(level, up)
-        if self._around or self._kept:
-            lower, upper = np.percentile(np.concatenate(self._around + self._kept), [3, 97], axis=0)
-            middle = (lower + upper) / 2
-            size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
-            away = -0.97 * level + 1.05 * up + 0.4 * side
-            return Outlook(up, middle + size * away, middle - (0.1 * size * level if self._kept else 0.0))
-        position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
-        return Outlook(up, position, at + level * (0.75 * reach))
 
 
 def frame_entity(frame: str) -> str:

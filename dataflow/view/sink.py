@@ -26,12 +26,13 @@ from dataflow.messages import Message
 from dataflow.view import process
 from dataflow.view.backlog import Backlog, Bounds
 from dataflow.view.blueprint import blueprint_of
-from dataflow.view.canvas import visualize
+from dataflow.view.drawing import visualize
 from dataflow.view.layout import layout
 from dataflow.view.process import LOOPBACK, ViewerError
-from dataflow.view.scene import SCENE, VIEWER_LOG, Outlook, SceneState, ViewOptions, entity_of
+from dataflow.view.scene import SCENE, VIEWER_LOG, SceneState, ViewOptions, entity_of
 from dataflow.view.scores import SCORES, Summaries, document, scores_of
 from dataflow.view.targets import GRPC_PORT, Connect, Save, Serve, Spawn, Target
+from dataflow.view.viewpoint import Outlook
 
 SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
@@ -246,16 +247,16 @@ class ViewerSink:
         """Decides, once, which way is up and where to look from."""
         if self._outlook is not None:
             return
-        self._outlook = self._scene.outlook()
+        self._outlook = self._scene.viewpoint.outlook(self._scene.tree)
         if self._outlook.up[1] < 0:
             recording.log(SCENE, rr.ViewCoordinates.RDF, static=True)
         self._lay_out(recording)
 
     def _look_again(self, recording: rr.RecordingStream) -> None:
         """Chooses the viewpoint once more, from which all that there is in a file is in view."""
-        if not self._scene.keeps:
+        if not self._scene.viewpoint.keeps:
             return
-        self._outlook = self._scene.outlook()
+        self._outlook = self._scene.viewpoint.outlook(self._scene.tree)
         self._lay_out(recording)
 
     def _saved_layout(self, recording: rr.RecordingStream, graph: Graph | None) -> None:

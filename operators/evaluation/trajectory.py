@@ -8,20 +8,19 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.messages.geometry import normalize, quaternion_multiply, quaternion_to_matrix
 from operators.association import mutually_nearest
-
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
 
 Alignment = Literal["se3", "sim3", "none"]
 Pairs = tuple[NDArray[np.intp], NDArray[np.intp]]
 """Indices of the first and of the second pose of each pair."""
 
+_CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 SPAN_TOLERANCE = 0.1
 """Largest difference between the path of two poses and the span that is asked for, as a share of it."""
 
@@ -204,18 +203,18 @@ def _relative_error(matches: Matches, pairs: Pairs) -> tuple[NDArray[np.float64]
     turned, moved = _motions(matches.estimate, pairs)
     truly_turned, truly_moved = _motions(matches.truth, pairs)
     translations = np.linalg.norm(moved - truly_moved, axis=1)  # a rotation before it changes no length
-    return translations, np.degrees((truly_turned.inv() * turned).magnitude())
+    apart = quaternion_multiply(truly_turned * _CONJUGATE, turned)
+    angles = 2 * np.arctan2(np.linalg.norm(apart[:, :3], axis=1), np.abs(apart[:, 3]))
+    return translations, np.degrees(angles)
 
 
-def _motions(trajectory: Trajectory, pairs: Pairs) -> tuple[Rotation, NDArray[np.float64]]:
-    """Rotation and translation from the first to the second pose of each pair, in the first's own frame."""
-    from scipy.spatial.transform import Rotation
-
+def _motions(trajectory: Trajectory, pairs: Pairs) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Quaternion and translation from the first to the second pose of each pair, in the first's own frame."""
     first, second = pairs
-    positions = np.array(trajectory.positions)
-    rotations = Rotation.from_quat(np.array(trajectory.orientations))
-    back = rotations[first].inv()
-    return back * rotations[second], back.apply(positions[second] - positions[first])
+    positions, orientations = np.array(trajectory.positions), normalize(trajectory.orientations)
+    back = orientations[first] * _CONJUGATE
+    moved = quaternion_to_matrix(back) @ (positions[second] - positions[first])[:, :, None]
+    return quaternion_multiply(back, orientations[second]), moved[:, :, 0]
 
 
 def _rmse(errors: NDArray[np.float64]) -> float:

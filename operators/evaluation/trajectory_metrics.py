@@ -30,7 +30,7 @@ class TrajectoryMetrics(Operator):
     it may come at any rate and late without delaying or dropping an estimate.
     """
 
-    estimate: In[Odometry] = In(doc="the poses to score")
+    estimate: In[Pose | Odometry] = In(doc="the poses to score")
     ground_truth: Batch[Pose | Odometry] = Batch(doc="the true poses of the same child frame")
 
     alignment: Literal["se3", "sim3", "none"] = Param(
@@ -50,10 +50,10 @@ class TrajectoryMetrics(Operator):
         self._not_finite = 0
         self._figures: dict[str, float | int | str] = {}
 
-    def process(self, estimate: Odometry, ground_truth: tuple[Pose | Odometry, ...]) -> None:
+    def process(self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...]) -> None:
         """Raises ValueError where estimate and truth pose different child frames."""
         for truth in ground_truth:
-            if truth.child_frame and truth.child_frame != estimate.child_frame:
+            if truth.child_frame and estimate.child_frame and truth.child_frame != estimate.child_frame:
                 raise ValueError(
                     f"the ground truth poses {truth.child_frame!r} but the estimate {estimate.child_frame!r}: "
                     f"both must pose the same frame"

@@ -28,18 +28,17 @@ from operators.fusion.beginning import Prior, coasting_node
 from operators.fusion.control import Command
 from operators.fusion.covariances import Unusable
 from operators.fusion.error_state import POSITION, Noise
-from operators.fusion.gate import GateConfig
+from operators.fusion.heard import Heard
 from operators.fusion.inertial import InertialConfig, InertialSensor
 from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.nodes import Measurement
 from operators.fusion.output import diagnostics, figures, odometry_of
 from operators.fusion.places import Places
-from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements, turning, unheard, use_of
+from operators.fusion.sensor_settings import SensorSettings, errors_of, name_of, never_yields, unheard, use_of
+from operators.fusion.sensors import Surroundings, measurements, turning
 from operators.fusion.silence import Silence
 
 Array = NDArray[np.float64]
-_NEVER_AGREE = 1_000_000
-_WITHOUT_PATIENCE = ("doppler", "range")
 
 
 class EkfFusion(Operator):
@@ -122,15 +121,10 @@ class EkfFusion(Operator):
         )
         self._silence = Silence(self.max_gap, self.gravity, self._unknown())
         self._reported = -1
-        self._stamps: dict[str, int] = {}
-        self._before: dict[str, Message] = {}
         self._origin, self._sure = self.origin, False
         self._ignored: Counter[str] = Counter()
-        self._heard: set[str] = set()
-        self._gates = {
-            name: GateConfig(share=s.share, agreeing=_NEVER_AGREE if s.use in _WITHOUT_PATIENCE else s.agreeing)
-            for name, s in self.sensors.items()
-        }
+        self._heard = Heard()
+        self._gates = {name: settings.gate(settings.use) for name, settings in self.sensors.items()}
         self._places = Places(self.base_frame, "" if self.motion == "inertial" else self.base_frame)
 
     def process(
@@ -142,8 +136,12 @@ class EkfFusion(Operator):
     ) -> dict[str, Any] | None:
         """Raises ValueError for a message that its settings do not fit, or that has no place on the robot."""
         self._places.given(extrinsics)
-        self._heard |= {stream.partition("/")[2] for stream in measurements}
-        named = {name: m for stream, m in measurements.items() if self._follows(name := self._name(stream), m.stamp)}
+        self._heard.hear(measurements)
+        named = {
+            name: m
+            for stream, m in measurements.items()
+            if self._follows(name := name_of(stream, self.sensors), m.stamp)
+        }
         felt = False
         for name, message in named.items():
             settings = self._settings(name)
@@ -168,40 +166,32 @@ class EkfFusion(Operator):
             "inertial": self._inertial.snapshot(),
             "silence": self._silence.snapshot(),
             "reported": self._reported,
-            "stamps": dict(self._stamps),
-            "before": {
-                name: [m.stamp, m.frame, m.child_frame, m.position, m.orientation]
-                for name, m in self._before.items()
-                if isinstance(m, Odometry)
-            },
+            "stamps": dict(self._heard.stamps),
+            "before": self._heard.odometry_state(),
             "origin": None if self._origin is None else list(self._origin),
             "body": self._places.body,
             "sure": int(self._sure),
             "ignored": dict(self._ignored),
-            "heard": sorted(self._heard),
-            "strict": sorted(name for name, gate in self._gates.items() if gate.agreeing == _NEVER_AGREE),
+            "heard": sorted(self._heard.streams),
+            "strict": sorted(name for name, gate in self._gates.items() if never_yields(gate)),
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
-        self._heard = set(state.get("heard", ()))
         for name in state.get("strict", ()):
-            self._gates[name] = GateConfig(share=self._settings(name).share, agreeing=_NEVER_AGREE)
+            self._gates[name] = self._settings(name).gate("range")
         if state["filter"] is not None:
             self._filter = LateFilter.restored(self._config(), state["filter"])
         if "inertial" in state:
             self._inertial.restore(state["inertial"])
             self._reported = int(state["reported"])
-            self._stamps = {name: int(stamp) for name, stamp in state["stamps"].items()}
         else:  # as snapshots were before the sensor kept its own part
             *stamps, self._reported = (int(stamp) for stamp in state["stamps"])
             self._inertial.restore({"samples": state["samples"], "stamps": stamps})
         if "silence" in state:
             self._silence.restore(state["silence"])
-        self._before = {
-            name: Odometry(stamp=int(stamp), frame=frame, child_frame=child, position=p, orientation=q)
-            for name, (stamp, frame, child, p, q) in state["before"].items()
-        }
+        last = state["stamps"] if "inertial" in state else {}
+        self._heard.restore(state.get("heard", ()), last, state["before"])
         self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
         self._places.body, self._sure, self._ignored = state["body"], bool(state["sure"]), Counter(state["ignored"])
 
@@ -213,23 +203,15 @@ class EkfFusion(Operator):
 
     def _follows(self, name: str, stamp: int) -> bool:
         """Tells whether a message comes after the sensor's last; one that does not is counted."""
-        if stamp <= self._stamps.get(name, -1):
-            self._ignored[f"{name}: stamp not later than the last"] += 1
-            return False
-        self._stamps[name] = stamp
-        return True
+        if self._heard.follows(name, stamp):
+            return True
+        self._ignored[f"{name}: stamp not later than the last"] += 1
+        return False
 
     def _offsets(self) -> dict[str, tuple[float, float]]:
         """The time offset of each sensor that has it estimated, in all, and its standard deviation, s."""
         found = {} if self._filter is None else self._filter.offsets()
         return {name: (self._settings(name).offset + at, sigma) for name, (at, sigma) in found.items()}
-
-    def _name(self, stream: str) -> str:
-        """The name in `sensors` that a stream's name ends with, else its name without the namespace."""
-        for name in self.sensors:
-            if stream == name or stream.endswith(f"/{name}"):
-                return name
-        return stream.partition("/")[2]
 
     def _settings(self, name: str) -> SensorSettings:
         return self.sensors.get(name) or SensorSettings()
@@ -303,11 +285,9 @@ class EkfFusion(Operator):
         if self._filter is None and self.motion == "constant_velocity":
             self._filter = LateFilter(self._config(), coasting_node(message.stamp, self._prior(), self.gravity))
         settings = self._settings(name)
-        if use_of(name, message, settings) in _WITHOUT_PATIENCE:  # whatever says so: the setting or the message's type
-            self._gates[name] = GateConfig(share=settings.share, agreeing=_NEVER_AGREE)
-        before = self._before.get(name)
-        if isinstance(message, Odometry):
-            self._before[name] = message
+        if never_yields(gate := settings.gate(use_of(name, message, settings))):  # by the setting, or by its type
+            self._gates[name] = gate
+        before = self._heard.before(name, message)
         if self._filter is None:
             self._ignored[f"{name}: before the beginning"] += 1
             return
@@ -362,4 +342,4 @@ class EkfFusion(Operator):
         return diagnostics(stamp, self._filter.health, self._filter.hypotheses, ignored, self._offsets(), unused)
 
     def _unheard(self) -> list[tuple[str, str]]:
-        return list(unheard(tuple(self.sensors), sorted(self._heard)).items())
+        return list(unheard(tuple(self.sensors), sorted(self._heard.streams)).items())

@@ -32,7 +32,7 @@ class PositionFusion(Operator):
     """
 
     sightings: In[LandmarkSightings] = In(many=True, doc="things seen by each sensor, with identities and covariances")
-    extrinsics: Sampled[Transforms] = Sampled(required=False, doc="where the sensors are")
+    extrinsics: Sampled[Transforms] = Sampled(many=True, required=False, doc="where the sensors are")
     places: Out[LandmarkSightings] = Out(doc="the things whose places are known, in `frame`")
     status: Out[Diagnostics] = Out(doc="which sensors agree; every second, and at once when one contradicts another")
 
@@ -45,14 +45,17 @@ class PositionFusion(Operator):
         self._sensors: RedundantSensors[LandmarkSightings] = RedundantSensors(self.window, self.share)
 
     def process(
-        self, sightings: Mapping[str, LandmarkSightings], context: Context, extrinsics: Transforms | None = None
+        self,
+        sightings: Mapping[str, LandmarkSightings],
+        context: Context,
+        extrinsics: Mapping[str, Transforms] | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError for sightings without covariances or of a frame without place."""
         stamp = context.stamp
         self._sensors.take(sightings)
         seen: dict[int, dict[str, Place | Bearing]] = {}
         for name, message in self._sensors.simultaneous(stamp):
-            for identity, one in self._of(name, message, extrinsics):
+            for identity, one in self._of(name, message, _holding(message.frame, extrinsics or {})):
                 seen.setdefault(identity, {})[name] = one
         found = [(identity, *place) for identity in sorted(seen) if (place := self._place(seen[identity])) is not None]
         places = LandmarkSightings(
@@ -103,6 +106,12 @@ class PositionFusion(Operator):
             else:
                 found.append((identity, one))
         return found
+
+
+def _holding(frame: str, extrinsics: Mapping[str, Transforms]) -> Transforms | None:
+    """The transforms that tell of a frame; any where none do, and None where there are none at all."""
+    given = [transforms for _, transforms in sorted(extrinsics.items())]
+    return next((one for one in given if frame in (*one.frames, *one.child_frames)), given[0] if given else None)
 
 
 def _bearings(message: LandmarkSightings, T: Array, noise: float) -> list[Bearing]:

@@ -57,7 +57,7 @@ CALLS: dict[str, tuple[Callable[[Path], object], str]] = {
     "open": (lambda p: dataflow.open(3), r"open\(\): path: expected a text or a path, got 3 \(int\)"),  # type: ignore[arg-type]
     "run: graph": (
         lambda p: dataflow.run(7),  # type: ignore[arg-type]
-        r"run\(\): graph: expected a Graph, a text or a path, got 7 \(int\)",
+        r"run\(\): graph: expected a GraphBuilder, a Graph, a text or a path, got 7 \(int\)",
     ),
     "run: settings": (
         lambda p: dataflow.run("graph.yaml", settings=["camera.rate=3"]),  # type: ignore[arg-type]

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+MOST_LINES = 350
+
 
 def allowed(repository: Path) -> dict[str, tuple[str, ...]]:
     """The design page's table: package → what it may import."""
@@ -62,3 +64,49 @@ def test_the_table_has_no_circle(repository: Path) -> None:
             pytest.fail(f"these import each other: {', '.join(left)}")
         for package in free:
             del left[package]
+
+
+def module_of(file: Path, repository: Path) -> str:
+    return ".".join(file.relative_to(repository).with_suffix("").parts).removesuffix(".__init__")
+
+
+def names_imported(file: Path) -> Iterator[str]:
+    """What a file imports, also inside functions and for annotations alone; names too, since they may be modules."""
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def arrows(repository: Path) -> dict[str, set[str]]:
+    """Module → the modules whose files it imports. Packages that only gather names of their modules do not count."""
+    files = [file for package in ("dataflow", "operators") for file in (repository / package).rglob("*.py")]
+    modules = {module_of(file, repository): file for file in files if file.name != "__init__.py"}
+
+    def found(name: str) -> str | None:
+        return name if name in modules else found(name.rpartition(".")[0]) if "." in name else None
+
+    return {
+        module: {other for name in names_imported(file) if (other := found(name)) is not None and other != module}
+        for module, file in modules.items()
+    }
+
+
+def test_no_modules_import_each_other(repository: Path) -> None:
+    left = arrows(repository)
+    while free := [module for module, others in left.items() if not others & left.keys()]:
+        for module in free:
+            del left[module]
+    circle = {module: sorted(others & left.keys()) for module, others in left.items()}
+    assert not circle, f"these import each other, or what does: {circle}"
+
+
+@pytest.mark.parametrize("package", ["dataflow", "operators"])
+def test_files_are_short(repository: Path, package: str) -> None:
+    long = {
+        str(file.relative_to(repository)): lines
+        for file in (repository / package).rglob("*.py")
+        if (lines := len(file.read_text(encoding="utf-8").splitlines())) > MOST_LINES
+    }
+    assert not long, f"longer than {MOST_LINES} lines: {long}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from operators_page import markdown, section
+from operators_page import graphs_of, markdown, section
 
 from dataflow.graph.catalogue import BUILT_IN, Catalogue, discover
 from dataflow.messages import PointCloud
@@ -37,6 +37,20 @@ def test_every_port_and_parameter_has_a_row_with_a_meaning(found: Catalogue, pag
         for name in (*cls.spec.inputs, *cls.spec.outputs, *cls.spec.parameters.model_fields):
             (row,) = [row for row in rows if row.startswith(f"| `{name}` |")]
             assert not row.endswith("|  |"), f"{cls.spec.name}.{name} has no documentation"
+
+
+GEOMETRY = ["cloud", "crosscheck", "depth", "evaluation", "frames", "fusion", "image", "localization", "mapping"]
+GEOMETRY += ["odometry", "slam"]
+
+
+def test_every_operator_of_geometry_stands_in_a_graph(found: Catalogue) -> None:
+    graphs = graphs_of()
+    geometry = [use for use in found.operators if use.split(".")[1].partition(":")[0] in GEOMETRY]
+    assert [use for use in geometry if use not in graphs] == []
+
+
+def test_operators_of_nested_graphs_are_counted_to_the_graph_that_holds_them() -> None:
+    assert "perception_kitti.yaml" in graphs_of()["operators.crosscheck:MotionCheck"]
 
 
 class Thinner(Operator):

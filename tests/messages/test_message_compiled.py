@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from messages_page import families
 
 from dataflow.messages import Message, MessageError, array, scalar
-from dataflow.messages.compiled import ONE_UPDATE
+from dataflow.messages.compiled_digest import ONE_UPDATE
 
 TYPES = [cls for classes in families().values() for cls in classes]
 EVERY_TYPE = pytest.mark.parametrize("cls", TYPES, ids=lambda c: c.SCHEMA)

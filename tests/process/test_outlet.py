@@ -102,6 +102,21 @@ def test_the_end_of_a_stream_reaches_a_consumer_that_missed_messages() -> None:
     assert linked.outlet.counters()["unsent"] > 0
 
 
+def test_what_was_dropped_last_of_an_incarnation_that_is_over_is_missed(linked: Linked) -> None:
+    linked.outlet.release()
+    linked.outlet.message(FAST, entry(FAST, 10, 0))
+    linked.outlet.message(FAST, entry(FAST, 20, 1))
+    linked.outlet.message(FAST, entry(FAST, 5, 0, incarnation=1))  # a clock jumped back
+    linked.outlet.message(FAST, entry(FAST, 15, 1, incarnation=1))
+    assert linked.taken() == [
+        ("fast", "MESSAGE", 0),
+        ("fast", "MESSAGE", 1),
+        ("fast", "FRONTIER", 2),
+        ("fast", "MESSAGE", 0),
+        ("fast", "MESSAGE", 1),
+    ]
+
+
 def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_message_and_end(linked: Linked) -> None:
     linked.outlet = Outlet(
         None,  # type: ignore[arg-type]

@@ -33,6 +33,13 @@ class Stored:
         self.places += [(r.incarnation, r.index) for r in decode_batch(payload).records]
 
 
+class Arrived(queue.SimpleQueue[tuple[Any, ...]]):
+    """An inbox to which nothing comes through rings."""
+
+    def counters(self) -> dict[str, int]:
+        return {}
+
+
 class Recorder:
     """A recorder without a network."""
 
@@ -40,8 +47,7 @@ class Recorder:
         graph = load_text(GRAPH)
         self.channel, self.stored = RecordedChannel(), Stored()
         config = SinkConfig("@recorder", "record", graph.to_json(), [], ["camera", "last"], {}, live=True)
-        inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
-        self.process = SinkProcess(config, self.channel, inbox, lambda *_: self.stored)  # type: ignore[arg-type]
+        self.process = SinkProcess(config, self.channel, Arrived(), lambda *_: self.stored)  # type: ignore[arg-type]
         self.process.sink = self.stored  # type: ignore[assignment]
 
     def arrives(self, *places: tuple[int, int], operator: str = "last", key: str = KEY) -> None:
@@ -84,6 +90,23 @@ def test_records_that_come_again_after_the_last_ones_are_taken() -> None:
 
     assert sorted(recorder.stored.places) == [(0, 0), (0, 1), (0, 2)]
     assert recorder.process.inlet.malformed == 0
+
+
+def test_a_recorder_that_has_ended_waits_for_the_end_of_what_begins_anew() -> None:
+    recorder = Recorder()
+
+    def ends(incarnation: int) -> list[dict[str, Any]]:
+        for name in ("camera", "last"):
+            records = encode_batch([FiringRecord(name, incarnation, 0, "finish", 2)], last=True)
+            recorder.process._receive(firings_key("test", name), records)
+            recorder.process._report(0.0)
+        return [fields["report"] for fields in recorder.channel.of("ended")]
+
+    assert [report["expected"] for report in ends(0)] == [0]
+    recorder.process._control("expect", {"streams": [KEY], "times": 1})
+    recorder.process._report(0.0)
+    assert len(recorder.channel.of("ended")) == 1
+    assert [report["expected"] for report in ends(1)] == [0, 1]
 
 
 def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys: pytest.CaptureFixture[str]) -> None:

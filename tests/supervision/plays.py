@@ -145,7 +145,9 @@ class Play:
         return Said(label, "progress", {"done": done, "counts": counts, **more})
 
     def ended(self, label: str) -> Said:
-        return Said(label, "ended", {"report": {"counts": {}, "streams": {}, "transport": {}}})
+        """A process has ended, having heard everything that it was told to expect."""
+        expected = self.core.run.processes[label].expected
+        return Said(label, "ended", {"report": {"counts": {}, "streams": {}, "transport": {}, "expected": expected}})
 
     # Scenes
 

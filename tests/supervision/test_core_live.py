@@ -58,6 +58,23 @@ def test_a_process_that_dies_comes_back_where_it_was_and_others_know() -> None:
     assert play.ends().report is not None
 
 
+def test_a_recorder_that_has_ended_goes_on_when_a_process_comes_back() -> None:
+    play = robot(record="run.mcap").starts()
+    unaware = play.ended("@recorder")
+    play.dies("smooth", -9)
+    play.tell(play.ended("@recorder"))
+    told = play.wait(0.3)
+    assert [fields["times"] for _, fields in sent(told, "expect")] == [1]
+
+    play.tell(unaware)  # it had not heard of that yet
+    play.tell(*(play.ended(label) for label in play.processes if label != "@recorder"))
+    assert not sent(play.wait(1.0), "leave")
+    play.tell(play.ended("@recorder"))
+    play.wait(1.0)
+    assert play.over is not None
+    assert play.over.failure is None
+
+
 def test_restarts_come_to_an_end() -> None:
     play = robot().starts()
     for _ in range(3):

@@ -240,15 +240,15 @@ def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
     for scene, points in ((around, room - [1, 0, 0]), (before, ahead)):
         scene.tree.place("world", "lidar", np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
                          owner="r/base", rank=Rank.TREE, stamp=0)  # fmt: skip
-        scene.saw_points("lidar", points)
+        scene.viewpoint.saw_points(scene.tree.pose("lidar"), points)
 
-    looked = around.outlook()
+    looked = around.viewpoint.outlook(around.tree)
     assert looked.position is not None
     assert looked.target is not None
     assert np.allclose(looked.target[:2], [3, 0], atol=0.3)  # the middle of the room, in the world
     assert looked.position[2] > 4
     assert np.linalg.norm(looked.position - looked.target) > 5
-    nearer = before.outlook().position
+    nearer = before.viewpoint.outlook(before.tree).position
     assert nearer is not None
     assert nearer[2] < looked.position[2]
 

@@ -39,7 +39,7 @@ from dataflow.messages import (
 )
 from dataflow.messages.declaration import Declaration, generic_type
 from dataflow.view import SceneState, ViewOptions, colors, visualize
-from dataflow.view.canvas import roles_of
+from dataflow.view.drawing import roles_of
 from dataflow.view.layout import layout
 
 TYPES = [

@@ -20,7 +20,7 @@ _SHADES = 32
 @visualizer(CameraInfo, "image")
 def camera_info(canvas: Canvas, message: CameraInfo) -> None:
     """A frustum in the optical frame; images and overlays of this camera lie in its plane. Distortion is not shown."""
-    canvas.scene.optical.setdefault(message.frame)
+    canvas.scene.viewpoint.optical.setdefault(message.frame)
     canvas.scene.see(canvas.recording, message.frame, canvas.stamp)
     canvas.log(
         "",
@@ -113,7 +113,7 @@ def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:
     known = np.isfinite(depth) & (depth > 0)
     clean = np.where(known, depth, np.float32(0))
     sample = clean[::8, ::8]
-    canvas.scene.saw_range(sample[sample > 0])
+    canvas.scene.viewpoint.saw_range(sample[sample > 0])
     if (canvas.entity, "depth scale") not in canvas.scene.remembered and (sample > 0).any():
         _scale(canvas, float(np.percentile(sample[sample > 0], 98)), clean.shape)
     step = canvas.scene.options.depth_step

@@ -32,7 +32,7 @@ def point_cloud(canvas: Canvas, message: PointCloud) -> None:
     step = np.float32(canvas.scene.options.point_step)
     drawn = np.round(points / step) * step if step else points
     canvas.draw("space", message.frame, rr.Points3D(drawn, colors=paint, radii=rr.Radius.ui_points(1.5)))
-    canvas.scene.saw_points(message.frame, points[::16])
+    canvas.scene.viewpoint.saw_points(canvas.scene.tree.pose(message.frame), points[::16])
 
 
 def _paint(message: PointCloud, chosen: npt.NDArray[np.int64]) -> colors.Colors:
@@ -51,11 +51,11 @@ def _kept(canvas: Canvas, message: PointCloud) -> None:
     chosen = np.flatnonzero(np.isfinite(message.points).all(axis=1))
     chosen = chosen[:: -(-len(chosen) // _KEPT_AT_ONCE) or 1]
     points = message.points[chosen].astype(np.float64)
-    scene.saw_points(message.frame, points[::16])
+    scene.viewpoint.saw_points(scene.tree.pose(message.frame), points[::16])
     paint = _paint(message, chosen)
     for stamp, placed, painted in there.add(canvas.stamp, message.frame, points, paint, scene.tree.pose_at):
         drawn = np.round(placed * 128) / 128  # 8 mm: packs better
-        scene.kept_points(placed)
+        scene.viewpoint.kept_points(placed)
         canvas.recording.set_time(TIMELINE, timestamp=np.datetime64(stamp, "ns"))
         canvas.draw("space/kept", scene.tree.root or message.frame,
                     rr.Points3D(drawn, colors=painted, radii=rr.Radius.ui_points(1.5)))  # fmt: skip

@@ -18,7 +18,7 @@ _FASTEST = 10.0  # m/s: the end of the scale of radial velocities
 def laser_scan(canvas: Canvas, message: LaserScan) -> None:
     """A point where each beam ended."""
     points = message.points()
-    canvas.scene.saw_range(np.linalg.norm(points, axis=1))
+    canvas.scene.viewpoint.saw_range(np.linalg.norm(points, axis=1))
     canvas.draw("space", message.frame, rr.Points3D(points, colors=_SCAN, radii=rr.Radius.ui_points(2.5)))
 
 
@@ -28,7 +28,7 @@ def radar_scan(canvas: Canvas, message: RadarScan) -> None:
     points = message.points()
     shown = finite_rows(points)
     points = points[shown]
-    canvas.scene.saw_range(np.linalg.norm(points, axis=1))
+    canvas.scene.viewpoint.saw_range(np.linalg.norm(points, axis=1))
     if message.velocities is None:
         canvas.draw("space", message.frame, rr.Points3D(points, colors=_SCAN, radii=rr.Radius.ui_points(4.0)))
         return

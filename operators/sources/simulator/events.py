@@ -39,7 +39,7 @@ SENSORS: dict[str, type[Sensor]] = {
 FIXED = frozenset({
     "rate", "phase", "outages", "width", "height", "focal", "focal_error", "mount", "offset", "rotation", "baseline",
     "color", "output", "quantum", "rings", "columns", "radius", "track", "ticks_per_turn", "scale_error", "latitude",
-    "longitude", "altitude", "gyro_bias", "accel_bias", "gravity",
+    "longitude", "altitude", "gyro_bias", "accel_bias", "gravity", "frame", "ranges",
 })  # fmt: skip
 """Parameters that last for the whole run: when a sensor measures, what its messages look like, its calibration."""
 

@@ -1,4 +1,4 @@
-"""Sightings of known landmarks by range and bearing."""
+"""Sightings of known landmarks by range and bearing, or by bearing alone."""
 
 from __future__ import annotations
 
@@ -34,12 +34,13 @@ def sightings(
     covariances = np.zeros((len(landmarks), 3, 3))
     covariances[:, 0, 0], covariances[:, 1, 1], covariances[:, 2, 2] = deviation**2, angles**2, angles**2
     bearing = (bearings + angles * noise[1] + math.pi) % (2 * math.pi) - math.pi
+    known = slice(0 if sensor.ranges else 1, 3)
     return LandmarkSightings(
         stamp=stamp,
         frame=frame,
         ids=ids[seen],
-        ranges=np.maximum(ranges + sensor.bias + deviation * noise[0], 0)[seen],
+        ranges=np.maximum(ranges + sensor.bias + deviation * noise[0], 0)[seen] if sensor.ranges else None,
         bearings=bearing[seen],
         elevations=(elevations + angles * noise[2])[seen],
-        covariances=covariances[seen],
+        covariances=covariances[seen][:, known, known],
     )

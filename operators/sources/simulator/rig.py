@@ -175,7 +175,7 @@ class Rig:
         return {"radar_scan": radar.scan(self.stage, sensor, t, rng, tick.stamp, "radar")}
 
     def landmarks(self, sensor: Landmarks, t: float, tick: Tick, rng: Rng) -> Messages:
-        return {"sightings": landmarks.sightings(self.stage, sensor, t, rng, tick.stamp, "landmark_sensor")}
+        return {"sightings": landmarks.sightings(self.stage, sensor, t, rng, tick.stamp, sensor.frame)}
 
     def gnss(self, receiver: Gnss, t: float, tick: Tick, rng: Rng) -> Messages:
         fix = self._gnss_model.measure(receiver, self.stage, t, rng, tick.stamp, "gnss")

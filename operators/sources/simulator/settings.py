@@ -199,8 +199,10 @@ class Radar(Placed):
 
 
 class Landmarks(Placed):
-    """Sightings of known landmarks by range and bearing."""
+    """Sightings of known landmarks by range and bearing, or by bearing alone as a camera has them."""
 
+    frame: str = Field("landmark_sensor", min_length=1, description="name of the sensor's frame")
+    ranges: bool = Field(True, description="ranges are measured beside bearings")
     mount: Mount = Field((0.0, 0.0, 0.62, 0.0, 0.0, 0.0), description="place on the robot")
     field: float = Field(6.2832, gt=0, le=6.2832, description="width of the field of view, radians")
     max_range: float = Field(8.0, gt=0, description="metres")
@@ -249,7 +251,7 @@ class Sensors:
             "imu": self.inertial,
             "magnetometer": self.magnetometer,
             "radar": self.radar,
-            "landmark_sensor": self.landmarks,
+            self.landmarks.frame: self.landmarks,
             "gnss": self.gnss,
         }
 

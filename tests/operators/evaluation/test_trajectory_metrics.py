@@ -49,6 +49,16 @@ def test_a_path_in_another_frame_has_no_error() -> None:
         assert figures[name] == pytest.approx(0, abs=1e-5), name
 
 
+def test_a_stream_of_poses_scores_as_odometry_does() -> None:
+    path = circle()
+    metrics = TrajectoryMetrics()
+    metrics.setup()
+    for k, T in enumerate(path):
+        metrics.process(Pose.from_matrix(T, stamp=k * STEP, frame="odom", child_frame=""), (truth(T, k),))
+    metrics.finish()
+    assert metrics.summary() == score(path, path)
+
+
 def test_noise_gives_its_own_rmse() -> None:
     """Alternating offsets of 3 cm off the plane cannot be aligned away."""
     path = circle(64)

@@ -115,7 +115,7 @@ def test_a_camera_that_was_knocked_is_named_and_left_out() -> None:
 
 
 def process(operator: PositionFusion, message: LandmarkSightings) -> None:
-    operator.process({"ns/lidar/things": message}, Context(message.stamp), mounts())
+    operator.process({"ns/lidar/things": message}, Context(message.stamp), {"ns/robot/extrinsics": mounts()})
 
 
 def test_sightings_that_cannot_be_used_are_counted_with_the_reason_and_the_others_serve() -> None:
@@ -141,7 +141,9 @@ def test_sightings_that_do_not_come_after_the_last_are_counted() -> None:
     operator.setup()
     good = lidar(1, np.random.default_rng(0))[0]
     for stamp in (good.stamp, good.stamp, good.stamp - 1):
-        operator.process({"ns/lidar/things": good.replace(stamp=stamp)}, Context(good.stamp), mounts())
+        operator.process(
+            {"ns/lidar/things": good.replace(stamp=stamp)}, Context(good.stamp), {"ns/robot/extrinsics": mounts()}
+        )
     assert operator.summary()["ignored, lidar/things: stamp not later than the last"] == 2
 
 
@@ -151,3 +153,28 @@ def test_two_plays_give_equal_bits() -> None:
         eyes = {name: camera(name, 10, np.random.default_rng(i)) for i, name in enumerate(EYES)}
         plays.append(fused({**eyes, "lidar": lidar(10, np.random.default_rng(5))})[0].digests())
     assert plays[0] == plays[1]
+
+
+def test_each_sensor_may_be_told_of_by_a_stream_of_its_own() -> None:
+    rng = np.random.default_rng(4)
+    whole = mounts()
+    apart = {
+        f"ns/{name}/extrinsics": Transforms(
+            stamp=0,
+            frames=("base_link",),
+            child_frames=(name,),
+            translations=whole.translations[[k]],
+            rotations=whole.rotations[[k]],
+        )
+        for k, name in enumerate(whole.child_frames)
+    }
+    seen = {f"ns/{name}/things": camera(name, 1, rng)[0] for name in EYES}
+    stamp = seen["ns/left/things"].stamp
+    found = []
+    for extrinsics in (apart, {"ns/robot/extrinsics": whole}):
+        operator = PositionFusion()
+        operator.setup()
+        found.append(operator.process(seen, Context(stamp), extrinsics)["places"])
+    assert found[0].count == 2
+    np.testing.assert_allclose(found[0].positions, THINGS, atol=0.2)
+    assert found[0] == found[1]

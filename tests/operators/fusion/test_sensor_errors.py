@@ -15,7 +15,8 @@ from operators.fusion.late_filter import FilterConfig, LateFilter
 from operators.fusion.measurements import Position, Velocity
 from operators.fusion.nodes import Measurement, Sample
 from operators.fusion.sensor_errors import SensorErrors
-from operators.fusion.sensors import SensorSettings, Surroundings, errors_of, measurements
+from operators.fusion.sensor_settings import SensorSettings, errors_of
+from operators.fusion.sensors import Surroundings, measurements
 
 MOTION = Motion()
 NOISE = Noise(1e-4, 1e-3, 1e-6, 1e-5)

@@ -402,6 +402,19 @@ def test_sightings_scatter_as_their_covariances_say() -> None:
     np.testing.assert_allclose(np.concatenate(pulls).std(axis=0), 1, rtol=0.15)
 
 
+def test_a_camera_sights_landmarks_by_the_same_bearings_without_ranges() -> None:
+    given = {"rate": 5, "max_range": 20}
+    (both, *_), (bearings, *_) = (
+        stream(robot(duration="400ms", movers=False, landmarks={**given, **kind}), "sightings")
+        for kind in ({}, {"ranges": False, "frame": "eye"})
+    )
+    b, c = cast(Any, both), cast(Any, bearings)
+    assert (c.ranges, c.frame) == (None, "eye")
+    np.testing.assert_array_equal(c.bearings, b.bearings)
+    np.testing.assert_array_equal(c.elevations, b.elevations)
+    np.testing.assert_array_equal(c.covariances, b.covariances[:, 1:, 1:])
+
+
 def test_a_landmark_behind_something_is_not_sighted() -> None:
     source = robot(duration="100ms", movers=False, landmarks={"rate": 10, "missing": 0, "max_range": 100})
     (message,) = stream(source, "sightings")

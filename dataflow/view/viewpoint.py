@@ -1,0 +1,102 @@
+"""The viewpoint from which a scene is looked at: what its sensors have seen is in view."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from dataflow.view.frames import FrameTree
+
+Vector = npt.NDArray[np.float64]
+_ONE_SIDED = 0.5
+"""Length of the mean direction of points that lie more to one side of their sensor than all round it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outlook:
+    """A viewpoint in the drawing frame, metres. `up` is a unit vector along an axis."""
+
+    up: Vector
+    position: Vector | None = None
+    target: Vector | None = None
+
+
+@dataclass(slots=True)
+class Viewpoint:
+    """Frames, ranges and positions that messages have told of so far."""
+
+    optical: dict[str, None] = field(default_factory=dict)
+    """Optical frames, in the order in which they came."""
+    posed: dict[str, None] = field(default_factory=dict)
+    """Frames that messages placed."""
+    _ranges: list[float] = field(default_factory=list)
+    _around: list[Vector] = field(default_factory=list)
+    _kept: list[Vector] = field(default_factory=list)
+    _ahead: Vector | None = None  # the direction in which one looks, decided once
+
+    def saw_range(self, distances: npt.ArrayLike) -> None:
+        """Distances (N,) in metres at which things were seen: they set how far back to look from."""
+        d = np.asarray(distances, np.float64)
+        d = d[np.isfinite(d) & (d > 0)]
+        if d.size and len(self._ranges) < 256:
+            self._ranges.append(float(np.median(d)))
+
+    def saw_points(self, T: Vector | None, points: npt.ArrayLike) -> None:
+        """Points (N, 3) of a cloud in its sensor's frame tell how far things are; those of a scan all round, with the
+        frame's pose `T` in the root frame, also where the place is."""
+        p = np.asarray(points, np.float64).reshape(-1, 3)
+        distances = np.linalg.norm(p, axis=1)
+        self.saw_range(distances)
+        p, distances = p[distances > 0], distances[distances > 0]
+        if len(p) < 16 or len(self._around) >= 16:
+            return
+        if T is not None and np.linalg.norm((p / distances[:, None]).mean(axis=0)) < _ONE_SIDED:
+            self._around.append(p @ T[:3, :3].T + T[:3, 3])
+
+    @property
+    def keeps(self) -> bool:
+        """Tells whether there are points that stay."""
+        return bool(self._kept)
+
+    def kept_points(self, points: npt.ArrayLike) -> None:
+        """Points (N, 3) in the root frame that stay: the viewpoint is so far off that they are in view."""
+        p = np.asarray(points, np.float64).reshape(-1, 3)
+        self._kept.append(p[:: max(len(p) // 64, 1)])
+
+    def outlook(self, tree: FrameTree) -> Outlook:
+        """Chooses the viewpoint from which everything seen is in view.
+
+        From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
+        place is in view, since the robot will drive about in it. Up is +z (REP 103), unless the root is itself like an
+        optical frame (y down), as in data sets whose world is their first camera.
+        """
+        up = np.array([0.0, 0.0, 1.0])
+        cameras = [T for frame in self.optical if (T := tree.pose(frame)) is not None]
+        if cameras and all(T[1, 1] > 0.7 and T[2, 2] > 0.7 for T in cameras):
+            up = np.array([0.0, -1.0, 0.0])
+        if cameras:
+            at, ahead = cameras[0][:3, 3], cameras[0][:3, 2]
+        else:
+            robot = next((T for frame in self.posed if (T := tree.pose(frame)) is not None), None)
+            if robot is None and not self._ranges:
+                return Outlook(up)
+            at, ahead = (np.zeros(3), np.eye(3)[0]) if robot is None else (robot[:3, 3], robot[:3, 0])
+        level = ahead - up * (ahead @ up)
+        if np.linalg.norm(level) < 0.2:
+            level = np.eye(3)[0] - up * up[0]
+        level /= np.linalg.norm(level)
+        if self._ahead is None:
+            self._ahead = level
+        level = self._ahead
+        reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
+        side = np.cross(level, up)
+        if self._around or self._kept:
+            lower, upper = np.percentile(np.concatenate(self._around + self._kept), [3, 97], axis=0)
+            middle = (lower + upper) / 2
+            size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
+            away = -0.97 * level + 1.05 * up + 0.4 * side
+            return Outlook(up, middle + size * away, middle - (0.1 * size * level if self._kept else 0.0))
+        position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
+        return Outlook(up, position, at + level * (0.75 * reach))
