@@ -6,7 +6,7 @@ Distinct from those in a small window is enough where a pose says which window.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +16,24 @@ from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
 from operators.odometry.camera import RgbdCamera
 
-if TYPE_CHECKING:
-    from operators.slam.visual_view import View
-
 RATIO = 0.85  # of the distance of descriptors to that of the second nearest in the window
 FARTHEST = 0.5  # squared distance of rooted descriptors beyond which they do not show the same
 
 
-def guided_pairs(known: View, seen: View, T_known_seen: Matrix, camera: RgbdCamera, window: float) -> NDArray[np.int64]:
+class Features(Protocol):
+    """Holds pixels (N, 2), points (N, 3) in the depth camera, NaN where unknown, and rooted descriptors (N, 128)."""
+
+    @property
+    def pixels(self) -> NDArray[np.float32]: ...
+    @property
+    def points(self) -> NDArray[np.float32]: ...
+    @property
+    def rooted(self) -> NDArray[np.float32]: ...
+
+
+def guided_pairs(
+    known: Features, seen: Features, T_known_seen: Matrix, camera: RgbdCamera, window: float
+) -> NDArray[np.int64]:
     """Returns pairs of indices (M, 2), each feature once, at most `window` working pixels from where the pose says."""
     nothing = np.zeros((0, 2), np.int64)
     there = np.flatnonzero(np.isfinite(known.points[:, 2]))
