@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
 from operators.odometry.fitting import Fitter
 from operators.odometry.keyframe import Keyframe, view_distance
@@ -52,11 +53,12 @@ class CameraEyes:
         return view_distance(T_a, T_b, self.depth)
 
     def sight(self, nodes: Mapping[int, Node[View]], known: int, seen: int, expected: bool) -> Sight | str:
-        """Features tell where a view is; where it is expected is not asked."""
+        """Features tell where a view is; where they are too few, it is looked for where the map expects it."""
         one, other = nodes[known].view, nodes[seen].view
         assert one is not None
         assert other is not None
-        found = sight(one, other, self.fitter, self.judge.inliers)
+        T_expected = invert(nodes[known].T) @ nodes[seen].T if expected else None
+        found = sight(one, other, self.fitter, self.judge.inliers, T_expected)
         if found is None:
             return "too few features agree"
         return self.judge.doubt(found) or found

@@ -14,7 +14,7 @@ from dataflow.messages.geometry import transform_points
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix
 from operators.odometry.camera import RgbdCamera
-from operators.odometry.fitting import Fitter
+from operators.odometry.fitting import Fitter, Sighting
 from operators.odometry.frame import Frame
 from operators.odometry.keyframe import Keyframe
 from operators.odometry.local_map import LocalMap
@@ -24,10 +24,16 @@ from operators.odometry.relocalizer import rough_points
 from operators.odometry.surface import Surface
 from operators.odometry.watch import Watch
 from operators.slam.graph_memory import plain
+from operators.slam.guided import guided_pairs
+from operators.slam.place_index import rooted
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
 SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
+FIRST = 8  # features that a first pose may rest on, by which others are looked for
+FOUND = 6.0  # working pixels around where a first pose has a feature, in which it is looked for
+EXPECTED = 20.0  # the same around where the map has it
+PLENTY = 40  # features in agreement that need no others
 FLAT = 0.05  # metres by which features of one plane may be off it
 TRIPLES = 64  # planes that are tried
 
@@ -59,6 +65,10 @@ class View:
             keyframe.surface,
             keyframe.gray[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)],
         )
+
+    @cached_property
+    def rooted(self) -> NDArray[np.float32]:
+        return rooted(self.descriptors, len(self.descriptors))
 
     @cached_property
     def description(self) -> Description:
@@ -107,19 +117,20 @@ class Judge:
         return ""
 
 
-def sight(known: View, seen: View, fitter: Fitter, fewest: int) -> Sight | None:
+def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matrix | None = None) -> Sight | None:
     """Measures the pose of a view in the depth camera of a known one; None where fewer than `fewest` features agree.
 
-    RANSAC PnP on matched descriptors, then reprojections and point-to-plane distances together.
+    RANSAC PnP on matched descriptors; where few agree, on those matched where the map expects them, and once more where
+    the first pose puts them; then reprojections and point-to-plane distances together.
     """
     pairs = match(known.description, seen.description)
-    if len(pairs) < fewest:
-        return None
-    points = known.points[pairs[:, 0]].astype(np.float64)
-    there = np.isfinite(points[:, 2])
-    pixels = seen.pixels[pairs[there, 1]].astype(np.float64)
-    sighting = fitter.solve(points[there], pixels, np.zeros(len(pixels), np.int64), PIXELS, fewest)
-    if sighting is None:
+    sighting, matched = _solved(known, seen, pairs, fitter), len(pairs)
+    if T_expected is not None and (sighting is None or len(sighting.pixels) < fewest):
+        sighting, matched = _more(sighting, matched, *_guided(known, seen, T_expected, fitter, EXPECTED))
+    if sighting is not None and len(sighting.pixels) < PLENTY:
+        again = _guided(known, seen, sighting.T_world_camera, fitter, FOUND)
+        sighting, matched = _more(sighting, matched, *again)
+    if sighting is None or len(sighting.pixels) < fewest:
         return None
     T = sighting.T_world_camera
     fit = fitter.refine(
@@ -129,9 +140,30 @@ def sight(known: View, seen: View, fitter: Fitter, fewest: int) -> Sight | None:
         return None
     overlap = fit.compared / fit.offered if fit.offered else 0.0
     return Sight(
-        fit.T_world_camera, SURE * fit.covariance, len(pairs), fit.inliers, relief(sighting.points_world), overlap,
+        fit.T_world_camera, SURE * fit.covariance, matched, fit.inliers, relief(sighting.points_world), overlap,
         fit.depth_inliers,
     )  # fmt: skip
+
+
+def _guided(
+    known: View, seen: View, T_known_seen: Matrix, fitter: Fitter, window: float
+) -> tuple[Sighting | None, int]:
+    pairs = guided_pairs(known, seen, T_known_seen, fitter.camera, window)
+    return _solved(known, seen, pairs, fitter), len(pairs)
+
+
+def _more(a: Sighting | None, matched_a: int, b: Sighting | None, matched_b: int) -> tuple[Sighting | None, int]:
+    """Returns the one of two in which more features agree."""
+    if b is None or (a is not None and len(a.pixels) >= len(b.pixels)):
+        return a, matched_a
+    return b, matched_b
+
+
+def _solved(known: View, seen: View, pairs: NDArray[np.int64], fitter: Fitter) -> Sighting | None:
+    points = known.points[pairs[:, 0]].astype(np.float64)
+    there = np.isfinite(points[:, 2])
+    pixels = seen.pixels[pairs[there, 1]].astype(np.float64)
+    return fitter.solve(points[there], pixels, np.zeros(len(pixels), np.int64), PIXELS, FIRST)
 
 
 def relief(points: NDArray[np.float64]) -> int:

@@ -14,6 +14,7 @@ from operators.geometry.se3 import Matrix
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.fitting import Fitter
 from operators.odometry.noise import Noise
+from operators.odometry.recognition import match
 from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.slam.visual_view import STRIDE, Judge, Sight, View, relief, sight
@@ -59,6 +60,24 @@ def test_measured_from_either_end_the_motion_is_the_same() -> None:
     assert there is not None
     assert back is not None
     assert np.abs(se3.log(there.T_known_seen @ back.T_known_seen)).max() < 0.01
+
+
+def test_features_are_looked_for_again_where_a_first_pose_has_them() -> None:
+    far = look_at(np.array([0.79, 1.34, 1.3]), np.array([0.0, 0.0, 0.6]))  # 1.6 m and 69 degrees away
+    known, other, T = view(FIRST), view(far), invert(FIRST) @ far
+    assert len(match(known.description, other.description)) < 30
+    seen = sight(known, other, FITTER, 20)
+    assert seen is not None
+    assert seen.inliers > 22
+    assert np.linalg.norm(se3.log(invert(T) @ seen.T_known_seen)[:3]) < 0.03
+
+
+def test_a_wrong_expectation_misleads_no_sight() -> None:
+    known, other, T = view(FIRST), view(BESIDE), invert(FIRST) @ BESIDE
+    astray = T @ se3.exp(np.array([0.3, 0.0, 0.0, 0.0, 0.2, 0.0]))
+    seen = sight(known, other, FITTER, 20, astray)
+    assert seen is not None
+    assert np.linalg.norm(se3.log(invert(T) @ seen.T_known_seen)[:3]) < 0.015
 
 
 @pytest.mark.parametrize(
