@@ -77,6 +77,8 @@ def info(
         out.print(Text(silent, style="dim"))
     if described.events:
         out.print(_mapping("events", described.events))
+    if described.attachments:
+        out.print(_attachments(described))
     for name, digest in (computed or {}).items():
         out.print(Text(f"{digest}  {_relative(name, namespace)}"), soft_wrap=True)
     if metadata:
@@ -128,6 +130,8 @@ def _facts(described: Description) -> Table:
     row("messages", count(described.messages))
     if described.firings:
         row("firings of", ", ".join(described.firings))
+    if made:
+        row("metadata", f"{', '.join(made)} (--metadata prints them)")
     return grid
 
 
@@ -155,6 +159,13 @@ def _streams(described: Description, namespace: str) -> Table:
         rate = "" if s.rate is None or s.static else f"{s.rate:.2f}"
         row = (_relative(s.name, namespace), kind, count(s.count), rate, size(s.bytes), ", ".join(notes))
         made.add_row(*map(Text, row))
+    return made
+
+
+def _attachments(described: Description) -> Table:
+    made = table("attachment", "media type", "size", right=("size",))
+    for a in described.attachments:
+        made.add_row(Text(a.name), Text(a.media_type), size(a.bytes))
     return made
 
 

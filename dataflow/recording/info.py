@@ -31,6 +31,17 @@ class StreamSummary:
 
 
 @dataclass(frozen=True, slots=True)
+class AttachmentSummary:
+    """One file inside the recording; `log_time` and `created` (0: not said) in ns."""
+
+    name: str
+    media_type: str
+    bytes: int
+    log_time: int
+    created: int
+
+
+@dataclass(frozen=True, slots=True)
 class Description:
     """Result of `describe`. Stamps and durations in ns; sizes in bytes, `bytes` of the file, of streams uncompressed.
 
@@ -53,6 +64,7 @@ class Description:
     firings: Mapping[str, int]
     events: Mapping[str, int]
     metadata: Mapping[str, Mapping[str, str]]
+    attachments: tuple[AttachmentSummary, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -60,7 +72,7 @@ class Description:
 
 
 def describe(recording: Recording) -> Description:
-    """The facts of a recording, from its index and metadata; only its events are read."""
+    """The facts of a recording, from its index and metadata; only its events and attachments are read."""
     streams = tuple(_summary(recording, name) for name in recording.streams)
     moving = [s for s in streams if not s.static]
     start = min((s.first for s in moving if s.first is not None), default=None)
@@ -68,6 +80,9 @@ def describe(recording: Recording) -> Description:
     events: dict[str, int] = {}
     for event in recording.events():
         events[event.name] = events.get(event.name, 0) + 1
+    attachments = tuple(
+        AttachmentSummary(a.name, a.media_type, len(a.data), a.log_time, a.created) for a in recording.attachments()
+    )
     return Description(
         path=str(recording.path),
         bytes=os.stat(recording.path).st_size,
@@ -76,6 +91,7 @@ def describe(recording: Recording) -> Description:
         torn=recording.torn,
         lost_bytes=recording.lost_bytes,
         damage=recording.damage,
+        attachments=attachments,
         start=start,
         end=end,
         duration=0 if start is None or end is None else end - start,

@@ -13,6 +13,7 @@ from mcap.records import Channel
 
 from dataflow.messages.digest import StreamDigest
 from dataflow.recording.access import StreamIndex
+from dataflow.recording.attachments import Attachment
 from dataflow.recording.codecs import codec_for
 from dataflow.recording.entries import Event, RawRecord, Recorded
 from dataflow.recording.errors import RecordingError
@@ -55,8 +56,7 @@ class Recording:
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end: its writer died. Everything up to the last whole chunk is
-        readable."""
+        """Tells whether the file has no proper end: its writer died. All up to the last whole chunk is readable."""
         return self._file.torn
 
     @property
@@ -83,10 +83,7 @@ class Recording:
         return str(self._file.header.profile)
 
     def messages(
-        self,
-        streams: Sequence[str] | None = None,
-        start: int | None = None,
-        end: int | None = None,
+        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
     ) -> Iterator[Recorded]:
         """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream), whatever their order in the file.
 
@@ -147,6 +144,10 @@ class Recording:
         }
         for raw in self._in_file_order(list(channels)):
             yield channels[raw.channel], bytes(raw.data)
+
+    def attachments(self) -> Sequence[Attachment]:
+        """The files inside this one that can be read, in file order."""
+        return [self._file.attachment(place) for place in self._file.attachments]
 
     def firing_batches(self) -> Mapping[str, int]:
         """Number of batches of firing records by operator."""
