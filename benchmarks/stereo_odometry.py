@@ -8,6 +8,7 @@ import sys
 import time
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -41,6 +42,18 @@ def drift(estimate: list[Matrix], truth: list[Matrix]) -> tuple[float, float]:
     return 100 * float(np.linalg.norm(found[-1][:3, 3] - true[-1][:3, 3]) / way[-1]), 100 * float(np.mean(segments))
 
 
+def from_the_end(estimate: list[Matrix], truth: list[Matrix]) -> float:
+    """Returns the error of the first position with the last pose aligned, in percent: no first orientation is in it."""
+    true, found = ([invert(path[-1]) @ T for T in path] for path in (truth, estimate))
+    way = sum(float(np.linalg.norm(b[:3, 3] - a[:3, 3])) for a, b in pairwise(true))
+    return 100 * float(np.linalg.norm(found[0][:3, 3] - true[0][:3, 3])) / way
+
+
+def turning(path: list[Matrix], first: int, last: int) -> Matrix:
+    """Returns the rotation vectors (N, 3) between neighbouring poses, in mrad."""
+    return np.array([1e3 * cv2.Rodrigues((invert(a) @ b)[:3, :3])[0].ravel() for a, b in pairwise(path)][first:last])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "kitti_odometry_06"
@@ -49,25 +62,41 @@ def main() -> None:
     )
     cv2.setNumThreads(1)
     folder = parser.parse_args().data
-    print("| from pair | end point % | 10-40 m segments % | tracked | disparity offset px | median ms | CPU median |")
-    print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
-    for start in (0, 10):
-        source = KittiOdometry(path=str(folder), start=start)
-        source.setup()
-        statics = source.static_outputs()
-        odometry = StereoOdometry(rig_of(statics["left_info"], statics["right_info"]))  # type: ignore[arg-type]
+    print("| pairs | end point % | last pose aligned % | 10-40 m segments % | tracked | offset px | ms | CPU ms |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    source = KittiOdometry(path=str(folder))
+    source.setup()
+    statics = source.static_outputs()
+    rig = rig_of(statics["left_info"], statics["right_info"])  # type: ignore[arg-type]
+    steps: list[Any] = list(source.stream())
+    whole: dict[str, list[Matrix]] = {}
+    for name, chosen in (("all", steps), ("from 10", steps[10:]), ("from 12", steps[12:]), ("backwards", steps[::-1])):
+        odometry = StereoOdometry(rig)
         estimate, truth, wall, cpu, tracked = list[Matrix](), list[Matrix](), list[float](), list[float](), 0
-        for step in source.stream():
+        for k, step in enumerate(chosen):
             before, cpu_before = time.perf_counter(), time.process_time()
-            result = odometry.track(step["left"].data, step["right"].data, step["left"].stamp)  # type: ignore[attr-defined]
+            result = odometry.track(step["left"].data, step["right"].data, steps[k]["left"].stamp)
             wall.append(1e3 * (time.perf_counter() - before))
             cpu.append(1e3 * (time.process_time() - cpu_before))
             tracked += result.status in MEASURED
             estimate.append(result.T_world_camera)
-            truth.append(step["ground_truth"].matrix())  # type: ignore[attr-defined]
+            truth.append(step["ground_truth"].matrix())
         end, segments = drift(estimate, truth)
-        cells = f"{end:.2f} | {segments:.2f} | {tracked}/{len(estimate)} | {odometry.snapshot().offset:.2f}"
-        print(f"| {start} | {cells} | {np.median(wall):.0f} | {np.median(cpu):.0f} |")
+        offset = odometry.snapshot().offset
+        cells = f"{end:.2f} | {from_the_end(estimate, truth):.2f} | {segments:.2f} | {tracked}/{len(estimate)}"
+        print(f"| {name} | {cells} | {offset:.2f} | {np.median(wall):.0f} | {np.median(cpu):.0f} |")
+        whole[name] = estimate
+    forward, backward = whole["all"], whole["backwards"][::-1]
+    truth = [step["ground_truth"].matrix() for step in steps]
+    print("\n| turn from pair to pair, RMS of the three axes, mrad | pairs 0-12 | 12-50 |")
+    print("| --- | ---: | ---: |")
+    for name, a, b in (
+        ("forwards and backwards differ by", forward, backward),
+        ("forwards and the truth differ by", forward, truth),
+        ("backwards and the truth differ by", backward, truth),
+    ):
+        off = [turning(a, *part) - turning(b, *part) for part in ((0, 12), (12, 50))]
+        print(f"| {name} | {np.sqrt(np.mean(off[0] ** 2)):.2f} | {np.sqrt(np.mean(off[1] ** 2)):.2f} |")
 
 
 if __name__ == "__main__":

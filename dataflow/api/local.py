@@ -20,7 +20,6 @@ from dataflow.feeds.window import Window
 from dataflow.firing.calls import summary_of
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.protocol import Runner
-from dataflow.firing.source import SourceRunner
 from dataflow.firing.threads import limited_threads
 from dataflow.graph.model import Graph, Node
 from dataflow.process.config import ProcessConfig
@@ -200,16 +199,7 @@ class LocalRun:
 
     def _close(self) -> None:
         """Closes every operator; the first error is raised when all are closed."""
-        failures: list[OperatorFailure] = []
-        for maker in self._runners.all:
-            try:
-                if isinstance(maker, SourceRunner):
-                    maker.close_stream()
-                maker.operator.close()
-            except OperatorFailure as failure:
-                failures.append(failure)
-            except Exception as error:
-                failures.append(OperatorFailure(maker.node.name, "close()", error))
+        failures = self._runners.close(but=(), live=False)
         for log in self._feeding.logs:
             log.close()
         if failures:

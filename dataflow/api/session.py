@@ -11,7 +11,7 @@ from dataflow.api.graphs import GraphLike, resolved
 from dataflow.api.handed import HandedFeed
 from dataflow.api.local import Emitting, Recorder, config_of, make_here, step_each
 from dataflow.api.runs import metadata_of
-from dataflow.arguments import checked
+from dataflow.arguments import checked, require
 from dataflow.firing.calls import summary_of
 from dataflow.firing.failure import OperatorFailure
 from dataflow.firing.threads import limited_threads
@@ -96,7 +96,6 @@ class Session:
             chosen[stream] = name
         return chosen
 
-    @checked
     def put(self, stamp: int, messages: Mapping[str, Message]) -> Made:
         """Hands in the messages of one stamp, by stream, and returns what the graph makes of them.
 
@@ -104,11 +103,13 @@ class Session:
         the last one and for streams that are not the sources', `TypeError` for messages of another type, and
         `RunFailed` with the operator that failed, after which the session is closed.
         """
+        if stamp.__class__ is not int or not isinstance(messages, Mapping):  # each message is checked by its stream
+            require("Session.put", [("stamp", stamp, int), ("messages", messages, Mapping[str, Message])])
         if self._closed:
             raise ValueError("the session is closed")
-        checked = self._feed.check(messages, stamp)
+        named = self._feed.check(messages, stamp)
         try:
-            self._feed.admit(checked, stamp)
+            self._feed.admit(named, stamp)
             self._work()
         except BaseException as error:
             self._fail(error)

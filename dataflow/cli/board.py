@@ -139,7 +139,7 @@ def _late_sources(rows: Sequence[Row], told: Mapping[str, ProcessStatus]) -> dic
             continue
         status = told[row.operator]
         others = [name for name in status.restarts if name != row.operator]
-        why = held_up_by(others, *status.behind[row.operator], row.load)
+        why = held_up_by(others, *status.behind[row.operator], row.load, row.wall)
         said[row.operator] = f"source {row.operator!r} is {seconds(row.behind_clock)} behind the clock: {why}"
     return said
 

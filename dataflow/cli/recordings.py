@@ -77,8 +77,6 @@ def info(
         out.print(Text(silent, style="dim"))
     if described.events:
         out.print(_mapping("events", described.events))
-    if described.attachments:
-        out.print(_attachments(described))
     for name, digest in (computed or {}).items():
         out.print(Text(f"{digest}  {_relative(name, namespace)}"), soft_wrap=True)
     if metadata:
@@ -87,6 +85,7 @@ def info(
 
 
 def _facts(described: Description) -> Table:
+    from dataflow.recording.attachments import tells_of_run
     from dataflow.recording.cutting import cut_of
     from dataflow.recording.layout import GRAPH, OUTCOME, RECORDING, RECOVERED, RUN
     from dataflow.sync.stamps import format_stamp
@@ -130,8 +129,10 @@ def _facts(described: Description) -> Table:
     row("messages", count(described.messages))
     if described.firings:
         row("firings of", ", ".join(described.firings))
-    if made:
-        row("metadata", f"{', '.join(made)} (--metadata prints them)")
+    for each in described.attachments:
+        row("attachment", ", ".join(part for part in (each.name, each.media_type, size(each.bytes)) if part))
+    if told := [name for name in made if not tells_of_run(name)]:
+        row("metadata", f"{', '.join(told)} (--metadata prints it)")
     return grid
 
 
@@ -159,13 +160,6 @@ def _streams(described: Description, namespace: str) -> Table:
         rate = "" if s.rate is None or s.static else f"{s.rate:.2f}"
         row = (_relative(s.name, namespace), kind, count(s.count), rate, size(s.bytes), ", ".join(notes))
         made.add_row(*map(Text, row))
-    return made
-
-
-def _attachments(described: Description) -> Table:
-    made = table("attachment", "media type", "size", right=("size",))
-    for a in described.attachments:
-        made.add_row(Text(a.name), Text(a.media_type), size(a.bytes))
     return made
 
 

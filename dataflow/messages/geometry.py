@@ -106,20 +106,6 @@ def yaw_of(quaternion: npt.ArrayLike) -> F64:
     return np.asarray(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
 
 
-def slerp(first: npt.ArrayLike, second: npt.ArrayLike, fraction: npt.ArrayLike) -> F64:
-    """Rotations between two unit quaternions (..., 4) the short way: `first` at fraction 0, `second` at 1."""
-    a, b, t = normalize(first), normalize(second), np.asarray(fraction, np.float64)[..., None]
-    cosine = (a * b).sum(axis=-1, keepdims=True)
-    b = np.where(cosine < 0, -b, b)
-    angle = 2 * np.arctan2(np.linalg.norm(a - b, axis=-1, keepdims=True), np.linalg.norm(a + b, axis=-1, keepdims=True))
-    sine = np.sin(angle)
-    close = sine < 1e-8
-    divisor = np.where(close, 1.0, sine)
-    weight_a = np.where(close, 1 - t, np.sin((1 - t) * angle) / divisor)
-    weight_b = np.where(close, t, np.sin(t * angle) / divisor)
-    return normalize(weight_a * a + weight_b * b)
-
-
 def transform_matrix(position: npt.ArrayLike, orientation: npt.ArrayLike) -> F64:
     """Rigid transforms (..., 4, 4) of translations (..., 3) and quaternions (..., 4)."""
     rotation = quaternion_to_matrix(orientation)

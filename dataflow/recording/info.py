@@ -32,13 +32,11 @@ class StreamSummary:
 
 @dataclass(frozen=True, slots=True)
 class AttachmentSummary:
-    """One file inside the recording; `log_time` and `created` (0: not said) in ns."""
+    """One file that the recording carries."""
 
     name: str
     media_type: str
     bytes: int
-    log_time: int
-    created: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +61,8 @@ class Description:
     streams: tuple[StreamSummary, ...]
     firings: Mapping[str, int]
     events: Mapping[str, int]
+    attachments: tuple[AttachmentSummary, ...]
     metadata: Mapping[str, Mapping[str, str]]
-    attachments: tuple[AttachmentSummary, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         """JSON values."""
@@ -77,12 +75,10 @@ def describe(recording: Recording) -> Description:
     moving = [s for s in streams if not s.static]
     start = min((s.first for s in moving if s.first is not None), default=None)
     end = max((s.last for s in moving if s.last is not None), default=None)
+    attachments = tuple(AttachmentSummary(a.name, a.media_type, len(a.data)) for a in recording.attachments())
     events: dict[str, int] = {}
     for event in recording.events():
         events[event.name] = events.get(event.name, 0) + 1
-    attachments = tuple(
-        AttachmentSummary(a.name, a.media_type, len(a.data), a.log_time, a.created) for a in recording.attachments()
-    )
     return Description(
         path=str(recording.path),
         bytes=os.stat(recording.path).st_size,
@@ -91,7 +87,6 @@ def describe(recording: Recording) -> Description:
         torn=recording.torn,
         lost_bytes=recording.lost_bytes,
         damage=recording.damage,
-        attachments=attachments,
         start=start,
         end=end,
         duration=0 if start is None or end is None else end - start,
@@ -99,6 +94,7 @@ def describe(recording: Recording) -> Description:
         streams=streams,
         firings=recording.firing_batches(),
         events=dict(sorted(events.items())),
+        attachments=attachments,
         metadata=recording.metadata,
     )
 

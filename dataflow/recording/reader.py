@@ -56,7 +56,7 @@ class Recording:
 
     @property
     def torn(self) -> bool:
-        """Tells whether the file has no proper end: its writer died. All up to the last whole chunk is readable."""
+        """Tells whether the file has no proper end: its writer died. What lies before can be read."""
         return self._file.torn
 
     @property
@@ -67,10 +67,12 @@ class Recording:
     @property
     def damage(self) -> tuple[str, ...]:
         """Returns what in the file is damaged, for people: it was read by other means, or is left out as the note says.
-
-        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read.
-        """
+        Damage that cannot be got round raises `RecordingError` when the file is opened or the message is read."""
         return tuple(self._file.damage)
+
+    def attachments(self) -> Iterator[Attachment]:
+        """Yields the files that it carries, as far as they can be read; `damage` notes the others."""
+        return map(self._file.attachment, self._file.attachments)
 
     @property
     def library(self) -> str:
@@ -83,7 +85,10 @@ class Recording:
         return str(self._file.header.profile)
 
     def messages(
-        self, streams: Sequence[str] | None = None, start: int | None = None, end: int | None = None
+        self,
+        streams: Sequence[str] | None = None,
+        start: int | None = None,
+        end: int | None = None,
     ) -> Iterator[Recorded]:
         """Messages with start ≤ stamp ≤ end (ns), merged by (stamp, stream), whatever their order in the file.
 
@@ -144,10 +149,6 @@ class Recording:
         }
         for raw in self._in_file_order(list(channels)):
             yield channels[raw.channel], bytes(raw.data)
-
-    def attachments(self) -> Sequence[Attachment]:
-        """The files inside this one that can be read, in file order."""
-        return [self._file.attachment(place) for place in self._file.attachments]
 
     def firing_batches(self) -> Mapping[str, int]:
         """Number of batches of firing records by operator."""

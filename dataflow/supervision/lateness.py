@@ -22,19 +22,29 @@ AT_WORK = 0.7
 """CPU time of a source, as a share of the time that has passed, from which reading it takes longer than real time."""
 
 
-def held_up_by(others: Sequence[str], read: float, sent: float, load: float) -> str:
+IDLE = 0.05
+"""Share of CPU time in the time that reading takes, up to which it does nothing but wait."""
+
+
+def held_up_by(others: Sequence[str], read: float, sent: float, load: float, wall: float) -> str:
     """Names who holds a source up.
 
     `others`: the other operators of its process; `read`, `sent`: seconds by which its last message was late when it was
-    read, and when it was sent; `load`: CPU time of reading it, as a share of the time that has passed.
+    read, and when it was sent; `load`, `wall`: CPU time and time that reading it took, as shares of what has passed.
     """
     named = ", ".join(others)
     if read < ITS_OWN * sent:
         return f"its process is busy with {named or 'sending'}"
     if load > AT_WORK:
         return "reading it takes longer than real time"
-    beside = f"with {named}, its process's others, " if named else "with other processes "
-    return f"reading it waits, for a device or a file, or because it shares the CPU {beside}which are busy"
+    computes = min(1.0, load / wall) if wall > 0 else 0.0
+    if computes <= IDLE:
+        return "reading it waits, for a device or a file, and computes next to nothing"
+    beside = f"with {named}, its process's others" if named else "with other processes"
+    return (
+        f"reading it computes for {computes:.0%} of the time that it takes, and for the rest it waits: for a device or "
+        f"a file, or for the CPU, which it shares {beside}"
+    )
 
 
 class Lateness(Part):
@@ -67,8 +77,9 @@ class Lateness(Part):
         run = self.run
         assert run.release is not None
         elapsed = max(run.steady - run.release.at.steady, 1e-9)
-        load = run.status.operators[source].cpu_ns * 1e-9 / elapsed
-        return held_up_by([name for name in process.nodes if name != source], read, sent, load)
+        counts = run.status.operators[source]
+        load, wall = (ns * 1e-9 / elapsed for ns in (counts.cpu_ns, counts.wall_ns))
+        return held_up_by([name for name in process.nodes if name != source], read, sent, load, wall)
 
     def _waits(self, source: str, last: int | None, stamp: int, seconds: float) -> None:
         jump = "" if last is None else f", its stamps jump from {last} to {stamp}"

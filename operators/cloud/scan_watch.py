@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
+
 from dataflow.messages import Diagnostics, Message, PointCloud
 from dataflow.operator import In, Operator, Out, Param
 from operators.watching import Watching
@@ -21,8 +23,8 @@ class ScanWatch(Watching, Operator):
     checked: Out[PointCloud] = Out(doc="the same scan, if it shows something new")
     status: Out[Diagnostics] = Out(doc="with every scan; a warning for one that is held back")
 
-    least: int = Param(20, ge=0, live=True, doc="fewest points")
+    least: int = Param(20, ge=0, live=True, doc="fewest points that are finite")
 
     def process(self, cloud: PointCloud) -> Mapping[str, Message]:
-        few = cloud.count < self.least
+        few = int(np.isfinite(cloud.points).all(axis=1).sum()) < self.least
         return self.passed(cloud, cloud.points, "has too few points" if few else None)

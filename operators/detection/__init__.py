@@ -6,6 +6,7 @@ from dataflow.lazy import lazily
 
 if TYPE_CHECKING:
     from operators.detection.custom_detector import CustomDetector
+    from operators.detection.drawing import draw_detections
     from operators.detection.onnx_detector import OnnxDetector
     from operators.detection.score_filter import ScoreFilter
     from operators.detection.torchvision_detector import TorchvisionDetector
@@ -14,10 +15,11 @@ else:
         __name__,
         {
             "custom_detector": ("CustomDetector",),
+            "drawing": ("draw_detections",),
             "onnx_detector": ("OnnxDetector",),
             "score_filter": ("ScoreFilter",),
             "torchvision_detector": ("TorchvisionDetector",),
         },
     )
 
-__all__ = ["CustomDetector", "OnnxDetector", "ScoreFilter", "TorchvisionDetector"]
+__all__ = ["CustomDetector", "OnnxDetector", "ScoreFilter", "TorchvisionDetector", "draw_detections"]

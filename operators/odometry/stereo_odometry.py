@@ -31,7 +31,7 @@ class StereoOdometryConfig:
     corners: int = 350
     min_inliers: int = 15
     window: int = 8  # frames adjusted together
-    fixed: int = 2  # of these, the oldest, which hold the others
+    fixed: int = 1  # of these, the oldest; a second one would hold the scale of an offset that is known better by now
     iterations: int = 4
     sigma: float = 0.3  # of a sighting, pixels
     row_error: float = 1.5  # pixels by which a match may leave its row

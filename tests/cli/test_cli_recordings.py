@@ -7,6 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from dataflow.messages import Number
+from dataflow.recording import RecordingWriter
+from dataflow.recording.attachments import Attachment
+
 
 @pytest.fixture(scope="module")
 def longer(dataflow, small: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -34,6 +38,22 @@ def test_info_prints_the_digests_of_the_run_as_json(dataflow, recorded) -> None:
     described = json.loads(dataflow("info", path, "--digests", "--json").stdout)
 
     assert described["digests"] == {name: stream["digest"] for name, stream in report["streams"].items()}
+
+
+def test_info_lists_what_else_the_file_carries(dataflow, tmp_path: Path) -> None:
+    path = tmp_path / "carrying.mcap"
+    with RecordingWriter(path, metadata={}) as writer:
+        writer.add_stream("test/number", Number)
+        writer.add_attachment(Attachment("calibration.yaml", "text/yaml", 1, 2, b"fx: 500"))
+        writer.add_metadata("trip", {"driver": "somebody"})
+
+    told = dataflow("info", path).stdout
+
+    assert "calibration.yaml, text/yaml, 7 B" in told
+    assert "trip (--metadata prints it)" in told
+    described = json.loads(dataflow("info", path, "--json").stdout)
+    assert described["attachments"] == [{"name": "calibration.yaml", "media_type": "text/yaml", "bytes": 7}]
+    assert described["metadata"]["trip"] == {"driver": "somebody"}
 
 
 def test_info_fits_80_columns_with_whole_stream_names(dataflow, recorded, monkeypatch) -> None:

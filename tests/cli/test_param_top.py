@@ -313,7 +313,13 @@ def test_timeouts_and_late_messages_are_no_drops() -> None:
     ("read", "sent", "cpu", "told"),
     [
         (15.0, 15.1, 0.9, "reading it takes longer than real time"),
-        (15.0, 15.1, 0.1, "reading it waits, for a device or a file, or because it shares the CPU with detector"),
+        (
+            15.0,
+            15.1,
+            0.4,
+            "reading it computes for 40% of the time that it takes, and for the rest it waits: for a dev",
+        ),
+        (15.0, 15.1, 0.01, "reading it waits, for a device or a file, and computes next to nothing"),
         (0.1, 15.1, 0.1, "its process is busy with detector"),
     ],
 )

@@ -10,7 +10,6 @@ from pathlib import Path
 
 FOR_TESTS = {
     "pid_of",  # a process of a run, to stop it
-    "slerp",  # for operators to come, held against scipy
     "SPATIAL",  # the page about the simulator is held against it
     "visualizers",  # the message types that have one of their own
     "TO_PROCESSES",  # the page about faults is held against it

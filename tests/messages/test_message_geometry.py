@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from dataflow.messages import geometry
 
@@ -72,21 +72,6 @@ def test_inverse_and_composition(seed: int) -> None:
 def test_a_transform_survives_being_split(seed: int) -> None:
     matrix = random_transforms(seed)
     assert np.allclose(geometry.transform_matrix(*geometry.split_matrix(matrix)), matrix, atol=1e-12)
-
-
-@given(SEEDS, st.floats(0, 1))
-@settings(max_examples=50, deadline=None)
-def test_slerp_agrees_with_scipy(seed: int, fraction: float) -> None:
-    a, b = random_quaternions(seed, 2)
-    expected = Slerp([0, 1], Rotation.from_quat([a, b]))(fraction)
-    got = Rotation.from_quat(geometry.slerp(a, b, fraction))
-    assert (got * expected.inv()).magnitude() < 1e-7
-
-
-def test_slerp_between_equal_and_opposite_quaternions_stays() -> None:
-    q = random_quaternions(3, 1)[0]
-    for other in (q, -q, q + 1e-12):
-        assert np.allclose(geometry.slerp(q, other, 0.3), q, atol=1e-11)
 
 
 @given(st.floats(-3.14, 3.14))

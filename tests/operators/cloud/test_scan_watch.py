@@ -19,6 +19,15 @@ def test_a_scan_without_news_is_held_back(kept: int) -> None:
     assert [m.stamp for m in played["checked"]] == [0, 2]
 
 
+def test_a_scan_of_points_that_are_not_finite_is_held_back() -> None:
+    good = np.random.default_rng(3).uniform(1, 3, (100, 3)).astype(np.float32)
+    blind = np.full((100, 3), np.nan, np.float32)
+    blind[:19] = good[:19]
+    data = [good, blind, good + np.float32(0.1)]
+    played = play(ScanWatch(), {"cloud": [PointCloud(stamp=k, frame="lidar", points=d) for k, d in enumerate(data)]})
+    assert [m.stamp for m in played["checked"]] == [0, 2]
+
+
 def test_two_plays_are_equal_and_a_restored_watch_knows_the_last_scan() -> None:
     rng = np.random.default_rng(4)
     data = rng.uniform(1, 3, (100, 3)).astype(np.float32)

@@ -1,0 +1,47 @@
+"""Clouds that hold hardly anything, or nothing finite, are survived by operators of clouds, and said."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dataflow.messages import Diagnostics, PointCloud
+from dataflow.testing import play
+from operators.cloud import CloudFilter, Clusterer, PlaneSegmenter
+from operators.odometry import LidarOdometry
+from operators.slam import LidarSlam
+
+OPERATORS: list[Any] = [CloudFilter, Clusterer, LidarOdometry, LidarSlam, PlaneSegmenter]
+
+
+def room(count: int = 3000) -> np.ndarray:
+    """Points on the walls and the floor of a room, seen from within."""
+    rng = np.random.default_rng(0)
+    p = rng.uniform([-4, -3, -0.6], [4, 3, 1.8], (count, 3))
+    side = rng.integers(0, 5, count)
+    for k, (axis, at) in enumerate([(0, 4.0), (0, -4.0), (1, 3.0), (1, -3.0), (2, -0.6)]):
+        p[side == k, axis] = at
+    return p.astype(np.float32)
+
+
+BAD = {
+    "empty": np.zeros((0, 3), np.float32),
+    "one point": room()[:1],
+    "nothing finite": np.full((500, 3), np.nan, np.float32),
+    "one point many times": np.ones((500, 3), np.float32),
+}
+
+
+def scan(points: np.ndarray, k: int) -> PointCloud:
+    return PointCloud(stamp=(k + 1) * 100_000_000, frame="lidar", points=points)
+
+
+@pytest.mark.parametrize("bad", BAD.values(), ids=BAD)
+@pytest.mark.parametrize("made", OPERATORS, ids=lambda made: made.__name__)
+def test_a_bad_cloud_among_good_ones_is_survived_and_said(made: Any, bad: np.ndarray) -> None:
+    played = play(made(), {"cloud": [scan(room(), 0), scan(bad, 1), scan(room() + np.float32(0.01), 2)]})
+    said = {m.stamp: m for m in played["status"] if isinstance(m, Diagnostics)}
+    assert len(said) == 3
+    assert said[200_000_000].messages != said[100_000_000].messages
