@@ -13,7 +13,7 @@ import zstandard
 
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.packing import MAX_CHUNK_BYTES
-from dataflow.recording.rawfile import RawFile
+from dataflow.recording.rawfile import RECORD, RawFile
 
 CACHE_BYTES = 256 * 2**20
 MAX_RATIO = 300
@@ -34,11 +34,15 @@ CHUNK_HEAD = _CHUNK.size
 
 @dataclass(frozen=True, slots=True)
 class ChunkRef:
-    """One chunk: where its record's body begins in the file, and what the index says of it."""
+    """One chunk: where its record's body begins in the file, and what the index says of it.
+
+    `torn`: the file ends within it; `length` is what there is of it.
+    """
 
     offset: int
     length: int
     uncompressed_size: int
+    torn: bool = False
 
 
 def size_in_head(head: bytes) -> int:
@@ -128,24 +132,26 @@ class Chunks:
         (length,) = struct.unpack_from("<Q", body, at)
         packed = memoryview(body)[at + 8 : at + 8 + length]
         try:
-            data = self._unpack(name, packed, size, where)
+            data = self._unpack(name, packed, size, where, torn=ref.torn)
         except (zstandard.ZstdError, RuntimeError, ValueError, EOFError, MemoryError) as error:
             raise self._file.damaged(f"{where} does not decompress: {error}") from error
+        if ref.torn:
+            return data[: _whole_records(data)]
         if len(data) != size:
             raise self._file.damaged(f"{where} does not hold the {size} bytes that it says it has")
         if crc and zlib.crc32(data) != crc:
             raise self._file.damaged(f"{where} fails its checksum")
         return data
 
-    def _unpack(self, compression: str, packed: memoryview, size: int, where: str) -> bytes:
-        """At most `size` + 1 bytes, whatever the data says of itself."""
+    def _unpack(self, compression: str, packed: memoryview, size: int, where: str, *, torn: bool) -> bytes:
+        """At most `size` + 1 bytes, whatever the data says of itself; of a torn chunk, those that can be unpacked."""
         match compression:
             case "":
-                return bytes(packed)
+                return bytes(packed[: size + 1])
             case "zstd":
                 if not size:
                     return b""
-                stated = zstandard.frame_content_size(packed)
+                stated = -1 if torn else zstandard.frame_content_size(packed)
                 if stated == size:
                     return self._decompressor.decompress(packed, max_output_size=size)
                 if stated > size:  # one-shot decompression would believe it
@@ -169,3 +175,14 @@ def _unpack_lz4(packed: memoryview, most: int) -> bytes:
         unpacked.write(part)
         rest = b""
     return unpacked.getvalue()
+
+
+def _whole_records(data: bytes) -> int:
+    """Tells how many bytes of records are whole at the beginning of `data`."""
+    end = 0
+    while end + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, end)
+        if opcode == 0 or end + RECORD.size + length > len(data):
+            break
+        end += RECORD.size + length
+    return end

@@ -35,6 +35,7 @@ class Scan:
         self.contents = Contents(file)
         self.end = len(MAGIC)
         self.whole = False
+        self.salvaged = ""
         self._file = file
         self._sealed, self._trusting, self._lenient = sealed, trusting, lenient
         self._pending: _Pending | None = None
@@ -47,6 +48,9 @@ class Scan:
                 self.whole = True
                 break
             if self.end + RECORD.size + length > file.size or opcode == 0:
+                self._settle(torn=True)
+                if opcode == Opcode.CHUNK and self._lenient:
+                    self._salvage()
                 break
             self._take(opcode, self.end, length)
             self.end += RECORD.size + length
@@ -85,6 +89,24 @@ class Scan:
             case _ if self._sealed:
                 self.contents.damage.append(f"the record at byte {at} is none that this program writes; it is left out")
 
+    def _salvage(self) -> None:
+        """Takes the whole messages at the beginning of the chunk within which the file ends."""
+        at = self.end + RECORD.size
+        there = self._file.size - at
+        if there < CHUNK_HEAD:
+            return
+        size = size_in_head(self._file.near(at, CHUNK_HEAD))
+        number = self.contents.add_chunk(ChunkRef(at, there, size, torn=True))
+        before = sum(self.contents.counts().values())
+        try:
+            self.contents.take_chunk(number)
+        except DamagedError as error:
+            self.contents.damage.append(f"{error.what}; nothing of it is saved")
+            return
+        saved = sum(self.contents.counts().values()) - before
+        where = self.contents.chunks.where(number)
+        self.salvaged = f"the file ends within {where}: {saved} whole messages and records of it are saved"
+
     def _body(self, at: int, length: int) -> bytes | None:
         """The body of a record; None, and a note, where its checksum says that it is damaged."""
         record = self._file.record(at, length)
@@ -114,11 +136,12 @@ class Scan:
 
 def scan(file: RawFile, *, sealed: bool, trusting: bool, lenient: bool = False) -> Scan:
     """The pass that tells what `file` holds: where a trusting one comes upon damage, one that reads every chunk."""
-    first = Scan(file, sealed=sealed, trusting=trusting, lenient=lenient)
-    first.run()
-    if not trusting or not first.contents.damage:
-        return first
-    second = Scan(file, sealed=sealed, trusting=False, lenient=lenient)
-    second.run()
-    second.contents.damage[:] = list(dict.fromkeys([*first.contents.damage, *second.contents.damage]))
-    return second
+    found = Scan(file, sealed=sealed, trusting=trusting, lenient=lenient)
+    found.run()
+    if trusting and found.contents.damage:
+        first, found = found, Scan(file, sealed=sealed, trusting=False, lenient=lenient)
+        found.run()
+        found.contents.damage[:] = list(dict.fromkeys([*first.contents.damage, *found.contents.damage]))
+    if found.salvaged:
+        found.contents.damage.append(found.salvaged)
+    return found

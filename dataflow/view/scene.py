@@ -38,7 +38,7 @@ class ViewOptions:
 
     - `jpeg_quality`: raw colour images are sent as JPEG of this quality, None: as they are (20 times the memory).
     - `depth_step`: depth is sent as 16-bit PNG in steps of so many metres (coarser only where the farthest would not
-      fit); None: as float32.
+      fit); None: as float32. `depth_block`: side (pixels) of the squares that have one depth each; 1: every pixel.
     - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log says so once.
     - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
     - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
@@ -51,6 +51,7 @@ class ViewOptions:
 
     jpeg_quality: int | None = 85
     depth_step: float | None = 0.001
+    depth_block: int = 1
     max_points: int = 200_000
     point_step: float = 0.0
     kept_step: float = 0.05
@@ -64,6 +65,8 @@ class ViewOptions:
             raise ValueError(f"jpeg_quality must be 1 to 100 or None, got {self.jpeg_quality}")
         if self.depth_step is not None and not self.depth_step > 0:
             raise ValueError(f"depth_step must be more than 0 m or None, got {self.depth_step}")
+        if self.depth_block < 1:
+            raise ValueError(f"depth_block must be at least 1 pixel, got {self.depth_block}")
         if not self.point_step >= 0:
             raise ValueError(f"point_step must be 0 m or more, got {self.point_step}")
         if not self.kept_step > 0:

@@ -37,7 +37,9 @@ from dataflow.view.viewpoint import Outlook
 SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
 
-FILE_OPTIONS = ViewOptions(jpeg_quality=75, depth_step=0.02, max_points=2_500, point_step=2.0**-7, pose_step=45_000_000)
+FILE_OPTIONS = ViewOptions(
+    jpeg_quality=75, depth_step=0.04, depth_block=2, max_points=2_000, point_step=2.0**-6, pose_step=45_000_000
+)
 """Contents of a file unless more is asked for: for looking, not for measuring."""
 
 _FILE_BATCHES = rr.ChunkBatcherConfig(flush_tick=10.0, flush_num_bytes=8 << 20)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from mcap.opcode import Opcode
 from dataflow.editing.recover import recover
 from dataflow.messages import Text
 from dataflow.recording import Recording, RecordingError, RecordingWriter
+from dataflow.recording.packing import Compression
 
 HEAD = 9
 
@@ -92,3 +94,47 @@ def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     path = written(tmp_path / "b.mcap")
     with pytest.raises(RecordingError, match="to be recovered"):
         recover(path, path, overwrite=True)
+
+
+@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
+def test_whole_messages_before_a_cut_within_a_chunk_are_saved(tmp_path: Path, compression: Compression) -> None:
+    path, draw = tmp_path / "whole.mcap", random.Random(7)
+    with RecordingWriter(path, metadata={}, compression=compression, chunk_bytes=600_000) as writer:
+        writer.add_stream("a", Text)
+        for k in range(60):
+            noise = "".join(draw.choices("abcdefgh", k=30_000))
+            writer.write("a", Text(stamp=1 + k, text=noise), seq=k)
+    data, whole = path.read_bytes(), messages(path)
+    more = 0
+    for cut in sorted(draw.sample(range(chunks(data)[0][0], len(data)), 12)):
+        torn, saved = tmp_path / f"{cut}.mcap", tmp_path / f"{cut}_saved.mcap"
+        torn.write_bytes(data[:cut])
+        with Recording(torn) as strict:
+            before = strict.streams["a"].count if "a" in strict.streams else 0
+
+        recover(torn, saved)
+
+        found = messages(saved).get("a", {})
+        assert len(found) >= before
+        assert found == dict(list(whole["a"].items())[: len(found)])
+        more += len(found) - before
+    assert more > 12
+
+
+def test_a_cut_at_every_place_of_a_small_file_is_recovered(tmp_path: Path) -> None:
+    path = tmp_path / "whole.mcap"
+    with RecordingWriter(path, metadata={}, compression="none") as writer:
+        writer.add_stream("a", Text)
+        for k in range(6):
+            writer.write("a", Text(stamp=1 + k, text=f"word {k}"), seq=k)
+    data, whole = path.read_bytes(), list(messages(path)["a"].items())
+    begin, end = chunks(data)[0]
+    counts = []
+    for cut in range(begin, end, 7):
+        (tmp_path / "torn.mcap").write_bytes(data[:cut])
+        recover(tmp_path / "torn.mcap", tmp_path / "saved.mcap", overwrite=True)
+        found = list(messages(tmp_path / "saved.mcap").get("a", {}).items())
+        assert found == whole[: len(found)]
+        counts.append(len(found))
+    assert counts == sorted(counts)
+    assert counts[-1] >= 5

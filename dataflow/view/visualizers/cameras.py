@@ -15,6 +15,7 @@ _DEPTH_COLORS = rr.components.Colormap.Turbo
 _FAR = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 30.0, 40.0, 60.0, 80.0, 100.0)
 """Ends of the scale of depths, metres."""
 _SHADES = 32
+_PNG_LEVEL = 6  # more takes twice the time for two hundredths of the size
 
 
 @visualizer(CameraInfo, "image")
@@ -73,6 +74,7 @@ def compressed_depth(canvas: Canvas, message: CompressedDepth) -> None:
     proportional = message.quantizer == "linear" and message.offset == 0.0
     if (
         proportional
+        and canvas.scene.options.depth_block == 1
         and (step is None or message.scale > step / 2)
         and (canvas.entity, "depth scale") in canvas.scene.remembered
     ):
@@ -124,11 +126,18 @@ def _depth(canvas: Canvas, depth: np.typing.NDArray[np.float32]) -> None:
         return
     farthest = float(clean.max(initial=0.0))
     units = min(1.0 / step, 65000.0 / farthest if farthest > 0 else np.inf)  # per metre
-    steps = np.rint(clean * np.float32(units)).astype(np.uint16)
-    encoded, png = cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    steps = _in_blocks(np.rint(clean * np.float32(units)).astype(np.uint16), canvas.scene.options.depth_block)
+    encoded, png = cv2.imencode(".png", steps, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
     if not encoded:
         raise ValueError(f"a depth image of shape {depth.shape} cannot be written as PNG")
     _encoded_depth(canvas, png.tobytes(), units)
+
+
+def _in_blocks(steps: np.typing.NDArray[np.uint16], side: int) -> np.typing.NDArray[np.uint16]:
+    """The image in squares that have the value of their first pixel: as large as before, and far easier to pack."""
+    if side == 1:
+        return steps
+    return steps[::side, ::side].repeat(side, 0).repeat(side, 1)[: steps.shape[0], : steps.shape[1]]
 
 
 def _encoded_depth(canvas: Canvas, png: bytes, units: float) -> None:
