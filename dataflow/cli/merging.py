@@ -130,7 +130,10 @@ def recover(
             made.add_row(Text(name), count(done.saved.streams.get(name, 0)), count(lost[name]) if name in lost else "")
         out.print(made)
         if done.torn:
-            rest = f"; {plural(done.lost_bytes, 'byte')} of an unfinished record are lost" if done.lost_bytes else ""
+            ending = (
+                f"; its last {plural(done.lost_bytes, 'byte')} are an unfinished record: whole messages of it are saved"
+            )
+            rest = ending if done.lost_bytes else ""
             say(f"[yellow]torn:[/] {escape(str(recording))} has no proper end: its writer died{rest}")
         for note in done.damage:
             say(f"[yellow]damaged:[/] {escape(note)}")
