@@ -9,7 +9,8 @@ import pytest
 from typer import Context
 from typer.main import get_command
 
-from dataflow.cli import arguments, main, plugins
+from dataflow.cli import arguments, plugins
+from dataflow.cli.app import call
 from dataflow.cli.commands import BUILT_IN, Command, Commands, Family
 from dataflow.cli.main import app
 from dataflow.sync.stamps import parse_duration
@@ -81,11 +82,11 @@ def test_a_fault_of_ours_is_one_message_and_code_2(monkeypatch, capsys, asked: s
     def faulty() -> None:
         raise KeyError("nobody thought of this")
 
-    monkeypatch.setattr(main, "app", faulty)
+    monkeypatch.setattr("dataflow.cli.app.app", faulty)
     monkeypatch.setenv("DATAFLOW_TRACEBACK", asked)
 
     with pytest.raises(SystemExit) as ended:
-        main.main()
+        call()
 
     told = capsys.readouterr().err
     assert ended.value.code == 2
