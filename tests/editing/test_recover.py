@@ -121,7 +121,7 @@ def test_whole_messages_before_a_cut_within_a_chunk_are_saved(tmp_path: Path, co
     assert more > 12
 
 
-def test_a_cut_at_every_place_of_a_small_file_is_recovered(tmp_path: Path) -> None:
+def test_cuts_all_over_a_small_file_are_recovered(tmp_path: Path) -> None:
     path = tmp_path / "whole.mcap"
     with RecordingWriter(path, metadata={}, compression="none") as writer:
         writer.add_stream("a", Text)
