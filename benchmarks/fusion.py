@@ -163,8 +163,8 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
 
 
 def simulator(seed: int, seconds: int) -> tuple[list[float], list[list[float]], list[float], list[float]]:
-    """Errors at the outages' ends (m); NEES of position and orientation there and 2 s after; errors between outages; and
-    the root of the trace of the position's covariance at the ends (m), which is what the filter expects of the errors."""
+    """Errors at the outages' ends (m); NEES of position and orientation there and 2 s after; errors between them; the
+    root of the trace of the position's covariance at the ends (m), which is what the filter expects of the errors."""
     from dataflow.messages.geometry import quaternion_to_matrix
     from operators.fusion import EkfFusion
     from operators.fusion.error_state import log_rotation
@@ -196,7 +196,7 @@ def simulator(seed: int, seconds: int) -> tuple[list[float], list[list[float]], 
             nees.append([off @ np.linalg.solve(C[:3, :3], off), w @ np.linalg.solve(C[3:, 3:], w)])
         if at_end:
             ends.append(float(np.linalg.norm(off)))
-            expected.append(math.sqrt(float(np.trace(C))))
+            expected.append(math.sqrt(float(np.trace(C[:3, :3]))))
         elif since > PERIOD and 0.2 <= phase < PERIOD - OUTAGE:
             errors.append(float(np.linalg.norm(off)))
     return ends, nees, errors, expected
