@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _IGNORED_AREA = -1.0  # outside of COCO's area range, so neither a miss nor, when matched, a false positive
 _AREA_RANGE = (0.0, 1e10)
-_TOGETHER = 16
+_TOGETHER = 8
 _BITS = 1 << np.arange(16)
 
 
