@@ -1,4 +1,4 @@
-"""What a score needs of the objects of one image."""
+"""Takes from a message of detections what a score needs of the objects of one image."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What scores keep of a long run: the same values as came, in little memory."""
+"""Poses that a score keeps of a long run: the same values as came, in little memory."""
 
 from __future__ import annotations
 
