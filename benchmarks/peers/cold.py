@@ -153,6 +153,8 @@ class Pair:
         taken_from = time.monotonic_ns()
         self.loops["near"].switch()
         taken = time.monotonic_ns()
+        for window in (self.near.window, self.near.backlog):  # nobody is here who tells the source how far all are
+            window.clear()
         spans = {
             "emit": sent - begun,
             "emit, after": emitted - sent,
