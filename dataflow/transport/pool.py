@@ -54,7 +54,7 @@ class Block:
     generation: int = 0
     claims: tuple[Claim, ...] = ()
     start: int = 0
-    """Where its envelope begins."""
+    """The place in the pool at which its envelope begins."""
 
     def free(self) -> bool:
         return all(c.released(self.slot, self.generation) for c in self.claims)
@@ -68,7 +68,7 @@ class _Array(weakref.ref["npt.NDArray[np.uint8]"]):
     key: int
     gone: bool
     sent: bool
-    """Whether there is an envelope in front of it: another one would be written over that."""
+    """An envelope lies in front of it: another one would be written over that."""
 
     __hash__ = object.__hash__
     __eq__ = object.__eq__
