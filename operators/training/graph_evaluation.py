@@ -39,7 +39,7 @@ def evaluate_graph(
         typer.Option(
             "--data",
             metavar="FOLDER|NAME=FOLDER|FILE.mcap",
-            help="The data: sets the graph's parameter for it; a recording takes the place of the sources. May be repeated.",
+            help="The data: sets the graph's parameter for it; a recording replaces the sources. May be repeated.",
         ),
     ] = None,
     settings: Annotated[

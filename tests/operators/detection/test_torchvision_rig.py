@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +69,12 @@ def calls_of(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return sizes
 
 
+def one_by_one(operator: Any, images: Sequence[Image]) -> list[Any]:
+    """What an operator for one camera gives of each image."""
+    operator.setup()
+    return [operator.process(each) for each in images]
+
+
 def streams(*images: Image) -> dict[str, Mapping[str, list[Image]]]:
     by_camera: dict[str, list[Image]] = {}
     for each in images:
@@ -81,20 +87,17 @@ def test_boxes_are_those_of_each_camera_alone_and_the_network_is_called_once(
     checkpoints: dict[str, str], model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     options = {"model": model, "checkpoint": checkpoints[model], "score_threshold": 0.3}
-    alone = {
-        c: play(TorchvisionDetector(**options), {"image": [image(c)]})["detections"][0]  # type: ignore[arg-type]
-        for c in CAMERAS
-    }
+    alone = one_by_one(TorchvisionDetector(**options), [image(c) for c in CAMERAS])  # type: ignore[arg-type]
     calls = calls_of(monkeypatch)
     rig = play(TorchvisionRigDetector(cameras=CAMERAS, **options), streams(*(image(c) for c in CAMERAS)))
     assert calls == [3]
     for k, camera in enumerate(CAMERAS):
         (found,) = rig[f"detections_{k + 1}"]
-        assert len(alone[camera].scores) > 3
+        assert len(alone[k].scores) > 3
         assert found.frame == camera
-        np.testing.assert_allclose(found.boxes, alone[camera].boxes, atol=1e-4)
-        np.testing.assert_allclose(found.scores, alone[camera].scores, atol=1e-5)
-        assert found.class_ids.tolist() == alone[camera].class_ids.tolist()
+        np.testing.assert_allclose(found.boxes, alone[k].boxes, atol=1e-4)
+        np.testing.assert_allclose(found.scores, alone[k].scores, atol=1e-5)
+        assert found.class_ids.tolist() == alone[k].class_ids.tolist()
     assert rig["detections_4"] == []
 
 
@@ -103,7 +106,7 @@ def test_images_of_other_sizes_are_not_given_borders_by_their_neighbours(
 ) -> None:
     options = {"model": RCNN, "checkpoint": checkpoints[RCNN], "score_threshold": 0.3}
     seen = [image("front"), image("left", size=(64, 160)), image("rear")]
-    alone = [play(TorchvisionDetector(**options), {"image": [i]})["detections"][0] for i in seen]  # type: ignore[arg-type]
+    alone = one_by_one(TorchvisionDetector(**options), seen)  # type: ignore[arg-type]
     calls = calls_of(monkeypatch)
     rig = play(TorchvisionRigDetector(cameras=CAMERAS, **options), streams(*seen))
     assert sorted(calls) == [1, 2]
@@ -124,10 +127,7 @@ def test_a_camera_that_is_silent_holds_up_no_other(
 
 def test_maps_are_those_of_each_camera_alone(checkpoints: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
     options = {"model": LRASPP, "checkpoint": checkpoints[LRASPP], "side": 64, "with_confidence": True}
-    alone = [
-        play(TorchvisionSegmenter(**options), {"image": [image(c)]})["segmentation"][0]  # type: ignore[arg-type]
-        for c in CAMERAS
-    ]
+    alone = one_by_one(TorchvisionSegmenter(**options), [image(c) for c in CAMERAS])  # type: ignore[arg-type]
     calls = calls_of(monkeypatch)
     rig = play(TorchvisionRigSegmenter(cameras=CAMERAS, **options), streams(*(image(c) for c in CAMERAS)))  # type: ignore[arg-type]
     assert calls == [3]
