@@ -1,4 +1,4 @@
-"""What networks in ONNX files take: an image as the tensor that the input wants; and class names from a file."""
+"""The input of networks in ONNX files: an image as the tensor that they want; and class names from a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all segmenters do last: unsure pixels become void, and classes become a message."""
+"""The last step of all segmenters: unsure pixels become void, and classes become a message."""
 
 from __future__ import annotations
 

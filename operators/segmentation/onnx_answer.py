@@ -1,4 +1,4 @@
-"""What segmentation networks in ONNX files say of themselves and answer: names, colours, normalisation, scores."""
+"""Answers of segmentation networks in ONNX files, and what these say of themselves: names, colours, normalisation."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Told:
-    """What a model's metadata tell, each None where they do not: labels, and mean and deviation as shares of 1."""
+    """Labels, mean and deviation (shares of 1) from a model's metadata, each None where these do not tell."""
 
     labels: Labels | None
     mean: Triple | None

@@ -24,7 +24,7 @@ DATA_NAMES = ("data", "path", "folder", "file", "recording")
 _SCORES = "operators.evaluation:"
 
 Figures = Mapping[str, Mapping[str, Any]]
-"""What operators sum up at the end of a run, by operator and name."""
+"""Figures that operators sum up at the end of a run, by operator and name."""
 
 
 def evaluate_graph(
