@@ -102,7 +102,7 @@ def outside(model: Path, threshold: float, nms_iou: float) -> Callable[[Image], 
         best, labels = output[5:].max(dim=0)
         scores = (output[0] ** 0.6 * best**0.4).reshape(-1)
         strong = scores >= threshold
-        corners = box_convert(boxes, "cxcywh", "xyxy").clip(0, 1) * torch.tensor([image.width, image.height] * 2)
+        corners = box_convert(boxes, "cxcywh", "xyxy")
         corners, scores, labels = corners[strong], scores[strong], labels.reshape(-1)[strong]
         kept = batched_nms(corners, scores, labels, nms_iou)[:100]
         return Detections2D(
@@ -110,7 +110,7 @@ def outside(model: Path, threshold: float, nms_iou: float) -> Callable[[Image], 
             frame=image.frame,
             width=image.width,
             height=image.height,
-            boxes=corners[kept].numpy().astype(np.float32),
+            boxes=(corners[kept].clip(0, 1) * torch.tensor([image.width, image.height] * 2)).numpy().astype(np.float32),
             scores=scores[kept].clip(0, 1).numpy().astype(np.float32),
             class_ids=labels[kept].numpy().astype(np.int32),
         )
