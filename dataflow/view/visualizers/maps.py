@@ -106,14 +106,14 @@ def _hulls(canvas: Canvas, message: Planes, paint: np.typing.NDArray[np.uint8]) 
     sizes = np.array([len(hulls[k]) for k in drawn])
     starts = np.cumsum(sizes) - sizes
     fans = [start + np.array([[0, i, i + 1] for i in range(1, n - 1)]) for start, n in zip(starts, sizes, strict=True)]
-    sheer = np.column_stack([paint[drawn], np.full(len(drawn), _SHEER, np.uint8)])
     canvas.draw(
         "space",
         message.frame,
         rr.Mesh3D(
             vertex_positions=np.concatenate([hulls[k] for k in drawn]),
             triangle_indices=np.concatenate(fans),
-            vertex_colors=np.repeat(sheer, sizes, axis=0),
+            vertex_colors=np.repeat(paint[drawn], sizes, axis=0),
+            albedo_factor=(255, 255, 255, _SHEER),  # the opacity of single corners is not drawn
         ),
     )
     edges = [np.vstack([hulls[k], hulls[k][:1]]) for k in drawn]
