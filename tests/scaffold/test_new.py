@@ -42,7 +42,7 @@ def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
         call("new", "operator", f"Another{kind}", "--kind", kind, "--to", project / "my_robot")
     call("new", "graph", "second", "--to", project / "graphs")
     assert (project / "tests" / "test_anothersource.py").is_file()
-    assert "9 passed" in run_tests(project, tmp_path)
+    assert "11 passed" in run_tests(project, tmp_path)
 
 
 def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> None:
