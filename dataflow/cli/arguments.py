@@ -237,7 +237,7 @@ def span(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] 
 
 
 def named_once(metavar: str, argument: Path | None, option: Path | None) -> Path | None:
-    """What to write, which may be named by an argument or by --out, and not by both."""
+    """Returns the path to write, which may be named by an argument or by --out, and not by both."""
     if argument is not None and option is not None:
         raise fail(f"--out {option} and {metavar} {argument} both name what to write: name one of them")
     return argument if option is None else option
