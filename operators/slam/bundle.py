@@ -121,10 +121,10 @@ class _Solver:
         H, b = np.zeros((count, 6, 6)), np.zeros((count, 6))
         np.add.at(H, own, Jp.transpose(0, 2, 1) @ Jp)
         np.add.at(b, own, np.einsum("sij,si->sj", Jp, r[f]))
-        A = np.zeros((count, 6, size, 3))
-        A[own, :, seen.points[f]] = Jp.transpose(0, 2, 1) @ Jl[f]
-        B = np.einsum("camj,mjk->camk", A, V_inverse).reshape(6 * count, 3 * size)
-        A = A.reshape(6 * count, 3 * size)
+        E = np.zeros((count, 6, size, 3))
+        E[own, :, seen.points[f]] = Jp.transpose(0, 2, 1) @ Jl[f]
+        A = E.reshape(6 * count, 3 * size)
+        B = np.einsum("camj,mjk->camk", E, V_inverse).reshape(6 * count, 3 * size)
         S, g = graph.normal(poses)
         S = S - B @ A.T
         for i in range(count):

@@ -43,7 +43,7 @@ def adjust_newest(graph: KeyframeGraph[View], points: MapPoints, fitter: Fitter,
     observed = Observations(
         np.array([place[k] for k in seen.nodes.tolist()], np.int64), np.searchsorted(rows, seen.points),
         seen.pixels, seen.depths, max(PIXEL, noise.pixel),
-        noise.depth * fitter.config.depth_noise.sigma(known) + DEPTH,
+        np.asarray(noise.depth * fitter.config.depth_noise.sigma(known) + DEPTH, np.float64),
     )  # fmt: skip
     bundle = adjusted(
         fitter.camera, np.array([graph.nodes[k].T for k in place]), points.world(rows, graph.nodes), observed,
