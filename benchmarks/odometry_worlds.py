@@ -55,9 +55,9 @@ def _render(file: Path, kind: str, seed: int) -> None:
     truth = {"poses": 10, "boxes": False, "relations": 0, "activities": 0}
     robot = SimulatedRobot(world=kind, seed=seed, duration=f"{SECONDS}s", truth=truth, **sensed)
     robot.setup()
-    static = dict(robot.static_outputs())
+    static: dict[str, Any] = dict(robot.static_outputs())
     color, depth = ImageDecoder(), DepthDecoder()
-    messages = [dict(m) for m in robot.stream()]
+    messages: list[dict[str, Any]] = [dict(m) for m in robot.stream()]
     color_info, depth_info = static["image_info"], static["depth_info"]
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
