@@ -1,5 +1,9 @@
 """Accuracy and time of RGB-D odometry on a 7-Scenes folder, beside two peers in the same process, one thread.
 
+    python benchmarks/visual_odometry.py                                    7-Scenes
+    python benchmarks/visual_odometry.py worlds                             twelve simulated worlds, movers on
+    python benchmarks/visual_odometry.py worlds office:811 corridor:812     others, kind and seed
+
 Peers: frame-to-frame ORB + RANSAC PnP (OpenCV), and depth-only generalised ICP to a local map (small_gicp).
 Decoding is excluded. The methods take turns frame by frame, so load on the machine falls on all alike.
 """
@@ -22,6 +26,7 @@ sys.path.insert(0, str(REPOSITORY))
 
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
+import odometry_worlds  # noqa: E402
 import small_gicp  # noqa: E402
 from evo.core import metrics  # noqa: E402
 from evo.core.trajectory import PosePath3D  # noqa: E402
@@ -137,6 +142,9 @@ def score(estimate: list[Matrix], truth: list[Matrix], delta: int) -> dict[str, 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["recorded", "worlds"], nargs="?", default="recorded")
+    parser.add_argument("worlds", nargs="*", default=[], help="KIND:SEED (default: twelve that nothing is tuned on)")
+    parser.add_argument("--cache", type=Path, default=Path("out") / "visual_odometry", help="folder of rendered drives")
     data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "rgbd_7scenes"
     parser.add_argument("--data", type=Path, default=data, help="a 7-Scenes folder (default: the project's data)")
     parser.add_argument("--stride", type=int, default=1, help="use every stride-th frame: faster motion")
@@ -145,6 +153,9 @@ def main() -> None:
     parser.add_argument("--json", action="store_true", help="print JSON instead of a table")
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
+    if arguments.what == "worlds":
+        odometry_worlds.table(arguments.worlds or list(odometry_worlds.WORLDS), arguments.cache)
+        return
 
     frames, truth = read(arguments.data)
     frames, truth = frames[:: arguments.stride], truth[:: arguments.stride]

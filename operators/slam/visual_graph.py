@@ -14,9 +14,11 @@ from operators.odometry.keyframe import Keyframe, view_distance
 from operators.odometry.local_map import typical_depth
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import Node
-from operators.slam.place_graph import PlaceGraph
+from operators.slam.local_bundle import adjust_newest
+from operators.slam.map_points import MapPoints
+from operators.slam.place_graph import WINDOW, PlaceGraph
 from operators.slam.place_index import PlaceIndex
-from operators.slam.sights import Added, PlaceSettings, Sighting
+from operators.slam.sights import Added, Eyes, PlaceSettings, Sighting
 from operators.slam.visual_view import Judge, Sight, View, sight
 
 DRIFT = np.diag([0.002**2] * 3 + [0.001**2] * 3)  # what odometry may be off besides: it errs more where things move
@@ -83,6 +85,7 @@ class VisualGraph(PlaceGraph[View]):
     def __init__(self, settings: GraphSettings) -> None:
         super().__init__(settings, _Looks, between)
         self._judge = settings.judge
+        self.points = MapPoints()
 
     def add(self, keyframe: Keyframe, fitter: Fitter, found_again: bool) -> Added:
         """Takes a keyframe of the odometry, and what fits its poses.
@@ -94,6 +97,19 @@ class VisualGraph(PlaceGraph[View]):
             CameraEyes(fitter, self._judge, typical_depth(keyframe.surface)),
             lambda: View.of(keyframe, fitter.camera),
         )  # fmt: skip
+
+    def _adjust(self, number: int, view: View, eyes: Eyes[View]) -> None:
+        """Adjusts the newest nodes and the points that they share with each other and with views around."""
+        assert isinstance(eyes, CameraEyes)
+        new = self.nodes[number]
+        here = self.tied if new.island in self.tied else {new.island}
+        around = [
+            k
+            for k, node in self.nodes.items()
+            if k != number and node.island in here and eyes.distance(node.T, new.T) < self._settings.reach
+        ]
+        self.points.see(number, view, self.nodes, around, eyes.fitter.camera)
+        adjust_newest(self.graph, self.points, eyes.fitter, WINDOW)
 
     def _confirmed(self, k: int, number: int, seen: Sighting) -> bool:
         """Leaves out surprises that rest on one plane, since two views of a repeated pattern say the same."""

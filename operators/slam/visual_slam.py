@@ -50,15 +50,17 @@ class VisualSlam(Operator):
     to odometry frame (REP 105). Keyframes that look alike, or that the map has near each other, are compared by
     features and depth; a loop is closed only where both agree, and where it is a surprise only when a second view says
     the same and neither rests on one plane, since the patterns of floors and walls repeat. A pose graph with a robust
-    kernel moves all keyframes accordingly. A place that was seen before keeps its old view, so the map grows with the
-    space that is seen.
+    kernel moves all keyframes accordingly; the newest, and the points that three or more have seen, are adjusted
+    together at every keyframe. A place that was seen before keeps its old view, so the map grows with the space that
+    is seen.
 
     With `map_file` the camera is looked for in a saved map, whose keyframes stay where they are; until it is found
     there is neither pose nor correction. Images as for `VisualOdometry`.
 
     Methods: pose graph of Grisetti et al., "A tutorial on graph-based SLAM", 2010, with the kernel of Yang et al.,
-    "Graduated non-convexity", 2020; places by McCann and Lowe, "Local naive Bayes nearest neighbor for image
-    classification", 2012; the whole as in Endres et al., "3-D mapping with an RGB-D camera", 2014.
+    "Graduated non-convexity", 2020; bundle adjustment of Triggs et al., "Bundle adjustment, a modern synthesis", 2000,
+    with depths; places by McCann and Lowe, "Local naive Bayes nearest neighbor for image classification", 2012; the
+    whole as in Endres et al., "3-D mapping with an RGB-D camera", 2014.
     """
 
     image: In[Image] = In(doc="colour or grey, of the same stamp")

@@ -19,6 +19,7 @@ from operators.odometry.frame import Frame
 from operators.odometry.keyframe import Keyframe
 from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
+from operators.odometry.noise import Noise
 from operators.odometry.recognition import Description, match
 from operators.odometry.relocalizer import rough_points
 from operators.odometry.surface import Surface
@@ -29,6 +30,9 @@ from operators.slam.place_index import rooted
 
 STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
 SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
+# Working pixels. Tracks that miss by more tell of colour and depth that are not of one place and time, and then every
+# sight errs anew: its variance grows with the fourth power of it.
+ASTRAY = 0.6
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
 FIRST = 8  # features that a first pose may rest on, by which others are looked for
 FOUND = 6.0  # working pixels around where a first pose has a feature, in which it is looked for
@@ -69,6 +73,17 @@ class View:
     @cached_property
     def rooted(self) -> NDArray[np.float32]:
         return rooted(self.descriptors, len(self.descriptors))
+
+    @cached_property
+    def steady(self) -> NDArray[np.bool_]:
+        """Tells which features (N,) lie on a smooth surface, not on an edge, where either depth may do."""
+        known = np.isfinite(self.points[:, 2])
+        h, w = self.surface.inverse_depth.shape
+        points = np.where(known[:, None], self.points, np.float32(1.0)).astype(np.float64)
+        u, v = np.rint(project(points, self.surface.K)).astype(np.int64).T
+        planes = self.surface.bordered_planes.reshape(h + 2, w + 2, 4)
+        smooth = planes[np.clip(v + 1, 0, h + 1), np.clip(u + 1, 0, w + 1), 3] != 0
+        return np.asarray(known & smooth, np.bool_)
 
     @cached_property
     def description(self) -> Description:
@@ -140,9 +155,14 @@ def sight(known: View, seen: View, fitter: Fitter, fewest: int, T_expected: Matr
         return None
     overlap = fit.compared / fit.offered if fit.offered else 0.0
     return Sight(
-        fit.T_world_camera, SURE * fit.covariance, matched, fit.inliers, relief(sighting.points_world), overlap,
-        fit.depth_inliers,
+        fit.T_world_camera, SURE * astray(fitter.noise) * fit.covariance, matched, fit.inliers,
+        relief(sighting.points_world), overlap, fit.depth_inliers,
     )  # fmt: skip
+
+
+def astray(noise: Noise) -> float:
+    """Returns how much larger the variance of a sight is where colour and depth are not of one place and time."""
+    return max(1.0, noise.pixel / ASTRAY) ** 4
 
 
 def _guided(

@@ -22,6 +22,9 @@ from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.camera import RgbdCamera
+from operators.odometry.fitting import Fit, Sighting
+from operators.odometry.movers import Movers
+from operators.odometry.noise import Noise
 from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
@@ -243,6 +246,24 @@ def test_a_pose_is_less_certain_than_the_keyframe_that_it_is_measured_against() 
             newest = keyframes[-1]
             carried = moved_covariance(newest.covariance, newest.T_world_camera, result.T_world_camera)
             assert np.linalg.eigvalsh(result.covariance - carried)[0] > 0
+
+
+def doubted(share: float, recognised: bool = False) -> Fit:
+    """A fit to ten features of which a share agrees."""
+    agree = round(10 * share)
+    sighting = Sighting(
+        np.eye(4), np.zeros((agree, 3)), np.zeros((agree, 2)), np.zeros(agree, np.int64), 10, recognised
+    )
+    still = Movers.none(K_DEPTH, (60, 80))
+    return Fit(np.eye(4), np.eye(6), np.eye(6), agree, 0, 0, 0, Noise(0.3, 1.0), still, sighting)
+
+
+def test_a_pose_that_most_tracks_contradict_is_less_certain() -> None:
+    certain = np.trace(doubted(1.0).covariance)
+    assert np.trace(doubted(0.6).covariance) == certain
+    assert np.trace(doubted(0.3).covariance) > 10 * certain
+    assert np.trace(doubted(0.2).covariance) > np.trace(doubted(0.3).covariance)
+    assert np.trace(doubted(0.3, recognised=True).covariance) == certain
 
 
 # -- failures ------------------------------------------------------------------------------------------------

@@ -1,0 +1,147 @@
+"""Bundle adjustment of RGB-D views: poses and points that best explain pixels, depths and the motions between views.
+
+Gauss-Newton, reweighted by Cauchy's function, on all views that are free and all points at once; points are eliminated
+by the Schur complement. Triggs et al., "Bundle adjustment, a modern synthesis", 2000; with depths as in Mur-Artal and
+Tardós, "ORB-SLAM2", 2017.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from operators.geometry.pinhole import Points
+from operators.odometry.camera import RgbdCamera
+from operators.slam import motions
+from operators.slam.pose_graph import DenseEdges, Edge
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+CAUCHY = 2.0  # residuals of this many sigmas count half
+NEAR = 0.1  # metres; nearer points are behind or in the lens
+_STILL = 1e-5  # metres and radians: a step less than this ends the iterations
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Says which view (S,) sees which point (S,), at what pixel (S, 2) of the colour camera and depth (S,) in the depth
+    camera, metres, NaN where unknown; and how noisy a pixel is and each depth (S,)."""
+
+    views: Indices
+    points: Indices
+    pixels: Array
+    depths: Array
+    sigma_pixel: float
+    sigma_depths: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Poses (W, 4, 4) and points (M, 3) in one frame, and the squared errors (S, 2) of pixels and of depths in sigmas,
+    0 for a depth that is unknown."""
+
+    poses: Array
+    points: Points
+    squared: Array
+
+
+def adjusted(
+    camera: RgbdCamera, poses: Array, points: Points, seen: Observations, edges: Sequence[Edge], fixed: int,
+    strength: float, iterations: int,
+) -> Bundle:  # fmt: skip
+    """Improves depth camera poses (W, 4, 4) after the first `fixed` ones, and points (M, 3).
+
+    `edges` are between these poses; `strength` is the share of the observations' information that is believed, whose
+    errors are not independent.
+    """
+    poses, points = poses.copy(), points.copy()
+    graph = DenseEdges(edges, fixed, len(poses))
+    solver = _Solver(camera, seen, len(poses), len(points), fixed, strength)
+    for _ in range(iterations):
+        poses[fixed:], points, step = solver.step(poses, points, graph)
+        if step < _STILL:
+            break
+    poses[fixed:] = motions.orthonormalised(poses[fixed:])
+    return Bundle(poses, points, solver.residuals(poses, points)[2])
+
+
+class _Solver:
+    """The observations sorted by point, and what of them stays the same from step to step."""
+
+    def __init__(
+        self, camera: RgbdCamera, seen: Observations, poses: int, points: int, fixed: int, strength: float
+    ) -> None:
+        self.camera, self.seen, self.fixed, self.strength = camera, seen, fixed, strength
+        self.count, self.size = poses - fixed, points
+        self.free = np.flatnonzero(seen.views >= fixed)
+        self.known = np.isfinite(seen.depths)
+        self.depths = np.where(self.known, seen.depths, 1.0)
+
+    def residuals(self, poses: Array, points: Points) -> tuple[Array, Array, Array, Array]:
+        """Returns points in the depth cameras (S, 3), residuals (S, 3) in sigmas, their squares (S, 2), R (S, 3, 3)."""
+        seen, K, T_color = self.seen, self.camera.K_color, self.camera.T_color_depth
+        inverse = motions.inverses(poses)
+        R = inverse[seen.views, :3, :3]
+        p = np.einsum("sij,sj->si", R, points[seen.points]) + inverse[seen.views, :3, 3]
+        c = p @ T_color[:3, :3].T + T_color[:3, 3]
+        z = np.maximum(c[:, 2], NEAR)
+        r = np.empty((len(p), 3))
+        r[:, 0] = (K[0, 0] * c[:, 0] / z + K[0, 2] - seen.pixels[:, 0]) / seen.sigma_pixel
+        r[:, 1] = (K[1, 1] * c[:, 1] / z + K[1, 2] - seen.pixels[:, 1]) / seen.sigma_pixel
+        r[:, 2] = np.where(self.known, (p[:, 2] - self.depths) / seen.sigma_depths, 0.0)
+        squared = np.column_stack([r[:, 0] ** 2 + r[:, 1] ** 2, r[:, 2] ** 2])
+        squared[c[:, 2] <= NEAR] = np.inf
+        return p, r, squared, R
+
+    def step(self, poses: Array, points: Points, graph: DenseEdges) -> tuple[Array, Points, float]:
+        """Returns the free poses and the points after a step, and the largest part of the poses' step."""
+        seen, fixed, count, size = self.seen, self.fixed, self.count, self.size
+        p, r, squared, R = self.residuals(poses, points)
+        w = self.strength / (1.0 + squared / CAUCHY**2)
+        J = self._derivatives(p)
+        root = np.sqrt(np.column_stack([w[:, 0], w[:, 0], np.where(self.known, w[:, 1], 0.0)]))
+        J *= root[:, :, None]
+        r = np.where(root > 0, r * root, 0.0)
+        Jl = J @ R
+        # d p / d x of the pose's right perturbation is [-I, [p]x]; of the point, R.
+        f = self.free
+        Jp = np.empty((len(f), 3, 6))
+        Jp[:, :, :3] = -J[f]
+        Jp[:, :, 3:] = np.cross(J[f], p[f][:, None, :])
+        V, c = np.zeros((size, 3, 3)), np.zeros((size, 3))
+        np.add.at(V, seen.points, Jl.transpose(0, 2, 1) @ Jl)
+        np.add.at(c, seen.points, np.einsum("sij,si->sj", Jl, r))
+        V[:, np.arange(3), np.arange(3)] += 1e-6
+        V_inverse = np.linalg.inv(V)
+        own = seen.views[f] - fixed
+        H, b = np.zeros((count, 6, 6)), np.zeros((count, 6))
+        np.add.at(H, own, Jp.transpose(0, 2, 1) @ Jp)
+        np.add.at(b, own, np.einsum("sij,si->sj", Jp, r[f]))
+        E = np.zeros((count, 6, size, 3))
+        E[own, :, seen.points[f]] = Jp.transpose(0, 2, 1) @ Jl[f]
+        A = E.reshape(6 * count, 3 * size)
+        B = np.einsum("camj,mjk->camk", E, V_inverse).reshape(6 * count, 3 * size)
+        S, g = graph.normal(poses)
+        S = S - B @ A.T
+        for i in range(count):
+            S[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] += H[i]
+        x = -np.linalg.solve(S, g + b.ravel() - B @ c.ravel())
+        moved = np.einsum("mij,mj->mi", V_inverse, -c - (x @ A).reshape(size, 3))
+        return poses[fixed:] @ motions.exps(x.reshape(count, 6)), points + moved, float(np.abs(x).max(initial=0.0))
+
+    def _derivatives(self, p: Array) -> Array:
+        """Returns d residuals / d p (S, 3, 3), of points in the depth cameras."""
+        K, T = self.camera.K_color, self.camera.T_color_depth
+        c = p @ T[:3, :3].T + T[:3, 3]
+        z = np.maximum(c[:, 2], NEAR)
+        D = np.zeros((len(p), 3, 3))
+        D[:, 0, 0], D[:, 0, 2] = K[0, 0] / z, -K[0, 0] * c[:, 0] / z**2
+        D[:, 1, 1], D[:, 1, 2] = K[1, 1] / z, -K[1, 1] * c[:, 1] / z**2
+        D[:, :2] /= self.seen.sigma_pixel
+        D[:, :2] = D[:, :2] @ T[:3, :3]
+        D[:, 2, 2] = 1.0 / self.seen.sigma_depths
+        return D
