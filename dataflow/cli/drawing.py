@@ -172,7 +172,7 @@ def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
 def drawn_as_json(sink: ViewerSink, file: Path) -> dict[str, Any]:
     """Returns JSON values that say how much a viewer file holds."""
     counts = sink.statistics()
-    return {"files": [str(file)], "messages": counts.drawn, "passed_over": counts.passed, "not_drawn": counts.failed}
+    return {"files": [str(file)], "messages": counts.drawn, "not_drawn": counts.failed}
 
 
 def until_interrupted() -> None:
