@@ -95,6 +95,16 @@ End = Annotated[
         help="End so long after the recording's first message: seconds, or 500ms, 2min.",
     ),
 ]
+Every = Annotated[
+    float | None,
+    typer.Option(
+        "--every",
+        metavar="TIME",
+        parser=offset,
+        help="Of a viewer file: draw one image, overlay and cloud of each stream in so much event time; 0: every one. "
+        "Default: what the graph says (`view: every`), else 200ms.",
+    ),
+]
 Without = Annotated[
     list[str] | None, typer.Option("--without", metavar="STREAM", help="Leave these streams out. May be repeated.")
 ]

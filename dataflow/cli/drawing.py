@@ -32,6 +32,7 @@ def draw_recording(
     start: float | None,
     end: float | None,
     clock: Choice,
+    every: float | None = None,
 ) -> tuple[ViewerSink, bool]:
     """Draws a recording or a bag; returns the viewer, closed, and whether it took everything."""
     from rich.progress import BarColumn, Progress, TextColumn
@@ -56,7 +57,7 @@ def draw_recording(
         begin, finish = window(whole, start, end, path)
         first, last = whole or (0, 0)
         first, last = begin or first, last if finish is None else min(finish, last)
-        with open_sink(target) as sink:
+        with open_sink(target, every) as sink:
             with Progress(
                 TextColumn("drawing"), BarColumn(bar_width=24), TextColumn("{task.fields[note]}"), console=err,
                 transient=True, disable=not err.is_terminal,
@@ -113,10 +114,17 @@ def showing(graph: Graph, wanted: list[str] | None) -> Graph:
     return replace(graph, view=replace(graph.view, hide=tuple(s for s in graph.view.hide if s not in wanted)))
 
 
-def open_sink(target: Target) -> ViewerSink:
-    from dataflow.view import ViewerSink
+def open_sink(target: Target, every: float | None = None) -> ViewerSink:
+    """The viewer. `every`: seconds of event time in which one image of each stream is drawn into a file."""
+    from dataflow.view import Save, ViewerSink
+    from dataflow.view.sink import FILE_OPTIONS
 
-    return ViewerSink(target, report=lambda line: say(f"[yellow]{escape(line)}[/]"))
+    if every is not None and not isinstance(target, Save):
+        raise fail("--every is about a viewer file (--to FILE.rrd); elsewhere every message is drawn")
+    if every is not None and not every >= 0:
+        raise fail(f"--every {every:g}: expected a duration of 0 or more")
+    options = None if every is None else replace(FILE_OPTIONS, image_step=round(every * 1e9))
+    return ViewerSink(target, options=options, report=lambda line: say(f"[yellow]{escape(line)}[/]"))
 
 
 class Announcer:
@@ -148,6 +156,8 @@ def report(sink: ViewerSink, complete: bool, file: Path | None = None) -> None:
     parts = [plural(drawn.drawn, "message")]
     if drawn.dropped:
         parts.append(f"{drawn.dropped:,} skipped because the viewer was too slow")
+    if drawn.passed:
+        parts.append(f"{drawn.passed:,} passed over")
     if drawn.failed:
         parts.append(f"{drawn.failed:,} could not be drawn")
     if isinstance(sink.target, Save):

@@ -15,6 +15,7 @@ from rich.markup import escape
 from dataflow.cli.arguments import (
     Clock,
     End,
+    Every,
     Overwrite,
     Start,
     Without,
@@ -65,6 +66,7 @@ def view(
     clock: Clock = "auto",
     graph: GraphName = None,
     wait: Wait = 0.0,
+    every: Every = None,
     overwrite: Overwrite = False,
     modules: Annotated[
         list[str] | None,
@@ -80,6 +82,7 @@ def view(
 
       dataflow view run.mcap
       dataflow view run.mcap --to run.rrd --start 5 --end 10
+      dataflow view run.mcap --to run.rrd --every 0
       dataflow view run.mcap --to serve --stream "camera/*"
       dataflow view drive.bag --to drive.rrd
       dataflow view --graph rgbd_perception --to serve
@@ -90,11 +93,11 @@ def view(
             if graph is not None or wait:
                 raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
             target = _target(to, overwrite)
-            report(*draw_recording(existing_recording(recording), target, streams, without, start, end, clock))
+            report(*draw_recording(existing_recording(recording), target, streams, without, start, end, clock, every))
         else:
             if start is not None or end is not None:
                 raise fail("--start and --end are about a recording; name one")
-            _view_running(_target(to, overwrite), streams, graph, wait, until_end=until_end)
+            _view_running(_target(to, overwrite), streams, graph, wait, every, until_end=until_end)
 
 
 def _import(modules: Iterable[str]) -> None:
@@ -126,7 +129,9 @@ def require_display() -> None:
         )
 
 
-def _view_running(target: Target, streams: list[str] | None, name: str | None, wait: float, *, until_end: bool) -> None:
+def _view_running(
+    target: Target, streams: list[str] | None, name: str | None, wait: float, every: float | None, *, until_end: bool
+) -> None:
     from dataflow.client.attach import graph_of, tap
     from dataflow.graph.sections import PLACE_FRAMES
 
@@ -139,7 +144,7 @@ def _view_running(target: Target, streams: list[str] | None, name: str | None, w
     others = [name for name in others if name not in chosen]
     with tap(found, [f"/{name}" for name in (*chosen, *others)] if streams else ["**"]) as client:
         say(f"following {escape(running.name)} (process {found.pid})")
-        _draw_running(target, client, found, running, chosen, others, logs=not streams, until_end=until_end)
+        _draw_running(target, client, found, running, chosen, others, every, logs=not streams, until_end=until_end)
 
 
 def _draw_running(
@@ -149,6 +154,7 @@ def _draw_running(
     running: Graph,
     chosen: list[str],
     others: list[str],
+    every: float | None,
     *,
     logs: bool,
     until_end: bool,
@@ -164,7 +170,7 @@ def _draw_running(
     from dataflow.view import Serve, as_alarm
 
     log_stream = logs_key(running.namespace)
-    with open_sink(target) as sink, closing(LogFollower(found.pid)) as follower:
+    with open_sink(target, every) as sink, closing(LogFollower(found.pid)) as follower:
         types = _types(running, [*chosen, *others], log_stream if logs else None)
         sink.open(types, showing(running, None if logs else chosen), hidden=others)
         Announcer(sink).announce()

@@ -14,7 +14,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
-from dataflow.graph.sections import Network, Record, View, record_from_json, record_to_json, view_from_json
+from dataflow.graph.sections import (
+    Network,
+    Record,
+    View,
+    record_from_json,
+    record_to_json,
+    view_from_json,
+    view_to_json,
+)
 from dataflow.messages.base import Message, MessageError, import_type, message_type
 from dataflow.messages.declaration import Declaration
 
@@ -226,7 +234,7 @@ class Graph:
             "types": [declaration.to_json() for declaration in self.types.values()],
             "left_out": dict(self.left_out),
             "record": record_to_json(self.record),
-            "view": asdict(self.view),
+            "view": view_to_json(self.view),
             "network": asdict(self.network),
             "bundle": asdict(self.sources_bundle),
         }

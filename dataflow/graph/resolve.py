@@ -246,7 +246,7 @@ class Resolver:
         return Record(tuple(sorted(kept)), thin=len(kept) < len(everything), snapshots=snapshots, flight=flight)
 
     def view(self, tree: Tree | None) -> View:
-        table = self.fields.table(tree, "view", ("hide", "panels", "layout", "keep"))
+        table = self.fields.table(tree, "view", ("hide", "panels", "layout", "keep", "every"))
         if table is None:
             return View()
         panels = []
@@ -257,7 +257,7 @@ class Resolver:
         if layout and not layout.endswith(".rbl"):
             self.fields.wrong(table.get("layout"), "layout", "a file of the viewer's, NAME.rbl")  # type: ignore[arg-type]
         hidden, kept = (self.topics(table.get(what), what) for what in ("hide", "keep"))
-        return View(hidden, tuple(panels), layout, kept)
+        return View(hidden, tuple(panels), layout, kept, self.fields.duration(table.get("every"), "every"))
 
     def topics(self, tree: Tree | None, what: str) -> tuple[str, ...]:
         """The streams that a list of key expressions matches; each must match one at least."""

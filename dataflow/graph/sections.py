@@ -62,13 +62,15 @@ PLACE_FRAMES = ("Transforms", "Odometry", "Pose")
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """Choices for the viewer: streams left out, panels (none: all), a layout saved from it (empty: derived), and
-    clouds whose points stay where they were seen."""
+    """Choices for the viewer: streams left out, panels (none: all), a layout saved from it (empty: derived), clouds
+    whose points stay where they were seen, and the event time (ns) between two images of a stream in a viewer file
+    (None: the viewer's own choice)."""
 
     hide: tuple[str, ...] = ()
     panels: tuple[str, ...] = ()
     layout: str = ""
     keep: tuple[str, ...] = ()
+    every: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,6 +105,12 @@ def record_from_json(data: Mapping[str, Any]) -> Record:
     return Record(**{**data, "streams": tuple(data["streams"]), "flight": flight})
 
 
+def view_to_json(view: View) -> dict[str, Any]:
+    """Leaves out `every` where the graph does not say it, so that recorded graphs stay as they were."""
+    return {name: value for name, value in asdict(view).items() if name != "every" or value is not None}
+
+
 def view_from_json(data: Mapping[str, Any]) -> View:
     """Sections that older recordings lack are as they were: every panel, no saved layout, no points that stay."""
-    return View(tuple(data["hide"]), tuple(data.get("panels", ())), data.get("layout", ""), tuple(data.get("keep", ())))
+    hide, panels, keep = (tuple(data.get(name, ())) for name in ("hide", "panels", "keep"))
+    return View(hide, panels, data.get("layout", ""), keep, data.get("every"))

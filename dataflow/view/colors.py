@@ -55,10 +55,11 @@ def of_identities(numbers: Sequence[int]) -> Colors:
     return np.array([of_identity(number) for number in numbers], np.uint8).reshape(-1, 3)
 
 
-def of_values(values: npt.ArrayLike, low: float | None = None, high: float | None = None) -> Colors:
+def of_values(values: npt.ArrayLike, low: float | None = None, high: float | None = None, shades: int = 0) -> Colors:
     """Colours (N, 3) of N numbers from dark blue (low) over green to red (high), after Google's Turbo.
 
-    The limits default to the 2nd and 98th percentile; NaN is neutral grey.
+    The limits default to the 2nd and 98th percentile; NaN is neutral grey. `shades`: how many colours there are, 2 or
+    more; 0: as many as there are values.
     """
     v = np.asarray(values, np.float64).reshape(-1)
     known = np.isfinite(v)
@@ -68,6 +69,8 @@ def of_values(values: npt.ArrayLike, low: float | None = None, high: float | Non
         lower = float(np.percentile(v[known], 2)) if low is None else low
         upper = float(np.percentile(v[known], 98)) if high is None else high
         t = np.clip((v[known] - lower) / max(upper - lower, 1e-9), 0.0, 1.0)
+        if shades:
+            t = np.rint(t * (shades - 1)) / (shades - 1)
         stops, ramp = np.linspace(0, 1, len(_TURBO)), np.array(_TURBO, np.float64)
         colors[known] = np.stack([np.interp(t, stops, ramp[:, c]) for c in range(3)], axis=-1).round()
     return colors

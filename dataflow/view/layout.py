@@ -20,15 +20,20 @@ from dataflow.messages import (
     Mesh,
     Message,
     Planes,
+    PointCloud,
     RelativeDepth,
     SceneGraph,
     SegmentationMap,
     Tracks,
 )
+from dataflow.view.pacing import Pace
 
 COLOR: tuple[type[Message], ...] = (Image, CompressedImage)
 DEPTH: tuple[type[Message], ...] = (DepthImage, CompressedDepth, RelativeDepth)
 OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
+
+HEAVY: tuple[type[Message], ...] = (*COLOR, *DEPTH, *OVERLAYS, PointCloud)
+"""Types that make up nearly all of a file: images, what is drawn over them, and clouds."""
 
 _TRUTH = {"true", "truth", "groundtruth", "gt"}
 
@@ -69,6 +74,10 @@ class Layout:
     def of_type(self, *types: type[Message]) -> tuple[str, ...]:
         """The streams of some types, sorted."""
         return tuple(name for name, type_ in self.streams.items() if issubclass(type_, types))
+
+    def pace(self, step: int) -> Pace:
+        """The choice of what is drawn in a step of event time (ns). What stays, or never changes, is drawn whole."""
+        return Pace(step, frozenset(self.of_type(*HEAVY)) - self.static - self.kept)
 
 
 def layout(

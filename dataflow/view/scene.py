@@ -41,11 +41,14 @@ class ViewOptions:
       fit); None: as float32. `depth_block`: side (pixels) of the squares that have one depth each; 1: every pixel.
     - `max_points`: a cloud of more points is thinned evenly to at most this many; the viewer's log says so once.
     - `point_step`: positions of a cloud's points are rounded to this, metres, which packs better; 0: not at all.
+    - `point_shades`: colours that the values of a cloud's points are told apart by, which packs better; 0: all.
     - `kept_step`: side (m) of the cells in which points that stay are kept, one each; `kept_after`: clouds that must
       have had a point in a cell, so that what moves leaves none.
     - `trail`: trails get a vertex every so many metres at least.
     - `pose_step`: event time (ns) from which a pose of a stream is drawn again; its frames are placed, and its curves
       go on, with every message.
+    - `image_step`: event time (ns) in which one message of a stream of images, of what is drawn over them, or of clouds
+      is drawn, the first; and the stream's last. 0: every message.
     - `track_history`: event time (ns) for which the paths of tracks are drawn.
     """
 
@@ -54,10 +57,12 @@ class ViewOptions:
     depth_block: int = 1
     max_points: int = 200_000
     point_step: float = 0.0
+    point_shades: int = 0
     kept_step: float = 0.05
     kept_after: int = 4
     trail: float = 0.01
     pose_step: int = 0
+    image_step: int = 0
     track_history: int = 5_000_000_000
 
     def __post_init__(self) -> None:
@@ -71,6 +76,10 @@ class ViewOptions:
             raise ValueError(f"point_step must be 0 m or more, got {self.point_step}")
         if not self.kept_step > 0:
             raise ValueError(f"kept_step must be more than 0 m, got {self.kept_step}")
+        if self.image_step < 0:
+            raise ValueError(f"image_step must be 0 ns or more, got {self.image_step}")
+        if self.point_shades < 0 or self.point_shades == 1:
+            raise ValueError(f"point_shades must be at least 2, or 0 for all, got {self.point_shades}")
         if self.max_points < 1:
             raise ValueError(f"max_points must be at least 1, got {self.max_points}")
 

@@ -14,7 +14,7 @@ import traceback
 import uuid
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Self
 from urllib.parse import urlsplit
@@ -28,6 +28,7 @@ from dataflow.view.backlog import Backlog, Bounds
 from dataflow.view.blueprint import blueprint_of
 from dataflow.view.drawing import visualize
 from dataflow.view.layout import layout
+from dataflow.view.pacing import Pace
 from dataflow.view.process import LOOPBACK, ViewerError
 from dataflow.view.scene import SCENE, VIEWER_LOG, SceneState, ViewOptions, entity_of
 from dataflow.view.scores import SCORES, Summaries, document, scores_of
@@ -38,7 +39,14 @@ SETTLE = 1_000_000_000
 """Event time (ns) after which the viewer decides where to look from."""
 
 FILE_OPTIONS = ViewOptions(
-    jpeg_quality=75, depth_step=0.04, depth_block=2, max_points=2_000, point_step=2.0**-6, pose_step=45_000_000
+    jpeg_quality=75,
+    depth_step=0.04,
+    depth_block=2,
+    max_points=2_000,
+    point_step=2.0**-6,
+    point_shades=16,
+    pose_step=45_000_000,
+    image_step=200_000_000,
 )
 """Contents of a file unless more is asked for: for looking, not for measuring."""
 
@@ -48,11 +56,12 @@ _FILE_BATCHES = rr.ChunkBatcherConfig(flush_tick=10.0, flush_num_bytes=8 << 20)
 
 @dataclass(frozen=True, slots=True)
 class SinkStatistics:
-    """Counts of messages: drawn, dropped because the viewer was too slow, failed to draw."""
+    """Counts of messages: drawn, dropped because the viewer was too slow, failed to draw, left out by `image_step`."""
 
     drawn: int
     dropped: int
     failed: int
+    passed: int = 0
 
 
 class ViewerSink:
@@ -71,13 +80,14 @@ class ViewerSink:
         application: str = "dataflow",
     ) -> None:
         self.target = target
-        self._options = options or (FILE_OPTIONS if isinstance(target, Save) else ViewOptions())
+        self._options = options
         self._report = report or logging.getLogger(__name__).warning
         self._application = application
         self._recording: rr.RecordingStream | None = None
         self._scene = SceneState()
         self._thread: threading.Thread | None = None
         self._server: subprocess.Popen[bytes] | None = None
+        self._pace = Pace()
         self._backlog = Backlog(bounds or Bounds())
         self._counts: Counter[str] = Counter()
         self._reported: set[tuple[str, str]] = set()
@@ -104,7 +114,9 @@ class ViewerSink:
         if self._recording is not None:
             raise ViewerError("this sink is open already")
         self._graph = graph
-        self._scene = SceneState(layout(streams, graph, static, hidden), self._options)
+        options = self._options or _options(self.target, graph)
+        self._scene = SceneState(layout(streams, graph, static, hidden), options)
+        self._pace = self._scene.layout.pace(options.image_step)
         name = graph.name if graph is not None else self._application
         batches = _FILE_BATCHES if isinstance(self.target, Save) else None
         recording = rr.RecordingStream(name, recording_id=uuid.uuid4(), batcher_config=batches)
@@ -149,7 +161,7 @@ class ViewerSink:
 
     def statistics(self) -> SinkStatistics:
         """Returns what became of the messages so far."""
-        return SinkStatistics(self._counts["drawn"], self._counts["dropped"], self._counts["failed"])
+        return SinkStatistics(*(self._counts[what] for what in ("drawn", "dropped", "failed", "passed")))
 
     def backlog(self) -> int:
         """Tells how many messages wait to be drawn."""
@@ -211,10 +223,16 @@ class ViewerSink:
         assert recording is not None
         while (entry := self._backlog.take()) is not None:
             if isinstance(entry, tuple):
-                self._draw(recording, *entry)
+                if self._pace.takes(*entry):
+                    self._draw(recording, *entry)
+                else:
+                    self._counts["passed"] += 1
             else:
                 self._scores = entry
                 self._guarded("", lambda: self._score(recording))
+        for stream, message in self._pace.rest():
+            self._draw(recording, stream, message)
+            self._counts["passed"] -= 1
         self._guarded("", lambda: self._settle(recording))
         if isinstance(self.target, Save):
             self._guarded("", lambda: self._look_again(recording))
@@ -297,6 +315,14 @@ class ViewerSink:
         if (stream, cause) not in self._reported:
             self._reported.add((stream, cause))
             self._report(text)
+
+
+def _options(target: Target, graph: Graph | None) -> ViewOptions:
+    """What a file holds, by the graph's wish too; anything else shows all."""
+    if not isinstance(target, Save):
+        return ViewOptions()
+    every = graph.view.every if graph is not None else None
+    return FILE_OPTIONS if every is None else replace(FILE_OPTIONS, image_step=every)
 
 
 _abandoned: list[rr.RecordingStream] = []

@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
 
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
@@ -28,13 +29,19 @@ Picture = npt.NDArray[np.uint8]
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent.parent
 DATA = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data")
-SIZE = (1600, 1000)
+SIZE = (1200, 750)
+DRAWN = (1600, 1000)  # the window that is made smaller
+BYTES = 150_000
+"""The largest picture: one that is larger is given fewer colours."""
 
 VIEWS: dict[str, tuple[str, ...]] = {
     "dead_reckoning": ("run", "graphs/dead_reckoning.yaml"),
     "depth": ("run", "graphs/depth.yaml"),
-    "fusion": ("run", "graphs/fusion.yaml"),
+    "fusion": ("run", "graphs/fusion.yaml", "--set", "duration=30s"),
+    "landmarks": ("run", "graphs/landmarks.yaml", "--set", "duration=30s"),
     "lidar": ("run", "graphs/simulated_lidar.yaml"),
+    "localize": ("run", "graphs/localize.yaml", "--set", "duration=18s"),
+    "mapping": ("run", "graphs/mapping.yaml", "--set", "duration=20s"),
     "mono": ("run", "graphs/mono.yaml"),
     "mono_depth": (
         "run",
@@ -42,13 +49,30 @@ VIEWS: dict[str, tuple[str, ...]] = {
         "--set",
         f"model={DATA / 'models' / 'tcmonodepth_small_192x320.onnx'}",
     ),
+    "orientation": ("run", "graphs/orientation.yaml", "--set", "duration=12s"),
+    "places": ("run", "graphs/places.yaml", "--set", "duration=16s"),
+    "preprocessing": ("run", "graphs/preprocessing.yaml", "--set", "duration=6s"),
+    "redundant": ("run", "graphs/redundant.yaml", "--set", "duration=18s"),
+    "registration": ("run", "graphs/registration.yaml", "--set", "duration=12s"),
     "slam": ("run", "graphs/slam.yaml", "--set", "duration=26s"),
     "slam_lidar": ("run", "graphs/slam_lidar.yaml", "--set", "duration=26s"),
     "stereo": ("run", "graphs/simulated_stereo.yaml"),
 }
 """The arguments of `dataflow` by the picture's name."""
 
-LATER = {"fusion": 39, "slam": 22, "slam_lidar": 22}
+LATER = {
+    "fusion": 29,
+    "landmarks": 29,
+    "localize": 17,
+    "mapping": 19,
+    "orientation": 11,
+    "places": 15,
+    "preprocessing": 5,
+    "redundant": 17,
+    "registration": 11,
+    "slam": 25,
+    "slam_lidar": 25,
+}
 """Seconds after the start of which a picture is, where there is little to be seen at first."""
 
 GROWN = "demo"
@@ -66,7 +90,7 @@ def rendered(shown: Path) -> Picture:
     programs, large = Path(sys.executable).parent, shown.with_suffix(".png")
     subprocess.run(
         ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(programs / "rerun"), "--screenshot-to", str(large),
-         "--window-size", f"{SIZE[0]}x{SIZE[1]}", "--bind", "127.0.0.1", "--new", str(shown)],
+         "--window-size", f"{DRAWN[0]}x{DRAWN[1]}", "--bind", "127.0.0.1", "--new", str(shown)],
         check=True, capture_output=True, timeout=180,
     )  # fmt: skip
     pixels = cv2.imread(str(large))
@@ -104,24 +128,27 @@ def grown(folder: Path) -> Path:
 
 
 def written(pixels: Picture, name: str) -> Path:
-    file = HERE / name
-    cv2.imwrite(str(file), pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9])
+    """Writes a picture beside this file with as many colours as it may have."""
+    file, picture = HERE / name, Image.fromarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB))
+    for colors in (256, 192, 128, 96, 64):
+        few = picture.quantize(colors, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+        few.save(file, optimize=True)
+        if file.stat().st_size <= BYTES:
+            break
     return file
 
 
 def picture(name: str, folder: Path) -> Path:
     """Runs a graph, renders what the viewer shows of it, and writes NAME.png beside this file."""
     shown = folder / f"{name}.rrd"
-    command = [sys.executable, "-m", "dataflow.cli.main"]
+    command = [sys.executable, "-m", "dataflow.cli.main", *VIEWS[name], "--quiet"]
     if name in LATER:
         recorded = folder / f"{name}.mcap"
-        run = [*command, *VIEWS[name], "--record", str(recorded), "--quiet"]
-        subprocess.run(run, cwd=REPOSITORY, check=True)
-        show = [*command, "view", str(recorded), "--to", str(shown), "--start", str(LATER[name])]
-        subprocess.run(show, cwd=REPOSITORY, check=True)
+        subprocess.run([*command, "--record", str(recorded)], cwd=REPOSITORY, check=True)
+        at(LATER[name], REPOSITORY / VIEWS[name][1], recorded, shown)
         recorded.unlink()
     else:
-        subprocess.run([*command, *VIEWS[name], "--view", str(shown), "--quiet"], cwd=REPOSITORY, check=True)
+        subprocess.run([*command, "--view", str(shown)], cwd=REPOSITORY, check=True)
     return written(rendered(shown), f"{name}.png")
 
 

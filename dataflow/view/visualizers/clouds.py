@@ -28,19 +28,18 @@ def point_cloud(canvas: Canvas, message: PointCloud) -> None:
         _kept(canvas, message)
         return
     kept = thin(canvas, np.flatnonzero(np.isfinite(message.points).all(axis=1)))
-    points, paint = message.points[kept], _paint(message, kept)
+    points, paint = message.points[kept], _paint(canvas, message, kept)
     step = np.float32(canvas.scene.options.point_step)
     drawn = np.round(points / step) * step if step else points
     canvas.draw("space", message.frame, rr.Points3D(drawn, colors=paint, radii=rr.Radius.ui_points(1.5)))
     canvas.scene.viewpoint.saw_points(canvas.scene.tree.pose(message.frame), points[::16])
 
 
-def _paint(message: PointCloud, chosen: npt.NDArray[np.int64]) -> colors.Colors:
+def _paint(canvas: Canvas, message: PointCloud, chosen: npt.NDArray[np.int64]) -> colors.Colors:
     if message.colors is not None:
         return message.colors[chosen]
-    if message.intensities is not None:
-        return colors.of_values(message.intensities[chosen])
-    return colors.of_values(message.points[chosen, 2])
+    values = message.points[chosen, 2] if message.intensities is None else message.intensities[chosen]
+    return colors.of_values(values, shades=canvas.scene.options.point_shades)
 
 
 def _kept(canvas: Canvas, message: PointCloud) -> None:
@@ -52,7 +51,7 @@ def _kept(canvas: Canvas, message: PointCloud) -> None:
     chosen = chosen[:: -(-len(chosen) // _KEPT_AT_ONCE) or 1]
     points = message.points[chosen].astype(np.float64)
     scene.viewpoint.saw_points(scene.tree.pose(message.frame), points[::16])
-    paint = _paint(message, chosen)
+    paint = _paint(canvas, message, chosen)
     for stamp, placed, painted in there.add(canvas.stamp, message.frame, points, paint, scene.tree.pose_at):
         drawn = np.round(placed * 128) / 128  # 8 mm: packs better
         scene.viewpoint.kept_points(placed)
