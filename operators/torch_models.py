@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image
 from operators.inference import ModelError
+from operators.network_input import three_channels
 
 if TYPE_CHECKING:
     import torch
@@ -99,7 +100,7 @@ class Runner:
             except torch.cuda.OutOfMemoryError:
                 if not self.spilled:
                     _LOG.warning("the memory of %s does not suffice: images are worked on by the CPU", self.device)
-                self.spilled += 1
+                self.spilled += tensor.shape[0] if tensor.ndim == 4 else 1
                 torch.cuda.empty_cache()
             try:
                 return call(self.model.to("cpu"), tensor)
@@ -111,12 +112,15 @@ class Runner:
         return {"images_on_cpu_for_lack_of_memory": self.spilled} if self.spilled else {}
 
 
-def tensor_of(image: Image) -> Tensor:
-    """Returns (3, H, W) float32 in [0, 1] of an image; grey is repeated in the three channels."""
+def batch_of(images: Sequence[Image]) -> Tensor:
+    """Returns (N, 3, H, W) float32 in [0, 1] of N images of one size; grey is repeated in the three channels."""
     import torch
 
-    pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
-    return torch.from_numpy(np.ascontiguousarray(pixels.transpose(2, 0, 1))).float() / 255
+    return torch.stack([torch.from_numpy(np.ascontiguousarray(_channels_first(i))) for i in images]).float() / 255
+
+
+def _channels_first(image: Image) -> NDArray[np.uint8]:
+    return three_channels(image.data).transpose(2, 0, 1)
 
 
 def wanted_classes(names: Sequence[str], asked: Sequence[str], where: str) -> NDArray[np.bool_]:

@@ -14,6 +14,11 @@ import pytest
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
 hypothesis.settings.load_profile("repeatable")
 
+for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"):
+    # As in the processes of a run, and before a library reads it: the threads of two workers on two cores wait for each
+    # other in busy loops, for as long again as the work takes.
+    os.environ.setdefault(name, "1")
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 sys.path += [str(REPOSITORY / "tests" / "support"), str(REPOSITORY / "tools")]
 

@@ -58,6 +58,9 @@ Clock = Annotated[
         help="Of a bag: stamp messages with the time in their headers, or with the time of their recording.",
     ),
 ]
+OutInstead = Annotated[
+    Path | None, typer.Option("--out", "-o", metavar="PATH", help="Instead of the argument: what to write.")
+]
 RecordingFile = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (.mcap).")]
 
 
@@ -183,8 +186,8 @@ def chosen_streams(
 ) -> list[str]:
     """The streams that `words` mean, but those of `without`.
 
-    They are full names, names without the namespace, or patterns with wildcards; None or no words: all. A word that
-    matches nothing is an error that names the nearest stream.
+    They are full names, names without the namespace, patterns with wildcards, or the last parts of names; None or no
+    words: all. A word that matches nothing is an error that names the nearest stream.
     """
     known = list(names)
     left_out = set(_meant(without, known, namespace)) if without else set()
@@ -195,7 +198,7 @@ def chosen_streams(
 
 
 def _meant(words: Sequence[str], known: Sequence[str], namespace: str) -> list[str]:
-    from dataflow.graph.keys import as_expression, canonical, key_fault, matching
+    from dataflow.graph.keys import as_expression, canonical, has_wildcard, key_fault, matching
     from dataflow.graph.problems import did_you_mean
 
     keys = {name.strip("/"): name for name in known}  # foreign recordings name streams "/tf"
@@ -207,6 +210,8 @@ def _meant(words: Sequence[str], known: Sequence[str], namespace: str) -> list[s
             raise fail(f"stream {word!r}: {fault}")
         expressions = [bare] if word.startswith("/") or not namespace else [f"{namespace}/{bare}", bare]
         matches = [keys[key] for expression in expressions for key in matching(canonical(expression), keys)]
+        if not matches and not has_wildcard(bare) and not word.startswith("/"):
+            matches = [keys[key] for key in matching(f"**/{bare}", keys)]
         if not matches:
             shown = [name.removeprefix(f"{namespace}/") if namespace else name for name in known]
             raise fail(f"no stream {word!r}: " + did_you_mean(word, shown, "there are"))
@@ -229,6 +234,13 @@ def span(recording: PlayableStreams, streams: Iterable[str]) -> tuple[int, int] 
     part = cut_of(recording.metadata)
     start, end = (None, None) if part is None else (part.start, part.end)
     return min(firsts) if start is None else start, max(lasts) if end is None else min(max(lasts), end)
+
+
+def named_once(metavar: str, argument: Path | None, option: Path | None) -> Path | None:
+    """Returns the path to write, which may be named by an argument or by --out, and not by both."""
+    if argument is not None and option is not None:
+        raise fail(f"--out {option} and {metavar} {argument} both name what to write: name one of them")
+    return argument if option is None else option
 
 
 def check_offset(option: str, value: float | None) -> None:

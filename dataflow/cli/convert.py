@@ -18,11 +18,13 @@ from dataflow.cli.arguments import (
     Clock,
     End,
     Json,
+    OutInstead,
     Overwrite,
     Start,
     Without,
     chosen_streams,
     existing_recording,
+    named_once,
     output_file,
 )
 from dataflow.cli.output import count, err, fail, friendly_errors, out, plural, print_json, say, table
@@ -54,8 +56,11 @@ _MCAP = ("mcap", "foxglove", "ros2")
 
 def convert(
     recording: AnyRecording,
-    output: Annotated[Path, typer.Argument(metavar="OUTPUT", help="The file or folder to write.")],
     to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="The format; the examples name all of them.")],
+    output: Annotated[
+        Path | None, typer.Argument(metavar="OUTPUT", help="The file or folder to write; or name it with --out.")
+    ] = None,
+    out_option: OutInstead = None,
     streams: Annotated[
         list[str] | None,
         typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
@@ -105,6 +110,9 @@ def convert(
     """
     with friendly_errors():
         existing_recording(recording)
+        output = named_once("OUTPUT", output, out_option)
+        if output is None:
+            raise fail("nothing says where to write: name a file or folder behind the recording, or with --out")
         _check_output(output, to, overwrite)
         if to == "rrd":
             from dataflow.cli.drawing import draw_recording, drawn_as_json, report

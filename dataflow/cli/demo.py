@@ -26,6 +26,8 @@ def demo(
         str | None,
         typer.Option(
             "--to",
+            "--out",
+            "-o",
             metavar="TARGET",
             help="spawn: a viewer window; serve: a page for a browser; FILE.rrd: a file. Default: a window, or a file "
             "where there is no display.",

@@ -11,6 +11,7 @@ from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, Json, Overwrite, Without, chosen_streams, output_file
 from dataflow.cli.material import (
+    Compression,
     Material,
     Out,
     Quiet,
@@ -38,6 +39,7 @@ def cut(
         bool,
         typer.Option("--bare", metavar=FLAG, help="Exactly the messages of the span, without firing records."),
     ] = False,
+    compression: Compression = "zstd",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -70,7 +72,9 @@ def cut(
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
         refuse_itself(output, [recording])
         part = asked_span(origin, start, end, duration)
-        done = write_part(origin, Part(*part, bare=bare), output, overwrite=overwrite, watch=watch)
+        done = write_part(
+            origin, Part(*part, bare=bare), output, compression=compression, overwrite=overwrite, watch=watch
+        )
     if json:
         print_json(done.as_json())
     else:
@@ -85,6 +89,7 @@ def filter_(
         typer.Option("--stream", metavar="STREAM", help="Keep these streams; wildcards work. May be repeated."),
     ] = None,
     without: Without = None,
+    compression: Compression = "zstd",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -114,7 +119,7 @@ def filter_(
         refuse_itself(output, [recording])
         names = sorted(origin.counts())
         kept = chosen_streams(streams, names, origin.namespace, without)
-        done = write_part(origin, Part(streams=kept), output, overwrite=overwrite, watch=watch)
+        done = write_part(origin, Part(streams=kept), output, compression=compression, overwrite=overwrite, watch=watch)
     if json:
         print_json(done.as_json())
     else:
@@ -133,6 +138,7 @@ def split(
         Path | None,
         typer.Option("--out", "-o", metavar="DIR", help="The folder to write to. Default: named as the recording."),
     ] = None,
+    compression: Compression = "zstd",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -162,7 +168,9 @@ def split(
             raise fail(f"--out {target}: expected a folder")
         period = None if every is None else parsed_duration("--every", every)
         most = None if nbytes is None else parsed_size("--size", nbytes)
-        done = list(parts_of(origin, target, every=period, size=most, overwrite=overwrite, watch=watch))
+        done = list(
+            parts_of(origin, target, every=period, size=most, compression=compression, overwrite=overwrite, watch=watch)
+        )
     if json:
         print_json([one.as_json() for one in done])
         return

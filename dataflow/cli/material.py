@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.markup import escape
@@ -22,6 +22,14 @@ if TYPE_CHECKING:
 
 Material = Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording, or any other MCAP file.")]
 Out = Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="The file to write.")]
+Compression = Annotated[
+    Literal["zstd", "lz4", "none"],
+    typer.Option(
+        "--compression",
+        metavar="zstd|lz4|none",
+        help="How the file is compressed: zstd gives the smallest, lz4 takes less CPU time.",
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", metavar=FLAG, help="Show no progress.")]
 Word = str | None
 
@@ -114,5 +122,6 @@ def print_unknown(operators: Collection[str]) -> None:
     if operators:
         say(
             f"[yellow]no recorded state at or before the cut:[/] {escape(', '.join(sorted(operators)))}: they begin "
-            "afresh, and are not verified before their next recorded state (`record: {snapshots: 10s}` records states)"
+            "afresh, and are not verified before their next recorded state (`record: {snapshots: 10s}` records what "
+            "`snapshot()` gives; an operator without a state says `stateless = True`)"
         )

@@ -12,6 +12,7 @@ from rich.text import Text
 
 from dataflow.cli.arguments import Json, Overwrite, existing, output_file
 from dataflow.cli.material import (
+    Compression,
     Out,
     Quiet,
     copying,
@@ -31,6 +32,7 @@ def merge(
         list[str] | None,
         typer.Option("--prefix", metavar="FILE=NAME/", help="Put NAME/ before the streams of FILE. May be repeated."),
     ] = None,
+    compression: Compression = "zstd",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -66,7 +68,7 @@ def merge(
         prefixes = _prefixes(prefix or (), recordings)
         origins = [stack.enter_context(opened_material(path)) for path in recordings]
         watch = stack.enter_context(copying("merging", quiet or json))
-        done = merge_all(origins, output, prefixes=prefixes, overwrite=overwrite, watch=watch)
+        done = merge_all(origins, output, prefixes=prefixes, compression=compression, overwrite=overwrite, watch=watch)
     if json:
         print_json(done.as_json())
     else:
@@ -93,6 +95,7 @@ def _prefixes(words: Sequence[str], recordings: Sequence[Path]) -> list[str]:
 def recover(
     recording: Annotated[Path, typer.Argument(metavar="BROKEN.mcap", help="A torn or damaged MCAP file.")],
     output: Out,
+    compression: Compression = "zstd",
     overwrite: Overwrite = False,
     quiet: Quiet = False,
     json: Json = False,
@@ -120,7 +123,7 @@ def recover(
     with friendly_errors(), copying("recovering", quiet or json) as watch:
         existing(recording, "a recording")
         output_file(output, ".mcap", overwrite=overwrite, option="--out")
-        done = save(recording, output, overwrite=overwrite, watch=watch)
+        done = save(recording, output, compression=compression, overwrite=overwrite, watch=watch)
     if json:
         print_json(done.as_json())
     else:

@@ -14,7 +14,9 @@ from dataflow.cli.output import fail, out, print_json
 
 HERE = Path()
 Made = TypeVar("Made")
-To = Annotated[Path, typer.Option("--to", metavar="DIR", help="The folder to write into; made where it is missing.")]
+To = Annotated[
+    Path, typer.Option("--to", "--out", "-o", metavar="DIR", help="The folder to write into; made where it is missing.")
+]
 
 
 def operator(

@@ -10,7 +10,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, Json, existing, find_modules_in
+from dataflow.cli.arguments import FLAG, Json, OutInstead, existing, find_modules_in, named_once
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import DIFFERENT, fail, friendly_errors, jsonable, out, print_json, print_json_line, say, table
 
@@ -147,6 +147,7 @@ def dump(
     file: Annotated[
         Path | None, typer.Argument(metavar="FILE", help="A YAML file to write. Default: print it.")
     ] = None,
+    out_option: OutInstead = None,
     every: Annotated[
         bool, typer.Option("--all", metavar=FLAG, help="Also those that cannot change while the graph runs.")
     ] = False,
@@ -164,6 +165,7 @@ def dump(
       dataflow param dump
       dataflow param dump tuned.yaml
     """
+    file = named_once("FILE", file, out_option)
     if file is not None and file.exists() and not overwrite:
         raise fail(f"{file} exists; name another file, or replace it with --overwrite")
     with friendly_errors():

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, Json, Overwrite, chosen_streams, output_file
 from dataflow.cli.live import GraphName, Streams, Wait, running_graph
+from dataflow.cli.material import Compression
 from dataflow.cli.output import count, err, fail, friendly_errors, out, plural, print_json, say, size, table
 from dataflow.cli.quantities import parsed_duration, parsed_size
 
@@ -35,6 +36,7 @@ def record(
     split_size: Annotated[
         str | None, typer.Option("--split-size", metavar="SIZE", help="A new file after so many bytes: 500MB, 2GB.")
     ] = None,
+    compression: Compression = "zstd",
     duration: Annotated[float | None, typer.Option("--seconds", metavar="SECONDS", help="Stop after so long.")] = None,
     graph: GraphName = None,
     wait: Wait = 0.0,
@@ -83,7 +85,13 @@ def record(
         with (
             subscribed(found, chosen) as subscription,
             AttachedRecorder(
-                output, running, chosen, metadata=metadata, splitting=splitting, overwrite=overwrite
+                output,
+                running,
+                chosen,
+                metadata=metadata,
+                splitting=splitting,
+                compression=compression,
+                overwrite=overwrite,
             ) as recorder,
             _shown(recorder.tally, quiet or json) as show,
         ):

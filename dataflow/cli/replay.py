@@ -31,6 +31,7 @@ from dataflow.cli.output import DIFFERENT, err, fail, friendly_errors, out, prin
 from dataflow.cli.playback import keys, looped
 from dataflow.cli.run_options import (
     OUTPUT,
+    Compression,
     Json,
     OneProcess,
     Open,
@@ -76,6 +77,7 @@ def replay(
     process_each: ProcessEach = False,
     place: Place = None,
     record: Record = None,
+    compression: Compression = None,
     view: View = None,
     open_view: Open = False,
     complete: Annotated[
@@ -141,6 +143,9 @@ def replay(
             raise fail("--loop makes the same in each pass: it does not go with --record, --view or --complete")
         if graph is None and settings:
             raise fail("--set changes a graph file: name it with --graph")
+        if compression is not None and record is None:
+            raise fail("--compression is of a recording: name one with --record")
+        packing = {} if compression is None else {"compression": compression}
         find_modules_in(path)
         early = None if complete is not None else stack.enter_context(early_nursery())
         from dataflow.graph import load_graph
@@ -162,7 +167,7 @@ def replay(
             loaded = load_graph(graph_file(graph), settings=settings or ())
             outputs = checked_outputs(record, view, open_view, overwrite)
             options = plan_options(loaded, outputs, one_process, process_each, place, rate, paranoid, timeout)
-            options |= {"early": early, "paused": step, "controls": keys(quiet or json)}
+            options |= {"early": early, "paused": step, "controls": keys(quiet or json), **packing}
             if loop != 1:
                 raise fail("--loop needs a recording; make one of the bag: dataflow convert BAG OUT.mcap --to mcap")
             replay_bag(
@@ -200,7 +205,7 @@ def replay(
         shown = None
         if whole is not None:
             shown = (begin or whole[0], whole[1] if finish is None else min(whole[1], finish))
-        options |= {"paused": step, "controls": keys(quiet or json)}
+        options |= {"paused": step, "controls": keys(quiet or json), **packing}
 
         def once() -> dict[str, Any]:
             report = execute(

@@ -21,6 +21,7 @@ from dataflow.cli.execution import checked_outputs, execute, plan_options
 from dataflow.cli.output import fail, friendly_errors
 from dataflow.cli.playback import keys
 from dataflow.cli.run_options import (
+    Compression,
     Json,
     Live,
     LogLevel,
@@ -63,6 +64,7 @@ def run(
     process_each: ProcessEach = False,
     place: Place = None,
     record: Record = None,
+    compression: Compression = None,
     view: View = None,
     open_view: Open = False,
     overwrite: Replace = False,
@@ -84,6 +86,7 @@ def run(
 
       dataflow run graphs/synthetic_rgbd.yaml
       dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --view spawn
+      dataflow run graphs/synthetic_rgbd.yaml --record run.mcap --compression lz4
       dataflow run graphs/rgbd_perception.yaml --set data=FOLDER
       dataflow run graphs/synthetic_rgbd.yaml --view run.rrd --open
       dataflow run graphs/synthetic_rgbd.yaml --process-each --rate 1 --json
@@ -116,6 +119,10 @@ def run(
         flight = loaded.record.flight is not None and record is None
         controls = keys(quiet or json, live=live, flight=flight)
         options |= {"live": live, "paused": step, "controls": controls}
+        if compression is not None:
+            if record is None and not flight:
+                raise fail("--compression is of a recording: name one with --record")
+            options["compression"] = compression
         if flight and loaded.record.flight is not None:
             options["flight"] = Path(loaded.record.flight.folder)
             options["flight"].mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -34,6 +34,15 @@ Record = Annotated[
     Path | None,
     typer.Option(
         "--record", metavar="FILE.mcap", rich_help_panel=OUTPUT, help="Record the graph's streams and firings."
+    ),
+]
+Compression = Annotated[
+    Literal["zstd", "lz4", "none"] | None,
+    typer.Option(
+        "--compression",
+        metavar="zstd|lz4|none",
+        rich_help_panel=OUTPUT,
+        help="How the recording is compressed: zstd gives the smallest file, lz4 takes less CPU time. Default: zstd.",
     ),
 ]
 View = Annotated[

@@ -237,7 +237,8 @@ def _left_out(v: Verification) -> Iterator[str]:
     if v.unknown:
         yield (
             f"{v.operator}: {plural(v.unknown, 'firing')} could not be repeated: the recording was cut there, and "
-            "holds no state of it at or before the cut (`record: {snapshots: 10s}` records states)"
+            "holds no state of it at or before the cut (`record: {snapshots: 10s}` records what `snapshot()` gives; an "
+            "operator without a state says `stateless = True`)"
         )
     if v.unaccounted:
         yield f"{v.operator}: {plural(v.unaccounted, 'message')} that no firing record accounts for: records are lost"

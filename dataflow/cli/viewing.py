@@ -48,6 +48,8 @@ def view(
         str,
         typer.Option(
             "--to",
+            "--out",
+            "-o",
             metavar="TARGET",
             help="spawn: a window; serve: a page for a browser; FILE.rrd: a file; or the address of a viewer that "
             "runs (rerun+http://127.0.0.1:9876/proxy).",

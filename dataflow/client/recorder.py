@@ -23,6 +23,7 @@ from dataflow.graph.model import Graph
 from dataflow.messages.base import Message, MessageError
 from dataflow.recording import RecordingWriter
 from dataflow.recording.layout import ENDS
+from dataflow.recording.packing import Compression
 from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
 from dataflow.transport.codec import TypeOf, decode
 from dataflow.transport.envelope import DecodeError
@@ -84,11 +85,13 @@ class AttachedRecorder:
         *,
         metadata: Mapping[str, Mapping[str, str]],
         splitting: Splitting = Splitting(),
+        compression: Compression = "zstd",
         overwrite: bool = False,
         types: TypeOf | None = None,
     ) -> None:
         self._path, self._graph, self._streams = path, graph, frozenset(streams)
         self._metadata, self._splitting, self._overwrite = metadata, splitting, overwrite
+        self._compression: Compression = compression
         self._types = types or types_of(graph)
         self._statics: dict[str, Envelope] = {}
         self._added: set[str] = set()
@@ -186,7 +189,11 @@ class AttachedRecorder:
         if self._splitting.splits:
             path = path.with_name(f"{path.stem}_{len(self.tally.files):03}{path.suffix}")
         writer = RecordingWriter(
-            path, metadata=self._metadata, namespace=self._graph.namespace, overwrite=self._overwrite
+            path,
+            metadata=self._metadata,
+            namespace=self._graph.namespace,
+            compression=self._compression,
+            overwrite=self._overwrite,
         )
         self.tally.files.append(str(path))
         self._added, self._first = set(), None

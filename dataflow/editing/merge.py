@@ -20,6 +20,7 @@ from dataflow.recording.copying import Copy, Mask, Origin, framing
 from dataflow.recording.cutting import Cut, cut_of
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, GRAPH, RECORDING, RUN, Kind
+from dataflow.recording.packing import Compression
 from dataflow.records.cuts import taken_by
 from dataflow.records.firing import CALLS, FiringRecord
 from dataflow.records.reading import FiringLog
@@ -33,6 +34,7 @@ def merge(
     out: Path,
     *,
     prefixes: Sequence[str] = (),
+    compression: Compression = "zstd",
     overwrite: bool = False,
     watch: Watch = unwatched,
 ) -> Edited:
@@ -59,7 +61,7 @@ def merge(
         _tell_clocks(origins, done)
         _tell_runs(origins, prefixes, done)
     total = sum(int(mask.sum()) for masks in kept for mask in masks.values())
-    with Copy(out, origins[0], overwrite=overwrite) as copy:
+    with Copy(out, origins[0], compression=compression, overwrite=overwrite) as copy:
         for name, values in facts.items():
             copy.writer.add_metadata(name, values)
         take_over(copy, origins, [p.rstrip("/") for p in prefixes], done, joined=one_run)

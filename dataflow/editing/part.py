@@ -18,6 +18,7 @@ from dataflow.recording import Recording
 from dataflow.recording.copying import RUN_KINDS, Copy, Mask, Origin, framing, places
 from dataflow.recording.cutting import Cut, cut_of
 from dataflow.recording.layout import CUT, DIGESTS, ENDS, Kind
+from dataflow.recording.packing import Compression
 from dataflow.records.firing import CALLS, FiringRecord, consecutive, encode_batch
 from dataflow.records.reading import FiringLog
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph, resolved_graph
@@ -41,14 +42,22 @@ class Part:
         return self.start is not None or self.end is not None
 
 
-def write_part(origin: Origin, part: Part, out: Path, *, overwrite: bool = False, watch: Watch = unwatched) -> Edited:
+def write_part(
+    origin: Origin,
+    part: Part,
+    out: Path,
+    *,
+    compression: Compression = "zstd",
+    overwrite: bool = False,
+    watch: Watch = unwatched,
+) -> Edited:
     """Writes a part of `origin` into a file of its own. Raises `RecordingError`."""
     done = Edited(str(out))
     firings = _firings(origin, part, done)
     needed = {} if firings is None else firings.needed
     kept = masks_of(origin, part, needed)
     _describe(origin, kept, part, done)
-    with Copy(out, origin, overwrite=overwrite) as copy:
+    with Copy(out, origin, compression=compression, overwrite=overwrite) as copy:
         for name, values in _metadata(origin, kept, part):
             copy.writer.add_metadata(name, values)
         done.attachments = copy.attachments(origin)

@@ -16,6 +16,7 @@ from dataflow.recording.copying import Copy, Mask, Origin, places
 from dataflow.recording.cutting import cut_of
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.layout import DIGESTS, RECOVERED, Kind
+from dataflow.recording.packing import Compression
 from dataflow.records.firing import WITHHELD
 from dataflow.records.reading import FiringLog
 
@@ -63,7 +64,14 @@ class Recovered:
         }
 
 
-def recover(path: Path, out: Path, *, overwrite: bool = False, watch: Watch = unwatched) -> Recovered:
+def recover(
+    path: Path,
+    out: Path,
+    *,
+    compression: Compression = "zstd",
+    overwrite: bool = False,
+    watch: Watch = unwatched,
+) -> Recovered:
     """Writes everything that can be read of `path` into a file with a proper end and an index.
 
     Chunks that fail their checksum are left out. Raises `RecordingError` for what is no MCAP file at all.
@@ -76,7 +84,7 @@ def recover(path: Path, out: Path, *, overwrite: bool = False, watch: Watch = un
         broken = origin.file.broken_chunks()
         damage += [f"{where}: {why}" for where, why in broken.values()]
         kept = {c: ~np.isin(origin.entries(c).chunks, list(broken)) for c in origin.channels}
-        with Copy(out, origin, overwrite=overwrite) as copy:
+        with Copy(out, origin, compression=compression, overwrite=overwrite) as copy:
             for name, values in origin.records():
                 if name != DIGESTS:
                     copy.writer.add_metadata(name, values)

@@ -12,6 +12,7 @@ from dataflow.editing.part import Part, write_part
 from dataflow.editing.report import Edited, Watch, unwatched
 from dataflow.recording.copying import Origin
 from dataflow.recording.errors import RecordingError
+from dataflow.recording.packing import Compression
 
 MOST_PARTS = 10_000
 
@@ -22,6 +23,7 @@ def split(
     *,
     every: int | None = None,
     size: int | None = None,
+    compression: Compression = "zstd",
     overwrite: bool = False,
     watch: Watch = unwatched,
 ) -> Iterator[Edited]:
@@ -40,7 +42,7 @@ def split(
     folder.mkdir(parents=True, exist_ok=True)
     for k, (name, (start, end)) in enumerate(zip(names, spans, strict=True)):
         part = Part(start if k else None, end if k < len(spans) - 1 else None)
-        yield write_part(origin, part, name, overwrite=overwrite, watch=watch)
+        yield write_part(origin, part, name, compression=compression, overwrite=overwrite, watch=watch)
 
 
 def by_time(origin: Origin, every: int) -> list[tuple[int, int]]:

@@ -66,9 +66,14 @@ class Bag(Protocol):
         """Closes the files. Idempotent."""
 
 
+def is_static(topic: str) -> bool:
+    """Tells whether a topic's transforms hold for always, which in ROS its name says."""
+    return topic.rpartition("/")[2] == "tf_static"
+
+
 def is_latched(topic: str, profiles: str = "") -> bool:
     """Tells whether a topic keeps its messages for late subscribers, by its name or the text of its QoS profiles."""
-    if topic.rpartition("/")[2] == "tf_static":
+    if is_static(topic):
         return True
     compact = profiles.lower().replace(" ", "").replace('"', "")
     return "durability:transient_local" in compact or "durability:1\n" in compact + "\n"

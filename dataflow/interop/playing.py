@@ -7,13 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataflow.graph.model import Graph
-from dataflow.interop.bag import Bag
+from dataflow.interop.bag import Bag, is_static
 from dataflow.interop.clocks import Choice
 from dataflow.interop.conversions import offers
 from dataflow.interop.mapping import MappingError, Offered, Proposal, Wanted, parse_map, propose
 from dataflow.interop.opening import open_bag
 from dataflow.interop.streams import BagStreams, Played
 from dataflow.interop.topics import Reading
+from dataflow.messages import Transforms
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,9 +96,16 @@ def play(
 
 
 def readable(bag: Bag, path: Path, clock: Choice = "auto", topics: Collection[str] | None = None) -> BagStreams:
-    """Opens all topics of a bag, or some, that a message type fits, each under its own name. Raises `BagError`."""
+    """Opens all topics of a bag, or some, that a message type fits, each under its own name.
+
+    Topics called `tf_static` are static: all their transforms as one message. Raises `BagError`.
+    """
     found = [r for r in readings_of(bag, topics) if r.playable and r.topic.count]
-    played = {r.topic.name: Played(r.topic.name, r.read_as.SCHEMA) for r in found if r.read_as is not None}
+    played = {
+        r.topic.name: Played(r.topic.name, r.read_as.SCHEMA, r.read_as is Transforms and is_static(r.topic.name))
+        for r in found
+        if r.read_as is not None
+    }
     return BagStreams(path, played, clock)
 
 

@@ -25,6 +25,10 @@ ALIKE = 0.6
 """Correlation below which nothing is said: too little turning, or something else moves."""
 FEWEST = 40
 """Intervals that both must have seen."""
+SHORTEST = 8.0
+"""Seconds for which both must have been seen: within fewer, one slow swing fits another at many shifts."""
+STEEPEST = 0.02
+"""Drift (s/s) above which it is not the clock that differs: crystals are off by 1e-4, and 2 % is no clock at all."""
 WINDOW = 8.0
 """Seconds of a window, at least; there are at most WINDOWS."""
 WINDOWS = 12
@@ -68,7 +72,7 @@ NONE = ClockDifference(0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 def clock_difference(stream: Turning, reference: Turning, most: float = MOST) -> ClockDifference | None:
     """The lateness of `stream` against `reference`; None where their turning does not tell."""
     seen = _Seen(stream, reference)
-    if seen.usable < FEWEST:
+    if seen.usable < FEWEST or seen.duration < SHORTEST:
         return None
     offset = seen.best_offset(np.ones(len(stream.ends), bool), most)
     starts = [(offset, 0.0)]
@@ -87,7 +91,7 @@ def clock_difference(stream: Turning, reference: Turning, most: float = MOST) ->
     best = min(found, key=lambda result: float(result.fun))
     offset, drift = float(best.x[0]), float(best.x[1])
     likeness = seen.likeness(offset, drift)
-    if likeness < ALIKE or abs(offset) > most:
+    if likeness < ALIKE or abs(offset) > most or abs(drift) > STEEPEST:
         return None
     deviations = seen.deviations(offset, drift)
     if deviations is None:

@@ -193,7 +193,7 @@ def check_clocks(report: Report, contract: Contract) -> Iterator[Finding]:
         if drifts:
             way = "later" if drift > 0 else "earlier"
             text = (
-                f"its timestamps get {way} by {abs(drift) * 1e3:.3g} ± {difference.drift_deviation * 1e3:.1g} ms every "
+                f"its timestamps get {way} by {abs(drift) * 1e3:.3g} ± {difference.drift_deviation * 1e3:.2g} ms every "
                 f"second against {report.reference}: {over * 1e3:.3g} ms over the recording"
             )
             yield Finding("clock drift", name, "warning", text, None, values)

@@ -26,6 +26,7 @@ from dataflow.messages.fields import (
     canonical_stamp,
     scalar_value,
 )
+from dataflow.messages.memory import LARGE, copied
 
 _FROZEN, _FROZEN_IS = 0x401, 0x001
 """Of numpy's array flags C-contiguous and writeable, and what they are in a frozen array."""
@@ -64,11 +65,13 @@ def compile_class(
     names: dict[str, Any] = {
         "_bool": bool,
         "_cls": cls,
+        "_copied": copied,
         "_float": float,
         "_frozen": _FROZEN,
         "_frozen_is": _FROZEN_IS,
         "_general": general,
         "_int": int,
+        "_large": LARGE,
         "_max": INT64_MAX,
         "_min": INT64_MIN,
         "_missing": MISSING,
@@ -127,12 +130,13 @@ def _construct(
         *(f"    _state[{f.name!r}] = {_canonical(names, k, f, f.name)}" for k, f in enumerate(scalars)),
     ]
     for held in arrays:
-        copied = [f"{held.name} = {held.name}.copy()", f"{held.name}.setflags(False)"]
+        name = held.name
+        taken = [f"{name} = {name}.copy() if {name}.nbytes < _large else _copied({name})", f"{name}.setflags(False)"]
         if held.optional:
-            text += [f"    if {held.name} is not None:", *(f"        {line}" for line in copied)]
+            text += [f"    if {name} is not None:", *(f"        {line}" for line in taken)]
         else:
-            text += [f"    {line}" for line in copied]
-        text.append(f"    _state[{held.name!r}] = {held.name}")
+            text += [f"    {line}" for line in taken]
+        text.append(f"    _state[{name!r}] = {name}")
     return [*text, "    _self.validate()"] if validates else text
 
 

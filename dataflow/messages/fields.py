@@ -10,6 +10,8 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
+from dataflow.messages.memory import copied
+
 ScalarKind = Literal["bool", "int", "float", "str", "strs"]
 Scalar = bool | int | float | str | tuple[str, ...]
 
@@ -194,8 +196,9 @@ def array_value(
         dtype = next((d for d in spec.dtypes if np.can_cast(data.dtype, d, "same_kind")), None)
     if dtype is None:
         raise MessageError(f"{schema}.{spec.name} must be {spec.dtype_text()}, got an array of {data.dtype}")
-    frozen: npt.NDArray[Any] = np.array(data, dtype=dtype, order="C", copy=True)
-    if dtype.kind in "iu" and data.dtype != dtype and not np.array_equal(frozen, data):
+    same = data.dtype == dtype
+    frozen: npt.NDArray[Any] = copied(np.asarray(data)) if same else np.array(data, dtype=dtype, order="C", copy=True)
+    if dtype.kind in "iu" and not same and not np.array_equal(frozen, data):
         raise MessageError(
             f"{schema}.{spec.name} must be {spec.dtype_text()}, got {data.dtype} with values that do not fit: "
             f"{data.min()} to {data.max()}"

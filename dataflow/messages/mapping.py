@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataflow.messages import pictures
 from dataflow.messages.arrays import F32, F64, I8, I32, I64, U8, U32
-from dataflow.messages.base import Message, array, scalar
+from dataflow.messages.base import Message, MessageError, array, scalar
 from dataflow.messages.checks import (
     positive,
     together,
@@ -76,6 +76,14 @@ class Planes(Message):
     extents: F64 | None = array(
         "float64", "N 2", "full size of the rectangle seen, along its x and y", unit="m", default=None
     )
+    hulls: F64 | None = array(
+        "float64",
+        "C 3",
+        "corners of the convex hull of what was seen of each plane, plane after plane, counter-clockwise around n",
+        unit="m",
+        default=None,
+    )
+    hull_counts: I64 | None = array("int64", "N", "corners of each plane's hull", unit="corners", default=None)
     inlier_counts: I64 | None = array("int64", "N", "points of the cloud on each plane", unit="points", default=None)
     labels: I32 | None = array("int32", "P", "plane of each point of the cloud, -1 for none", default=None)
 
@@ -86,9 +94,24 @@ class Planes(Message):
         unit_quaternions(self, "orientations")
         together(self, "centers", "orientations", "extents")
         within(self, 0.0, float("inf"), "extents")
+        together(self, "hulls", "hull_counts")
+        if self.hulls is not None and self.hull_counts is not None:
+            within(self, 0, len(self.hulls), "hull_counts")
+            if int(self.hull_counts.sum()) != len(self.hulls):
+                raise MessageError(
+                    f"{self.SCHEMA}.hull_counts must add up to the {len(self.hulls)} corners of hulls, "
+                    f"got {int(self.hull_counts.sum())}"
+                )
         within_length(self, "labels", count, f"be -1 or index the {count} planes of coefficients", none=-1)
 
     @property
     def count(self) -> int:
         """Number of planes."""
         return len(self.coefficients)
+
+    def hull(self, index: int) -> F64:
+        """The corners (C, 3) of a plane's hull. Raises ValueError for a message without hulls."""
+        if self.hulls is None or self.hull_counts is None:
+            raise ValueError("these planes have no hulls")
+        end = int(self.hull_counts[: index + 1].sum())
+        return self.hulls[end - int(self.hull_counts[index]) : end]

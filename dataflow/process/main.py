@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dataflow.firing.failure import MOST_OF_A_TRACEBACK, cut
+from dataflow.messages.memory import make_large_arrays_in
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.handed import Handed, take_handed
 from dataflow.process.inbox import Inbox
@@ -57,7 +58,9 @@ def _make(
     from dataflow.process.config import ProcessConfig
     from dataflow.process.operator_process import OperatorProcess
 
-    return OperatorProcess(ProcessConfig(**config), channel, inbox, handed.outgoing, box=handed.box)
+    process = OperatorProcess(ProcessConfig(**config), channel, inbox, handed.outgoing, box=handed.box)
+    make_large_arrays_in(process.outlet.room)
+    return process
 
 
 def _recorder(config: SinkConfig, graph: Graph) -> StreamSink:

@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+import numpy.typing as npt
+
 from dataflow.messages.base import Message
 from dataflow.names import firings_key
 from dataflow.process.channel import Channel
@@ -155,6 +158,10 @@ class Outlet:
     def counters(self) -> dict[str, int]:
         """Returns what was sent to other processes (`Fanout.counters`)."""
         return self._fanout.counters()
+
+    def room(self, nbytes: int) -> npt.NDArray[np.uint8] | None:
+        """Returns memory for a large array that may be sent from where it lies (`Fanout.room`); on any thread."""
+        return self._fanout.room(nbytes)
 
     def close(self) -> None:
         """Lets go of the memory that other processes read."""

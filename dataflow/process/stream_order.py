@@ -4,6 +4,9 @@ Every envelope names a place, (incarnation, number): a message its own, a fronti
 stream's places are gapless. Envelopes come through a ring to which only the stream's own process writes, so an envelope
 at a later place means that messages were lost, or that the stream has begun a new incarnation. One at an earlier place,
 or one that breaks a promise, contradicts the stream and does not count.
+
+A process that is started again after its streams have ended, and has nothing more to say, ends them once more, in the
+next incarnation. Who waits for that end gets the first one again.
 """
 
 from __future__ import annotations
@@ -42,7 +45,7 @@ class StreamOrder:
         self.incarnation = 0
         self._next = first
         self._promised = NEVER
-        self._ended = False
+        self._end: Envelope | None = None
 
     def goes_on(self, envelope: Envelope) -> bool:
         """Takes a message that simply goes on: at the place that is due, above what was promised.
@@ -51,7 +54,7 @@ class StreamOrder:
         """
         if (
             envelope.kind is not Kind.MESSAGE
-            or self._ended
+            or self._end is not None
             or (envelope.incarnation, envelope.seq) != self._next
             or envelope.incarnation != self.incarnation
             or not self._promised < envelope.stamp < FOREVER
@@ -73,15 +76,16 @@ class StreamOrder:
             first = due[1] if envelope.incarnation == due[0] else 0
             gap = (first, envelope.seq) if envelope.seq > first else None
         if kind is Kind.MESSAGE and envelope.incarnation > self.incarnation:
-            self.incarnation, self._promised, self._ended = envelope.incarnation, NEVER, False
+            self.incarnation, self._promised, self._end = envelope.incarnation, NEVER, None
         if kind is Kind.MESSAGE:
             self._next = envelope.incarnation, envelope.seq + 1
         elif due is not None and (envelope.incarnation == due[0] or gap is not None):
             self._next = place
         if kind is Kind.FRONTIER and envelope.stamp <= self._promised:
             return Verdict(gap=gap, repeats=True)
-        if self._ended:
-            return Verdict(gap=gap)
+        if self._end is not None:
+            again = kind is Kind.END and envelope.incarnation > self._end.incarnation
+            return Verdict(self._end if again else None, gap)
         if kind is Kind.MESSAGE and envelope.stamp <= self._promised:
             why = f"broke its promise with number {envelope.seq}, stamp {envelope.stamp}"
             return Verdict(gap=gap, damaged=why)
@@ -90,8 +94,8 @@ class StreamOrder:
     def _as_promised(self, envelope: Envelope) -> Envelope:
         """Takes note of the promise. An end below an earlier promise (of a clock that jumped back) is raised to it."""
         if envelope.kind is Kind.END:
-            self._ended = True
             if NEVER < envelope.stamp < self._promised:
-                return replace(envelope, stamp=self._promised)
+                envelope = replace(envelope, stamp=self._promised)
+            self._end = envelope
         self._promised = max(self._promised, envelope.stamp)
         return envelope

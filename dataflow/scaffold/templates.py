@@ -33,6 +33,14 @@ class $Class(Operator):
             self.log.info("darkest so far: %.3f", value)
         return Number(stamp=image.stamp, value=value)
 
+    def snapshot(self) -> dict[str, float]:
+        """The state, from which a part of a recording is replayed and verified."""
+        return {"darkest": self.darkest}
+
+    def restore(self, state: dict[str, float]) -> None:
+        """Takes over what `snapshot` gave."""
+        self.darkest = state["darkest"]
+
     def summary(self) -> dict[str, float]:
         """Figures that `dataflow run` prints at the end."""
         return {"darkest": self.darkest}
@@ -64,6 +72,13 @@ def test_the_scale_is_a_factor_and_above_zero() -> None:
     assert number.value == pytest.approx(0.5)
     with pytest.raises(ValueError, match="scale"):
         $Class(scale=0)
+
+
+def test_a_snapshot_is_gone_on_from() -> None:
+    first, second = $Class(), $Class()
+    play(first, {"image": [image(1, 51)]})
+    second.restore(first.snapshot())
+    assert second.summary() == {"darkest": pytest.approx(0.2)}
 ''')
 
 TIMER = Template('''\
@@ -77,6 +92,8 @@ from dataflow.operator import Batch, Context, Operator, Out
 
 class $Class(Operator, every="500ms"):
     """Counts the images of each half second. Ticks follow the timestamps, so a replay gives the same counts."""
+
+    stateless = True  # what it gives depends on the inputs of the call alone
 
     image: Batch[Image] = Batch(doc="all images since the last tick")
     rate: Out[Number] = Out(doc="images a second")

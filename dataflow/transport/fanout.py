@@ -5,6 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+import numpy.typing as npt
+
 from dataflow.transport.codec import encode_head
 from dataflow.transport.envelope import Buffer, Envelope
 from dataflow.transport.links import Outgoing
@@ -89,6 +92,12 @@ class Fanout:
         for link, channel in able:
             link.send(channel, [reference], len(reference), droppable=droppable, block=block)
 
+    def room(self, nbytes: int) -> npt.NDArray[np.uint8] | None:
+        """Returns memory in the pool for an array of a message (`SharedPool.room`), once a first large message was sent
+        that others take; None where there is none. On any thread."""
+        pool = self._pool
+        return None if pool is None else pool.room(nbytes)
+
     def flush(self) -> bool:
         """Sends what has waited for room, as far as there is some; True when nothing is left."""
         return not sum(not link.flush() for link in self._links if link.waiting)
@@ -123,11 +132,11 @@ class Fanout:
         """Gives the pool back, once consumers that were just sent their first reference have mapped it (bounded)."""
         if self._pool is None:
             return
-        base, end = self._pool.base, time.monotonic() + MAPPED_WITHIN
-        waiting = self._pool.consumers()
+        pool, self._pool = self._pool, None
+        base, end = pool.base, time.monotonic() + MAPPED_WITHIN
+        waiting = pool.consumers()
         while waiting and time.monotonic() < end:
             waiting = {c for c in waiting if not c.mapped(base)}
             if waiting:
                 time.sleep(0.002)
-        self._pool.close()
-        self._pool = None
+        pool.close()

@@ -2,6 +2,9 @@
 
 Blocks are cut from the pool best-fit and come back to it, merged with their neighbours, when it is used up: so no size
 of message can keep the pool from the others for longer than its messages are held.
+
+A large array of a message is made in a block at once (`room`), behind room for what goes before it in an envelope: what
+is sent first from there is not copied again.
 """
 
 from __future__ import annotations
@@ -9,17 +12,25 @@ from __future__ import annotations
 import mmap
 import os
 import secrets
+import threading
+import weakref
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Protocol
 
 import msgpack
+import numpy as np
+import numpy.typing as npt
 
 from dataflow.transport.envelope import MAGIC, PRELUDE, VERSION, Buffer, Kind
 from dataflow.transport.shared import POOL_NAME, SLOTS, make_memory, protect
 
 SCAN_AT_MOST: Final = 16
+BEFORE: Final = 4096
+"""Bytes in front of an array that is made in a block, for the head and body of its envelope."""
+_HELD_HERE: Final = 4
+"""At most the pool's bytes by this are arrays that its own process holds: the rest is there for what is to be sent."""
 _SMALLEST: Final = 64 << 10
 
 
@@ -42,13 +53,35 @@ class Block:
     capacity: int
     generation: int = 0
     claims: tuple[Claim, ...] = ()
+    start: int = 0
+    """The place in the pool at which its envelope begins."""
 
     def free(self) -> bool:
         return all(c.released(self.slot, self.generation) for c in self.claims)
 
 
+class _Array(weakref.ref["npt.NDArray[np.uint8]"]):
+    """Claims a block for an array of a message that lies in it, for as long as somebody here holds the array."""
+
+    __slots__ = ("block", "gone", "key", "sent")
+    block: Block
+    key: int
+    gone: bool
+    sent: bool
+    """An envelope lies in front of it: another one would be written over that."""
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+    def released(self, slot: int, generation: int) -> bool:
+        return self.gone
+
+    def mapped(self, base: int) -> bool:
+        return True
+
+
 class SharedPool:
-    """The blocks of one producing process. Not thread-safe."""
+    """The blocks of one producing process; on any thread."""
 
     def __init__(self, size: int) -> None:
         """Makes the memory, of which pages are taken as they are first used; raises `SharedMemoryError`."""
@@ -65,42 +98,94 @@ class SharedPool:
         self._slots = list(range(SLOTS - 1, -1, -1))
         self._out: dict[int, deque[Block]] = {}
         """Blocks by capacity, the oldest first; some may have been released."""
+        self._lock = threading.Lock()
+        self._closed = False
+        self._arrays: dict[int, _Array] = {}
+        """Arrays that lie here, by their ids."""
+        self._here = 0
+        self._let_go: deque[int] = deque()
+        """Bytes of blocks whose arrays are held by this process, and of those that it has let go of since."""
+
+    def room(self, nbytes: int) -> npt.NDArray[np.uint8] | None:
+        """Returns memory to make an array on, held until the last view of it is gone; None when there is none."""
+        capacity = _capacity(BEFORE + nbytes)
+        with self._lock:
+            while self._let_go:
+                self._here -= self._let_go.popleft()
+            fits = self._here + capacity <= self.size // _HELD_HERE and not self._closed
+            block = self._take(capacity) if fits else None
+            if block is None:
+                return None
+            self._here += capacity
+            array: npt.NDArray[np.uint8] = np.ndarray((nbytes,), np.uint8, self._memory, block.offset + BEFORE)
+            claim = _Array(array, self._let_array_go)
+            claim.block, claim.key, claim.gone, claim.sent = block, id(array), False, False
+            self._arrays[claim.key] = claim
+            block.claims = (claim,)
+            self._out.setdefault(capacity, deque()).append(block)
+        return array
+
+    def _let_array_go(self, claim: _Array) -> None:
+        """Nobody here holds an array any more. Called at any moment, on any thread: so without the lock."""
+        del self._arrays[claim.key]
+        claim.gone = True
+        self._let_go.append(claim.block.capacity)
 
     def write(self, parts: Sequence[Buffer], size: int, claims: tuple[Claim, ...]) -> Block | None:
         """Puts an envelope of `size` bytes, given as consecutive buffers, into a block; None when there is no room."""
-        block = self._take(_capacity(size))
-        if block is None:
-            return None
-        offset = block.offset
-        for part in parts:
-            self._view[offset : offset + len(part)] = part
-            offset += len(part)
-        self._generation += 1
-        block.generation, block.claims = self._generation, claims
-        self._out.setdefault(block.capacity, deque()).append(block)
+        with self._lock:
+            claim = self._array_in(parts[-1])
+            before = size - len(parts[-1])
+            if claim is not None and before <= BEFORE:
+                claim.sent = True
+                block, parts, claims = claim.block, parts[:-1], (claim, *claims)
+                block.start = block.offset + BEFORE - before
+            else:
+                taken = self._take(_capacity(size))
+                if taken is None:
+                    return None
+                block = taken
+                block.start = block.offset
+                self._out.setdefault(block.capacity, deque()).append(block)
+            offset = block.start
+            for part in parts:
+                self._view[offset : offset + len(part)] = part
+                offset += len(part)
+            self._generation += 1
+            block.generation, block.claims = self._generation, claims
         return block
+
+    def _array_in(self, part: Buffer) -> _Array | None:
+        """Returns the claim of the array that is this part of an envelope, if it lies here and was not sent yet."""
+        given = getattr(getattr(part, "obj", None), "base", None)  # part → array of the message → memory of `room`
+        claim = self._arrays.get(id(given))
+        return None if claim is None or claim.sent or claim() is not given else claim
 
     def reference(self, head: bytes, block: Block, size: int) -> bytes:
         """Makes the envelope that stands for the one in `block`."""
         body: bytes = msgpack.packb(
-            (self.id, self.base, os.getpid(), self._descriptor, block.offset, size, block.slot, block.generation)
+            (self.id, self.base, os.getpid(), self._descriptor, block.start, size, block.slot, block.generation)
         )
         return PRELUDE.pack(MAGIC, VERSION, Kind.REFERENCE, len(head), len(body)) + head + body
 
     def free(self) -> int:
         """Returns how many bytes belong to nobody now."""
-        released = sum(b.capacity for blocks in self._out.values() for b in blocks if b.free())
-        return released + sum(length for _, length in self._gaps)
+        with self._lock:
+            released = sum(b.capacity for blocks in self._out.values() for b in blocks if b.free())
+            return released + sum(length for _, length in self._gaps)
 
     def consumers(self) -> set[Claim]:
         """Returns those who hold blocks."""
-        return {c for blocks in self._out.values() for b in blocks for c in b.claims if not b.free()}
+        with self._lock:
+            return {c for blocks in self._out.values() for b in blocks for c in b.claims if not b.free()}
 
     def close(self) -> None:
-        """Gives the memory back. Consumers that have mapped it keep what they hold."""
-        self._view.release()
-        self._memory.close()
-        os.close(self._descriptor)
+        """Gives the memory back. Consumers that have mapped it keep what they hold, as does who holds arrays here."""
+        with self._lock:
+            self._closed = True
+            self._view.release()
+            del self._memory
+            os.close(self._descriptor)
 
     def _take(self, capacity: int) -> Block | None:
         """Finds a block: one of this size that was released, memory not used yet, or what others have released."""

@@ -56,7 +56,10 @@ class Clusterer(Operator):
 
     up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
     voxel: float = Param(0.02, gt=0.001, doc="side of the voxels that are clustered", unit="m")
-    reach: float = Param(0.12, gt=0, live=True, doc="points so near are neighbours", unit="m")
+    reach: float = Param(0.04, gt=0, live=True, doc="points so near are neighbours", unit="m")
+    reach_growth: float = Param(
+        0.02, ge=0, live=True, doc="and this times their distance from the sensor, as points lie farther apart there"
+    )
     core_points: int = Param(5, ge=1, live=True, doc="points within reach that make a core point, its own included")
     min_points: int = Param(30, ge=1, live=True, doc="fewest points of a cluster")
     max_points: int = Param(1_000_000, ge=1, live=True, doc="most points of a cluster")
@@ -107,7 +110,9 @@ class Clusterer(Operator):
         if not len(points):
             return np.zeros(0, np.int32)
         voxels = Voxels.by_size(points, self.voxel)
-        of_voxel = dbscan(voxels.means(points), self.reach, self.core_points, voxels.counts)
+        means = voxels.means(points)
+        reach = self.reach + self.reach_growth * np.linalg.norm(means, axis=1)
+        of_voxel = dbscan(means, reach, self.core_points, voxels.counts)
         labels = of_voxel[voxels.of]
         sizes = np.bincount(labels[labels >= 0], minlength=int(labels.max(initial=-1)) + 1).astype(np.int64)
         return kept(labels, sizes, self.min_points, self.max_points)

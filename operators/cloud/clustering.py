@@ -15,20 +15,21 @@ Array = NDArray[np.float64]
 Labels = NDArray[np.int32]
 
 
-def dbscan(points: Array, reach: float, core: int, weights: NDArray[np.intp]) -> Labels:
+def dbscan(points: Array, reach: float | Array, core: int, weights: NDArray[np.intp]) -> Labels:
     """Returns the cluster (N,) of each point, -1 for noise. Clusters are numbered by their first point.
 
-    A point with a weight of at least `core` within `reach`, its own included, is a core point; core points within reach
-    of each other share a cluster, and others join that of their nearest core point within reach. With `core` 1 this is
-    Euclidean clustering. Ester et al., "A density-based algorithm for discovering clusters", 1996; ties by distance,
+    Two points are neighbours where they are as near as the smaller `reach` of the two, one for all or (N,). A point
+    with a weight of at least `core` among its neighbours, its own included, is a core point; core points that are
+    neighbours share a cluster, and others join that of their nearest core point within their reach. With `core` 1 this
+    is Euclidean clustering. Ester et al., "A density-based algorithm for discovering clusters", 1996; ties by distance,
     so the result does not depend on the order of the points.
     """
     count = len(points)
     labels = np.full(count, -1, np.int32)
     if not count:
         return labels
-    tree = cKDTree(points)
-    pairs = tree.query_pairs(reach, output_type="ndarray")
+    reaches = np.broadcast_to(np.asarray(reach, np.float64), (count,))
+    pairs = _neighbours(points, reaches)
     mass = weights + np.bincount(pairs[:, 0], weights[pairs[:, 1]], count)
     mass = mass + np.bincount(pairs[:, 1], weights[pairs[:, 0]], count)
     is_core = mass >= core
@@ -41,10 +42,28 @@ def dbscan(points: Array, reach: float, core: int, weights: NDArray[np.intp]) ->
     labels[cores] = part[cores]
     border = np.flatnonzero(~is_core)
     if len(border):
-        distance, nearest = cKDTree(points[cores]).query(points[border], distance_upper_bound=reach)
-        near = np.isfinite(distance)
+        distance, nearest = cKDTree(points[cores]).query(points[border])
+        near = distance <= reaches[border]
         labels[border[near]] = part[cores[nearest[near]]]
     return _numbered(labels)
+
+
+def _neighbours(points: Array, reach: Array) -> NDArray[np.intp]:
+    """Returns the pairs (M, 2) of points that are as near as the smaller of their `reach` (N,).
+
+    Reaches are looked at by powers of two, so that a few far points with a long reach cost no time among near ones.
+    """
+    octave = np.frexp(reach)[1]
+    found = []
+    for power in np.unique(octave):
+        own, others = np.flatnonzero(octave == power), np.flatnonzero(octave >= power)
+        near = cKDTree(points[own]).sparse_distance_matrix(
+            cKDTree(points[others]), float(reach[own].max()), output_type="ndarray"
+        )
+        i, j = own[near["i"]], others[near["j"]]
+        once = (near["v"] <= np.minimum(reach[i], reach[j])) & ((octave[j] > power) | (i < j))
+        found.append(np.column_stack([i[once], j[once]]))
+    return np.concatenate(found)
 
 
 def kept(labels: Labels, sizes: NDArray[np.int64], fewest: int, most: int) -> Labels:

@@ -29,10 +29,15 @@ def gravity(
     Without a pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the extrinsics
     relate to it; ValueError says where they do not.
     """
+    T = standing(cloud, pose, extrinsics)
+    return (fallback, 0.0) if T is None else (np.asarray(T[2, :3]), float(T[2, 3]))
+
+
+def standing(cloud: PointCloud, pose: Pose | Odometry | None, extrinsics: Transforms | None) -> Array | None:
+    """Returns the pose (4, 4) of the cloud's frame in the pose's frame; None without a pose. Errors as `gravity`."""
     if pose is None:
-        return fallback, 0.0
+        return None
     posed = pose.child_frame or cloud.frame
     if posed != cloud.frame and extrinsics is None:
         raise ValueError(f"the pose is that of {posed!r}, the cloud in {cloud.frame!r}, and there are no extrinsics")
-    T = pose.matrix() @ transform_between(extrinsics, cloud.frame, posed)
-    return np.asarray(T[2, :3]), float(T[2, 3])
+    return np.asarray(pose.matrix() @ transform_between(extrinsics, cloud.frame, posed))

@@ -25,6 +25,7 @@ Indices = NDArray[np.intp]
 Mask = NDArray[np.bool_]
 Kind = Literal["level", "upright"]
 
+ASKEW = math.radians(6)  # a plane so near to the direction of walls has it
 _ELECTORATE = 2000  # so many points are enough to tell the best of the samples; all fit the plane afterwards
 
 
@@ -89,21 +90,36 @@ def tolerances(points: Array, search: Search) -> Array:
     return np.asarray(search.distance + search.growth * np.einsum("ij,ij->i", points, points))
 
 
-def find_planes(scene: Scene, search: Search, rng: np.random.Generator) -> list[Plane]:
-    """Returns level planes, then upright ones, in the order in which they were found; a voxel is on one at most."""
+def find_planes(scene: Scene, search: Search, rng: np.random.Generator, walls: Array | None = None) -> list[Plane]:
+    """Returns level planes, then upright ones, in the order in which they were found; a voxel is on one at most.
+
+    Where the directions of `walls` (2, 3) are known, upright planes across them are looked for before all others: what
+    leans against a wall, such as a door that stands ajar, is then no part of one plane with it.
+    """
     lean = np.abs(scene.normals @ scene.up)
     sine, cosine = math.sin(search.normal_angle), math.cos(search.normal_angle)
     free = np.ones(len(scene.points), np.bool_)
     planes: list[Plane] = []
-    for kind, voters in (("level", lean >= cosine), ("upright", lean <= sine)):
-        planes += _planes_of_kind(scene, search, kind, voters, free, rng)  # type: ignore[arg-type]
+    planes += _planes_of_kind(scene, search, "level", lean >= cosine, free, rng)
+    if walls is not None:
+        planes += _planes_of_kind(scene, search, "upright", lean <= sine, free, rng, walls)
+    planes += _planes_of_kind(scene, search, "upright", lean <= sine, free, rng)
     return planes
 
 
 def _planes_of_kind(
-    scene: Scene, search: Search, kind: Kind, voters: Mask, free: Mask, rng: np.random.Generator
+    scene: Scene,
+    search: Search,
+    kind: Kind,
+    voters: Mask,
+    free: Mask,
+    rng: np.random.Generator,
+    across: Array | None = None,
 ) -> list[Plane]:
-    """Takes planes, best first, until none is large enough; takes their voxels from `free`."""
+    """Takes planes, best first, until none is large enough; takes their voxels from `free`.
+
+    Those `across` directions (2, 3) keep their direction while their voxels are found, and have it within `ASKEW` then.
+    """
     planes: list[Plane] = []
     may_vote = voters.copy()
     fewest = max(8, math.ceil(search.min_area / (4 * search.voxel**2)))
@@ -111,8 +127,8 @@ def _planes_of_kind(
         index = np.flatnonzero(may_vote & free)
         if len(index) < fewest:
             return planes
-        normal, d = _best_sample(scene, search, kind, index, rng)
-        normal, d, on = _refined(scene, search, kind, index, normal, d)
+        normal, d = _best_sample(scene, search, kind, index, rng, across)
+        normal, d, on = _refined(scene, search, kind, index, normal, d, across is not None)
         if len(on) < fewest:
             return planes
         parts = _parts(scene.points[on], search.gap if kind == "level" else 3 * search.gap)
@@ -122,6 +138,8 @@ def _planes_of_kind(
             area = covered_area(scene.points[members], normal, 2 * search.voxel)
             if area < search.min_area:
                 continue
+            if across is not None and _least_squares(scene, members, normal)[0] @ normal < math.cos(ASKEW):
+                continue
             own_normal, own_d = _fitted(scene, kind, members, normal, d, search.tilt)
             members = _absorbed(scene, free, members, own_normal, own_d, 2 * search.voxel)
             free[members] = False
@@ -129,7 +147,7 @@ def _planes_of_kind(
 
 
 def _best_sample(
-    scene: Scene, search: Search, kind: Kind, index: Indices, rng: np.random.Generator
+    scene: Scene, search: Search, kind: Kind, index: Indices, rng: np.random.Generator, across: Array | None
 ) -> tuple[Array, float]:
     """Returns the sampled plane with the most votes."""
     index = index[:: 1 + len(index) // _ELECTORATE]
@@ -137,6 +155,9 @@ def _best_sample(
     if kind == "level":
         picked = rng.integers(0, len(index), search.trials)
         candidates = np.repeat(scene.up[None], search.trials, axis=0)
+    elif across is not None:
+        picked = rng.integers(0, len(index), search.trials)
+        candidates = across[np.arange(search.trials) % len(across)]
     else:
         pairs = rng.integers(0, len(index), (search.trials, 2))
         along = points[pairs[:, 1]] - points[pairs[:, 0]]
@@ -155,9 +176,9 @@ def _best_sample(
 
 
 def _refined(
-    scene: Scene, search: Search, kind: Kind, index: Indices, normal: Array, d: float
+    scene: Scene, search: Search, kind: Kind, index: Indices, normal: Array, d: float, keeps_normal: bool
 ) -> tuple[Array, float, Indices]:
-    """Fits the plane to its voters and asks again who they are, a few times."""
+    """Fits the plane to its voters and asks again who they are, a few times; only its place if it `keeps_normal`."""
     on = index
     for _ in range(4):
         near = np.abs(scene.points[index] @ normal + d) <= scene.tolerance[index]
@@ -165,23 +186,32 @@ def _refined(
         on = index[near]
         if len(on) < 3:
             break
-        normal, d = _fitted(scene, kind, on, normal, d, search.tilt)
+        if keeps_normal:
+            weights = scene.tolerance[on] ** -2
+            d = -float(weights @ (scene.points[on] @ normal) / weights.sum())
+        else:
+            normal, d = _fitted(scene, kind, on, normal, d, search.tilt)
     return normal, d, on
 
 
 def _fitted(scene: Scene, kind: Kind, members: Indices, normal: Array, d: float, tilt: float) -> tuple[Array, float]:
     """Returns the plane of least squares through the members, weighted by their noise; the old one if it leans."""
-    weights = scene.tolerance[members] ** -2
-    weights = weights / weights.sum()
-    middle = weights @ scene.points[members]
-    offset = scene.points[members] - middle
-    _, axes = np.linalg.eigh((offset * weights[:, None]).T @ offset)
-    fitted = axes[:, 0] * (1.0 if axes[:, 0] @ normal >= 0 else -1.0)
+    fitted, middle = _least_squares(scene, members, normal)
     lean = abs(float(fitted @ scene.up))
     leans = lean < math.cos(tilt) if kind == "level" else lean > math.sin(tilt)
     if leans or fitted @ normal < math.cos(2 * tilt):
         return normal, -float(middle @ normal)
     return fitted, -float(middle @ fitted)
+
+
+def _least_squares(scene: Scene, members: Indices, normal: Array) -> tuple[Array, Array]:
+    """Returns the normal (3,) that fits the members, on the side of `normal`, and their middle (3,)."""
+    weights = scene.tolerance[members] ** -2
+    weights = weights / weights.sum()
+    middle = weights @ scene.points[members]
+    offset = scene.points[members] - middle
+    _, axes = np.linalg.eigh((offset * weights[:, None]).T @ offset)
+    return axes[:, 0] * (1.0 if axes[:, 0] @ normal >= 0 else -1.0), middle
 
 
 def _parts(points: Array, gap: float) -> NDArray[np.int32]:

@@ -14,9 +14,10 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import finite
-from operators.cloud.gravity import gravity, unit
-from operators.cloud.plane_search import Plane, Scene, Search, find_planes, tolerances
+from operators.cloud.gravity import standing, unit
+from operators.cloud.plane_search import Plane, Scene, Search, find_planes, in_plane, tolerances
 from operators.cloud.surfaces import SURFACES, Rules, Surface, recognised
+from operators.cloud.wall_directions import WallDirections
 from operators.status import counted_status
 
 Array = NDArray[np.float64]
@@ -33,8 +34,12 @@ class PlaneSegmenter(Operator):
     told where no floor is seen. Without a floor so far, level planes are `other`. A wall is wide and high, and nothing
     that stands is seen behind it. Upright planes need not be vertical beyond `tilt`; slopes are not looked for.
 
+    Walls that agree within right angles, over time where there is a pose, give directions: planes across these are
+    looked for first, and what is as narrow as a door and turned against them is a door that stands ajar, no wall.
+
     Method: RANSAC (Fischler and Bolles, 1981) along and across gravity, votes by normals as in Schnabel, Wahl and
-    Klein, "Efficient RANSAC for point-cloud shape detection", 2007, least squares over the voters.
+    Klein, "Efficient RANSAC for point-cloud shape detection", 2007, least squares over the voters; directions of walls
+    as in Coughlan and Yuille, "Manhattan world", 1999.
     """
 
     cloud: In[PointCloud] = In(doc="points in the frame of their sensor, which is the origin")
@@ -42,7 +47,9 @@ class PlaneSegmenter(Operator):
     extrinsics: Sampled[Transforms] = Sampled(
         required=False, doc="holds the transform between the cloud's frame and that of the pose, where they differ"
     )
-    planes: Out[Planes] = Out(doc="every plane with the rectangle seen of it, and the plane of every point")
+    planes: Out[Planes] = Out(
+        doc="every plane with the rectangle and the hull seen of it, and the plane of every point"
+    )
     surfaces: Out[Boxes3D] = Out(doc="the same planes in the same order as flat boxes with a class")
     rest: Out[PointCloud] = Out(doc="the points on no floor, wall, table top or ceiling")
     status: Out[Diagnostics] = Out(doc="how many of each were found; a warning where the cloud is too small for any")
@@ -63,6 +70,7 @@ class PlaneSegmenter(Operator):
     wall_side: float = Param(0.6, gt=0, doc="shortest width that is seen of a wall", unit="m")
     wall_area: float = Param(0.5, gt=0, doc="smallest area that is seen of a wall", unit="m²")
     wall_top: float = Param(1.2, gt=0, doc="a wall is seen up to this height above the floor at least", unit="m")
+    door_side: float = Param(1.05, ge=0, doc="a plane no wider and turned against the walls is no wall", unit="m")
     floor_memory: float = Param(0.1, gt=0, doc="the floor is within this of where it was", unit="m")
 
     def setup(self) -> None:
@@ -87,10 +95,15 @@ class PlaneSegmenter(Operator):
             wall_area=self.wall_area,
             wall_top=self.wall_top,
             floor_memory=self.floor_memory,
+            door_side=self.door_side,
         )
+        self._begin()
+        self._counts: Counter[str] = Counter()
+
+    def _begin(self) -> None:
         self._floor: float | None = None
         self._looked: int | None = None
-        self._counts: Counter[str] = Counter()
+        self._walls = WallDirections()
 
     def process(
         self, cloud: PointCloud, pose: Pose | Odometry | None = None, extrinsics: Transforms | None = None
@@ -99,17 +112,19 @@ class PlaneSegmenter(Operator):
         if self._looked is not None and cloud.stamp - self._looked < self.period * 1e9:
             return {}
         self._looked = cloud.stamp
-        up, height = gravity(cloud, pose, extrinsics, self._up)
+        T = standing(cloud, pose, extrinsics)
+        up, height = (self._up, 0.0) if T is None else (T[2, :3], float(T[2, 3]))
         usable = np.flatnonzero(finite(cloud.points))
         points = cloud.points[usable]
         surfaces: list[Surface] = []
         labels = np.full(cloud.count, -1, np.int32)
         if len(points):
             scene = Scene.of_cloud(points, up, self._search)
-            planes = find_planes(scene, self._search, self.rng)
             known = None if self._floor is None else self._floor - height
-            surfaces, floor = recognised(scene, planes, self._rules, known, 2 * self.voxel)
+            surfaces, floor = self._surfaces(scene, known, _turned(up) if T is None else T[:3, :3])
             self._floor = None if floor is None else floor + height
+            if T is None:
+                self._walls = WallDirections()  # the sensor may have turned when the next cloud comes
             labels[usable] = self._labels(points, scene, [surface.plane for surface in surfaces])
         named = np.array([surface.name != "other" for surface in surfaces] + [False])
         found = Counter(surface.name for surface in surfaces)
@@ -122,16 +137,40 @@ class PlaneSegmenter(Operator):
             "status": _status(cloud, found, self._floor is not None),
         }
 
+    def _surfaces(self, scene: Scene, floor: float | None, R: Array) -> tuple[list[Surface], float | None]:
+        """Returns the surfaces and the floor's height; walls that agree so far, else those of this cloud, have a say.
+
+        `R` (3, 3) turns the cloud's frame to one whose z is up, and that stays.
+        """
+        cell = 2 * self.voxel
+        before = self._walls.axes
+        axes = None if before is None else before @ R
+        planes = find_planes(scene, self._search, self.rng, axes)
+        surfaces, found = recognised(scene, planes, self._rules, floor, cell, axes)
+        walls = [s for s in surfaces if s.name == "wall" and s.seen.size[0] > self.door_side]
+        self._walls.add(_rows([R @ s.plane.normal for s in walls], 3), np.array([s.plane.area for s in walls]))
+        if before is None and (now := self._walls.axes) is not None:
+            planes = find_planes(scene, self._search, self.rng, now @ R)
+            surfaces, found = recognised(scene, planes, self._rules, floor, cell, now @ R)
+        return surfaces, found
+
     def on_reset(self, input: str) -> None:
-        """The clock of a stream began anew: the floor is looked for again."""
-        self._floor = self._looked = None
+        """The clock of a stream began anew: the floor and the directions of walls are looked for again."""
+        self._begin()
 
     def snapshot(self) -> Mapping[str, Any]:
-        return {"floor": self._floor, "looked": self._looked, "counts": dict(self._counts)}
+        return {
+            "floor": self._floor,
+            "looked": self._looked,
+            "walls": self._walls.snapshot(),
+            "counts": dict(self._counts),
+        }
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._floor = None if state["floor"] is None else float(state["floor"])
         self._looked = state.get("looked")  # not in those of earlier versions
+        if "walls" in state:
+            self._walls.restore(state["walls"])
         self._counts = Counter({key: int(count) for key, count in state["counts"].items()})
 
     def summary(self) -> Mapping[str, float | int]:
@@ -151,6 +190,12 @@ class PlaneSegmenter(Operator):
         return labels
 
 
+def _turned(up: Array) -> Array:
+    """Returns a rotation (3, 3) that takes `up` (3,) to z."""
+    x, y = in_plane(up)
+    return np.stack([x, y, up])
+
+
 def _planes(cloud: PointCloud, surfaces: list[Surface], labels: Labels) -> Planes:
     return Planes(
         stamp=cloud.stamp,
@@ -159,6 +204,8 @@ def _planes(cloud: PointCloud, surfaces: list[Surface], labels: Labels) -> Plane
         centers=_rows([s.seen.T[:3, 3] for s in surfaces], 3),
         orientations=_orientations(surfaces),
         extents=_rows([s.seen.size for s in surfaces], 2),
+        hulls=_rows([corner for s in surfaces for corner in s.seen.hull], 3),
+        hull_counts=np.array([len(s.seen.hull) for s in surfaces], np.int64),
         inlier_counts=_members(surfaces, labels),
         labels=labels,
     )

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.cloud.plane_search import Plane, Scene, covered_area, in_plane
+from operators.cloud.plane_search import ASKEW, Plane, Scene, covered_area, in_plane
 
 Array = NDArray[np.float64]
 
@@ -31,14 +32,18 @@ class Rules:
     """A wall is seen up to this height above the floor at least."""
     floor_memory: float
     """Largest distance of the floor from where it was before."""
+    door_side: float
+    """Greatest width of what may be the leaf of a door."""
 
 
 @dataclass(frozen=True, eq=False)
 class Rectangle:
-    """The part of a plane that was seen: `T_cloud_rectangle` (4, 4) with z along the normal, and its size (2,)."""
+    """The part of a plane that was seen: `T_cloud_rectangle` (4, 4) with z along the normal, its size (2,), and within
+    it the convex `hull` (C, 3), counter-clockwise seen from where the normal points."""
 
     T: Array
     size: Array
+    hull: Array
 
 
 def rectangle(plane: Plane, points: Array, up: Array) -> Rectangle:
@@ -56,7 +61,8 @@ def rectangle(plane: Plane, points: Array, up: Array) -> Rectangle:
     T = np.eye(4)
     T[:3, :3] = np.stack([*axes, plane.normal], axis=1)
     T[:3, 3] = middle @ axes - plane.d * plane.normal
-    return Rectangle(T, size)
+    corners = cv2.convexHull((points @ axes.T - middle).astype(np.float32), clockwise=False)[:, 0].astype(np.float64)
+    return Rectangle(T, size, corners @ axes + T[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,14 +75,19 @@ class Surface:
 
 
 def recognised(
-    scene: Scene, planes: list[Plane], rules: Rules, known_floor: float | None, cell: float
+    scene: Scene,
+    planes: list[Plane],
+    rules: Rules,
+    known_floor: float | None,
+    cell: float,
+    walls: Array | None = None,
 ) -> tuple[list[Surface], float | None]:
     """Returns the surfaces, the floor's parts as one, and the floor's height along up: as known before if none is seen.
 
-    `cell` is the side of the squares that areas are measured in.
+    `cell` is the side of the squares that areas are measured in, `walls` (2, 3) what directions walls face, if known.
     """
     seen = [rectangle(plane, scene.points[plane.members], scene.up) for plane in planes]
-    names, floor = _names(scene, planes, seen, rules, known_floor, cell)
+    names, floor = _names(scene, planes, seen, rules, known_floor, cell, walls)
     floors = [plane for plane, name in zip(planes, names, strict=True) if name == "floor"]
     surfaces = [Surface(*each) for each in zip(names, planes, seen, strict=True) if each[0] != "floor"]
     if floors:
@@ -93,7 +104,13 @@ def _joined(parts: list[Plane]) -> Plane:
 
 
 def _names(
-    scene: Scene, planes: list[Plane], rectangles: list[Rectangle], rules: Rules, known_floor: float | None, cell: float
+    scene: Scene,
+    planes: list[Plane],
+    rectangles: list[Rectangle],
+    rules: Rules,
+    known_floor: float | None,
+    cell: float,
+    walls: Array | None,
 ) -> tuple[list[str], float | None]:
     heights = [float(-plane.d * (plane.normal @ scene.up)) for plane in planes]
     floor = _floor(scene, planes, heights, rules, known_floor)
@@ -101,9 +118,16 @@ def _names(
     for plane, height, seen in zip(planes, heights, rectangles, strict=True):
         if plane.kind == "level":
             names.append(_level(plane, height, seen, scene, rules, floor))
+        elif walls is not None and _hangs_askew(plane, seen, rules, walls):
+            names.append("other")
         else:
             names.append("wall" if _is_wall(plane, seen, scene, rules, floor, cell) else "other")
     return names, floor
+
+
+def _hangs_askew(plane: Plane, seen: Rectangle, rules: Rules, walls: Array) -> bool:
+    """Tells whether an upright plane is as narrow as a door and turned against the walls, as one that stands ajar."""
+    return bool(seen.size[0] <= rules.door_side and np.abs(walls @ plane.normal).max() < math.cos(ASKEW))
 
 
 def _floor(scene: Scene, planes: list[Plane], heights: list[float], rules: Rules, known: float | None) -> float | None:

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from operators.detection.drawing import draw_detections
     from operators.detection.onnx_detector import OnnxDetector
     from operators.detection.score_filter import ScoreFilter
-    from operators.detection.torchvision_detector import TorchvisionDetector
+    from operators.detection.torchvision_detector import TorchvisionDetector, TorchvisionRigDetector
 else:
     __getattr__, __dir__ = lazily(
         __name__,
@@ -18,8 +18,15 @@ else:
             "drawing": ("draw_detections",),
             "onnx_detector": ("OnnxDetector",),
             "score_filter": ("ScoreFilter",),
-            "torchvision_detector": ("TorchvisionDetector",),
+            "torchvision_detector": ("TorchvisionRigDetector", "TorchvisionDetector"),
         },
     )
 
-__all__ = ["CustomDetector", "OnnxDetector", "ScoreFilter", "TorchvisionDetector", "draw_detections"]
+__all__ = [
+    "CustomDetector",
+    "OnnxDetector",
+    "ScoreFilter",
+    "TorchvisionDetector",
+    "TorchvisionRigDetector",
+    "draw_detections",
+]

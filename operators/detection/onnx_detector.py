@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
@@ -15,9 +13,7 @@ from operators.detection.decode import LAYOUTS, Candidates, DecoderName
 from operators.detection.fit import Fit, FitMode
 from operators.detection.nms import class_wise_nms
 from operators.inference import ModelError, Provider, open_session
-
-if TYPE_CHECKING:
-    import onnxruntime
+from operators.network_input import image_input, read_labels, three_channels
 
 
 class OnnxDetector(Operator):
@@ -47,18 +43,27 @@ class OnnxDetector(Operator):
         """Loads the model. Raises FileNotFoundError or ModelError."""
         file = self.use_file(self.model)
         self._session = open_session(file, self.provider)
-        self._input = self._session.get_inputs()[0].name
-        self._size = _input_size(file, self._session, self.input_size)
         self._layout = LAYOUTS[self.decoder]
+        self._input = image_input(
+            file,
+            self._session,
+            (self.input_size, self.input_size),
+            bgr=self._layout.bgr,
+            mean=(self._layout.mean,) * 3,
+            scale=(self._layout.scale,) * 3,
+            layouts=("nchw",),
+            types=("tensor(float)",),
+        )
         self._fit: FitMode = self._layout.fit if self.fit == "default" else self.fit
-        self._names = COCO_CLASSES if self.classes is None else _read_names(self.use_file(self.classes))
+        self._names = COCO_CLASSES if self.classes is None else read_labels(self.use_file(self.classes)).names
 
     def process(self, image: Image) -> Detections2D:
         """Raises ModelError where the model's output is not what the decoder reads."""
-        fit = Fit.plan(self._fit, (image.width, image.height), self._size)
-        outputs = self._session.run(None, {self._input: self._tensor(fit.apply(_three_channels(image.data)))})
+        fit = Fit.plan(self._fit, (image.width, image.height), self._input.size)
+        tensor = self._input.tensor(fit.apply(three_channels(image.data)))
+        outputs = self._session.run(None, {self._input.name: tensor})
         try:
-            found = self._layout.decode(outputs, self._size, self.score_threshold)
+            found = self._layout.decode(outputs, self._input.size, self.score_threshold)
         except ValueError as error:
             raise ModelError(f"OnnxDetector.decoder={self.decoder!r} does not fit {self.model}: {error}") from None
         self._check_classes(found)
@@ -75,40 +80,9 @@ class OnnxDetector(Operator):
             class_ids=found.classes[: self.max_detections],
         )
 
-    def _tensor(self, pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """The input (1, 3, H, W), in the decoder's range, of (H, W, 3) RGB pixels."""
-        channels = pixels[..., ::-1] if self._layout.bgr else pixels
-        tensor = np.ascontiguousarray(channels.transpose(2, 0, 1)[None], np.float32)
-        if self._layout.mean:
-            tensor -= np.float32(self._layout.mean)
-        tensor /= np.float32(self._layout.scale)
-        return tensor
-
     def _check_classes(self, found: Candidates) -> None:
         if found.classes.size and found.classes.max() >= len(self._names):
             raise ModelError(
                 f"{self.model} found class {found.classes.max()}, but there are {len(self._names)} class names; "
                 f"give the model's own in OnnxDetector.classes"
             )
-
-
-def _input_size(file: Path, session: onnxruntime.InferenceSession, free: int) -> tuple[int, int]:
-    """(width, height) of the input; `free` where the model leaves an extent open."""
-    inputs = session.get_inputs()
-    shape = inputs[0].shape
-    if len(inputs) != 1 or len(shape) != 4 or shape[1] != 3 or inputs[0].type != "tensor(float)":
-        described = ", ".join(f"{i.name} {i.type} {i.shape}" for i in inputs)
-        raise ModelError(f"{file} must have one input tensor(float) [1, 3, H, W], has {described}")
-    height, width = (extent if isinstance(extent, int) else free for extent in shape[2:])
-    return width, height
-
-
-def _read_names(file: Path) -> tuple[str, ...]:
-    names = tuple(line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip())
-    if not names:
-        raise ModelError(f"{file} holds no class name; it should have one a line")
-    return names
-
-
-def _three_channels(pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)

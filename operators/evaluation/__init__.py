@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from operators.evaluation.orientation_metrics import OrientationMetrics
     from operators.evaluation.scene_graph_metrics import SceneGraphMetrics
     from operators.evaluation.segmentation_metrics import SegmentationMetrics
+    from operators.evaluation.surface_metrics import SurfaceMetrics
     from operators.evaluation.trajectory_metrics import TrajectoryMetrics
     from operators.evaluation.trajectory_plots import TrajectoryPlots
 else:
@@ -23,6 +24,7 @@ else:
             "orientation_metrics": ("OrientationMetrics",),
             "scene_graph_metrics": ("SceneGraphMetrics",),
             "segmentation_metrics": ("SegmentationMetrics",),
+            "surface_metrics": ("SurfaceMetrics",),
             "trajectory_metrics": ("TrajectoryMetrics",),
             "trajectory_plots": ("TrajectoryPlots",),
         },
@@ -35,6 +37,7 @@ __all__ = [
     "OrientationMetrics",
     "SceneGraphMetrics",
     "SegmentationMetrics",
+    "SurfaceMetrics",
     "TrajectoryMetrics",
     "TrajectoryPlots",
 ]

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D
 from dataflow.operator import Batch, Duration, In, Operator, Param
-from operators.association import mutually_nearest
-from operators.evaluation.detection_score import ClassScore, ScoredFrame, precision, recall, score_frames
-from operators.evaluation.object_log import ObjectLog, Objects
+from operators.evaluation.detection_score import ClassScore, DetectionScore, ScoredFrame, precision, recall
+from operators.evaluation.objects import Objects, objects_of
+from operators.evaluation.pairing import Pairing
 from operators.evaluation.views import check_names, check_view, listed
 
 
@@ -46,9 +46,11 @@ class DetectionMetrics(Operator):
     out: str | None = Param(None, doc="JSON file for the figures and a table of the classes; its folder is made")
 
     def setup(self) -> None:
-        import pycocotools.cocoeval  # noqa: F401  a missing package shows now, not at the end of the run
-
-        self._detections, self._truth = ObjectLog(), ObjectLog()
+        self._pairs: Pairing[Objects, Objects] = Pairing(self.tolerance)
+        self._score = DetectionScore(
+            max_detections=self.max_detections, iou=self.iou, score_threshold=self.score_threshold
+        )
+        self._known_to: int | None = None
         self._known: set[str] = set()
         self._classes: set[str] = set()
         self._figures: dict[str, float | int | str] = {}
@@ -60,9 +62,13 @@ class DetectionMetrics(Operator):
             if detections.count and true.count:
                 check_names(detections.class_names, true.class_names)
             self._classes.update(true.class_names or true.labels())
-            self._truth.add(true, self._ignored(true))
+            self._pairs.add_truth(true.stamp, objects_of(true, self._ignored(true)))
         self._known.update(detections.class_names)
-        self._detections.add(detections)
+        self._pairs.add_found(detections.stamp, objects_of(detections))
+        if truth:
+            self._known_to = truth[-1].stamp
+        if self._known_to is not None:  # in a live run the truth may come late
+            self._take(self._pairs.settle(min(self._known_to, detections.stamp)))
 
     def on_reset(self, input: str) -> None:
         """A clock jumped back, so stamps do not tell any more what belongs together: the score begins anew."""
@@ -70,25 +76,19 @@ class DetectionMetrics(Operator):
 
     def finish(self) -> None:
         """Computes the figures and writes the file."""
-        frames = self._frames()
-        classes = score_frames(
-            frames,
-            sorted(self._classes),
-            max_detections=self.max_detections,
-            iou=self.iou,
-            score_threshold=self.score_threshold,
-        )
+        self._take(self._pairs.finish())
+        classes = self._score.classes(sorted(self._classes))
         self._figures = {
-            "frames": len(frames),
-            "unmatched_detections": len(self._detections) - len(frames),
-            "unmatched_truths": len(self._truth) - len(frames),
+            "frames": self._score.frames,
+            "unmatched_detections": self._pairs.unmatched_found,
+            "unmatched_truths": self._pairs.unmatched_truths,
             "truth_objects": sum(score.truth for score in classes.values()),
             "ignored_objects": sum(score.ignored for score in classes.values()),
             "detections": sum(score.detections for score in classes.values()),
         } | self._averages(classes)
-        beyond = [name for frame in frames for name in frame.labels if name not in self._classes]
+        beyond = {name: n for name, n in self._score.detections().items() if name not in self._classes}
         if beyond:
-            self._figures["detections_not_judged"] = len(beyond)
+            self._figures["detections_not_judged"] = sum(beyond.values())
             self._figures["classes_not_in_truth"] = listed(set(beyond))
         if self.out is not None:
             self._write(Path(self.out).expanduser(), classes)
@@ -104,10 +104,9 @@ class DetectionMetrics(Operator):
             ignored |= truth.pixel_counts < self.min_pixels
         return ignored
 
-    def _frames(self) -> list[ScoredFrame]:
-        found, truth = self._detections, self._truth
-        pairs = mutually_nearest(found.stamps, truth.stamps, self.tolerance)
-        return [_scored(found.image(i), truth.image(j)) for i, j in pairs]
+    def _take(self, pairs: list[tuple[Objects, Objects]]) -> None:
+        for found, truth in pairs:
+            self._score.add(_scored(found, truth))
 
     def _averages(self, classes: Mapping[str, ClassScore]) -> dict[str, float | int | str]:
         ap50 = {name: score.ap50 for name, score in classes.items() if score.ap50 is not None}

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
 from operators.segmentation.dataset import MaskedImage
+from operators.segmentation.labelled import VOID
 from operators.segmentation.score import confusion, mean_iou, named
-from operators.segmentation.segmenter import VOID, Segmenter
+from operators.segmentation.segmenter import Segmenter
 
 
 def assess(weights: Path, classes: Sequence[str], images: Sequence[MaskedImage]) -> dict[str, Any]:

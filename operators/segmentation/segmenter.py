@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.fit import Fit
+from operators.network_input import three_channels
+from operators.segmentation.labelled import VOID, enlarged, labelled
 from operators.segmentation.scores import best_classes, probability
 from operators.weights import NetworkFileError, open_network, shipped
-
-VOID = 255
 
 
 class Segmenter(Operator):
@@ -49,21 +49,16 @@ class Segmenter(Operator):
 
     def process(self, image: Image) -> SegmentationMap:
         network = self._network
-        pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
         fit = Fit.plan("letterbox", (image.width, image.height), network.size)
         wanted = self.with_confidence or self.confidence_threshold > 0
-        classes, confidence = self._answered(network.run(fit.apply(pixels)), wanted)
-        labels = np.asarray(_enlarged(classes, fit, cv2.INTER_NEAREST), np.uint8)
-        sure = None if confidence is None else np.asarray(_enlarged(confidence, fit, cv2.INTER_LINEAR), np.float32)
-        if sure is not None and self.confidence_threshold > 0:
-            labels = np.where(sure < self.confidence_threshold, np.uint8(VOID), labels)
-        return SegmentationMap(
-            stamp=image.stamp,
-            frame=image.frame,
-            class_names=network.classes,
-            void=VOID,
-            classes=labels,
-            confidence=np.clip(sure, 0, 1) if sure is not None and self.with_confidence else None,
+        classes, confidence = self._answered(network.run(fit.apply(three_channels(image.data))), wanted)
+        return labelled(
+            image,
+            network.classes,
+            np.asarray(enlarged(classes, fit, cv2.INTER_NEAREST), np.uint8),
+            None if confidence is None else np.asarray(enlarged(confidence, fit, cv2.INTER_LINEAR), np.float32),
+            least=self.confidence_threshold,
+            with_confidence=self.with_confidence,
         )
 
     def _answered(
@@ -75,10 +70,3 @@ class Segmenter(Operator):
             return best_classes(found[0][0]), probability(found[0][0], step) if wanted else None
         classes, confidence = found
         return classes[0].astype(np.uint8), confidence[0] if wanted else None
-
-
-def _enlarged(values: NDArray[Any], fit: Fit, interpolation: int) -> NDArray[Any]:
-    """The part of the input that the image takes, at the image's size."""
-    (x, y), (width, height) = fit.offset, fit.inner
-    part = np.ascontiguousarray(values[y : y + height, x : x + width])
-    return part if fit.inner == fit.image else np.asarray(cv2.resize(part, fit.image, interpolation=interpolation))

@@ -15,11 +15,16 @@ from rich.table import Table
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
+from dataflow.api.graphs import resolved
 from dataflow.shipped import graph as shipped_graph
 from operators.training.console import Json, fail, friendly, out_console
 
-DATA_NAMES = ("data", "path", "folder", "recording")
+DATA_NAMES = ("data", "path", "folder", "file", "recording")
 """Parameters of a graph that `--data FOLDER` may mean."""
+_SCORES = "operators.evaluation:"
+
+Figures = Mapping[str, Mapping[str, Any]]
+"""Figures that operators sum up at the end of a run, by operator and name."""
 
 
 def evaluate_graph(
@@ -32,41 +37,76 @@ def evaluate_graph(
     data: Annotated[
         list[str] | None,
         typer.Option(
-            "--data", metavar="FOLDER|NAME=FOLDER", help="The data: sets the graph's parameter for it. May be repeated."
+            "--data",
+            metavar="FOLDER|NAME=FOLDER|FILE.mcap",
+            help="The data: sets the graph's parameter for it; a recording replaces the sources. May be repeated.",
         ),
     ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="NAME=VALUE", help="Set a graph parameter, or OPERATOR.PARAM. May be repeated."),
     ] = None,
+    everything: Annotated[
+        bool, typer.Option("--all", help="What all operators count, not only the figures of metrics.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Run a graph and print the figures of its metrics.
 
-    `--data FOLDER` sets the parameter data, path, folder or recording, whichever the graph has; `--data NAME=FOLDER`
-    one of another name.
+    `--data FOLDER` sets the parameter data, path, folder, file or recording, whichever the graph has; `--data
+    NAME=FOLDER` one of another name. `--data FILE.mcap` replays a recording in place of the graph's sources. Metrics
+    are the operators of operators.evaluation and those of your own that give figures and have no outputs.
 
     Examples:
 
       dataflow evaluate graph graphs/lidar.yaml --data ../data/kitti_raw
       dataflow evaluate graph graphs/localize.yaml --set duration=20s --json
+
+      dataflow evaluate graph perception --data recordings/demo.mcap
     """
     with friendly():
         graph = _file(graph)
-        given = [*data_settings(parameters_of(graph), data or ()), *(settings or ())]
-    command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), "--json", "--quiet"]
+        parameters = parameters_of(graph)
+        recording, folders = recording_in(parameters, data or ())
+        given = [*data_settings(parameters, folders), *(settings or ())]
+    words = ["run", str(graph)] if recording is None else ["replay", str(recording), "--graph", str(graph)]
+    command = [sys.executable, "-m", "dataflow.cli.main", *words, "--json", "--quiet"]
     ran = subprocess.run(
         [*command, *(word for one in given for word in ("--set", one))], stdout=subprocess.PIPE, text=True, check=False
     )
     if ran.returncode:
         raise typer.Exit(ran.returncode)  # the run has said why
-    figures = {name: summary for name, summary in jsonlib.loads(ran.stdout)["summaries"].items() if summary}
+    every = {name: summary for name, summary in jsonlib.loads(ran.stdout)["summaries"].items() if summary}
+    figures = every if everything else {name: every[name] for name in metrics_of(graph, given) if name in every}
     if not figures:
         fail(f"no operator of {graph} gives figures: wire a metrics operator, such as operators.evaluation:...Metrics")
     if json:
-        typer.echo(jsonlib.dumps({"graph": str(graph), "settings": given, "figures": figures}, indent=2))
+        told = {"graph": str(graph), "settings": given, "figures": figures}
+        typer.echo(jsonlib.dumps(told | ({} if recording is None else {"recording": str(recording)}), indent=2))
         return
     out_console.print(table_of(figures))
+
+
+def recording_in(parameters: Mapping[str, Any], data: Sequence[str]) -> tuple[Path | None, list[str]]:
+    """Returns the recording among what `--data` named, None where there is none, and the rest.
+
+    A graph with a parameter `recording` is given it there. Raises ValueError for two, FileNotFoundError for one that is
+    missing.
+    """
+    found = [entry for entry in data if entry.endswith(".mcap") and entry.partition("=")[0] not in parameters]
+    if not found or "recording" in parameters:
+        return None, list(data)
+    if len(found) > 1:
+        raise ValueError(f"--data names {len(found)} recordings ({', '.join(found)}); one takes the sources' place")
+    if not Path(found[0]).is_file():
+        raise FileNotFoundError(f"no recording {found[0]!r} (looked for {Path(found[0]).absolute()})")
+    return Path(found[0]), [entry for entry in data if entry != found[0]]
+
+
+def metrics_of(graph: Path, settings: Sequence[str]) -> list[str]:
+    """Returns the names of the operators that score: those of operators.evaluation, and others without outputs."""
+    nodes = resolved(graph, dict(one.split("=", 1) for one in settings)).nodes
+    return [name for name, node in nodes.items() if node.use.startswith(_SCORES) or not node.outputs]
 
 
 def _file(graph: Path) -> Path:
@@ -106,7 +146,7 @@ def data_settings(parameters: Mapping[str, Any], data: Sequence[str]) -> list[st
     return made
 
 
-def table_of(figures: Mapping[str, Mapping[str, Any]]) -> Table:
+def table_of(figures: Figures) -> Table:
     """Returns a table of all figures by operator."""
     table = Table("operator", "figure", "value")
     for operator, summary in figures.items():

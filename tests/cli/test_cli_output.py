@@ -77,6 +77,7 @@ STREAMS = ["robot1/camera/image", "robot1/camera/depth", "robot1/odometry/odomet
         (["odometry/*", "camera/depth"], STREAMS[1:3]),  # in the order of the recording
         (["/tf"], STREAMS[3:]),  # as foreign recordings name them
         (["tf"], STREAMS[3:]),
+        (["depth"], STREAMS[1:2]),  # by its last part
         (None, STREAMS),
     ],
 )

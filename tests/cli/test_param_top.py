@@ -2,31 +2,23 @@
 
 from __future__ import annotations
 
-import io
 import json
 import signal
 import threading
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
-from rich.console import Console
 
-from dataflow.cli.board import Board, Sample, heading, line, shown
 from dataflow.client.attach import find_running
-from dataflow.client.processes import ProcessStatus
-from dataflow.graph import load_graph, load_text
-from dataflow.graph.model import Graph
+from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.records.reading import recorded_firings
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.report import RunReport
 from dataflow.supervision.supervisor import Supervisor
-from dataflow.sync import NEVER
-from dataflow.transport.registry import RunningGraph
 
 GRAPH = """\
 graph: tunable
@@ -63,9 +55,41 @@ class Background:
         return report
 
 
+class Shared:
+    """The graph that most tests look at: begun by the first that asks, and anew where one has ended it."""
+
+    def __init__(self, folders: pytest.TempPathFactory) -> None:
+        self._folders = folders
+        self._background: Background | None = None
+
+    def begun(self) -> Background:
+        if self._background is None:
+            self._background = Background(self._folders.mktemp("tunable"))
+        return self._background
+
+    def end(self) -> None:
+        if self._background is not None:
+            self._background.end()
+            self._background = None
+
+
 @pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Background]:
-    background = Background(tmp_path_factory.mktemp("tunable"))
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shared]:
+    made = Shared(tmp_path_factory)
+    yield made
+    made.end()
+
+
+@pytest.fixture
+def running(shared: Shared) -> Background:
+    return shared.begun()
+
+
+@pytest.fixture
+def alone(shared: Shared, tmp_path: Path) -> Iterator[Background]:
+    """A graph for one test, which may stop or end it; it is the only one that runs."""
+    shared.end()
+    background = Background(tmp_path)
     yield background
     if background.thread.is_alive():
         background.end()
@@ -73,6 +97,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Background]:
 
 @pytest.mark.usefixtures("running")
 def test_a_parameter_is_set_acknowledged_and_read_back(dataflow) -> None:
+    dataflow("param", "set", "tuned.factor", "1")
     assert dataflow("param", "get", "tuned.factor").stdout == "1.0\n"
 
     assert dataflow("param", "set", "tuned.factor", "2.5").stdout == "tuned.factor = 2.5\n"
@@ -134,8 +159,9 @@ def test_values_are_dumped_as_yaml_and_loaded_again_as_far_as_they_differ(datafl
     file = tmp_path / "tuned.yaml"
     before = dataflow("param", "get", "tuned.factor").stdout.strip()
     assert dataflow("param", "dump").stdout == f'"tuned":\n  factor: {before}\n'
-    dataflow("param", "dump", file)
+    dataflow("param", "dump", "-o", file)
     assert "exists; name another file" in dataflow("param", "dump", file, code=2).stderr
+    assert "both name what to write" in dataflow("param", "dump", file, "-o", file, code=2).stderr
     dataflow("param", "set", "tuned.factor", "4.5")
 
     assert dataflow("param", "load", file).stdout == f"tuned.factor = {before}\n"
@@ -206,9 +232,8 @@ def test_top_tells_the_latency_of_every_path_of_the_last_seconds(dataflow) -> No
     assert "costs most" in dataflow("top", "--once", "--every", "0.3").stdout
 
 
-def test_a_process_that_does_not_answer_is_shown_so_and_a_change_waits_for_it(dataflow, running: Background) -> None:
-    """The last test of the file but one: the process is stopped for a moment."""
-    process = running.process_of("tuned")
+def test_a_process_that_does_not_answer_is_shown_so_until_it_goes_on(dataflow, alone: Background) -> None:
+    process = alone.process_of("tuned")
     process.send_signal(signal.SIGSTOP)
     try:
         rows = rows_of(dataflow("top", "--json", "--every", "0.1"))
@@ -222,158 +247,21 @@ def test_a_process_that_does_not_answer_is_shown_so_and_a_change_waits_for_it(da
     assert "nobody answered for 'tuned' within 0.5 s" in told
     assert "nobody answered for tuned within 0.5 s" in missing.stderr
     assert "slow.sleep" in missing.stdout
+    assert dataflow("param", "set", "tuned.factor", "7", "--timeout", "30").stdout == "tuned.factor = 7.0\n"
 
 
-def test_the_changes_stand_in_the_recording_and_top_ends_with_the_graph(dataflow, running: Background) -> None:
-    """The last test of the file: it ends the graph."""
-    threading.Timer(0.5, running.supervisor.stop).start()
+def test_the_changes_stand_in_the_recording_and_top_ends_with_the_graph(dataflow, alone: Background) -> None:
+    for value in ("2.5", "3"):
+        dataflow("param", "set", "tuned.factor", value)
+    threading.Timer(0.5, alone.supervisor.stop).start()
     told = dataflow("top", "--every", "0.2")
-    running.thread.join(60)
+    alone.thread.join(60)
 
     assert "tunable has ended" in told.stderr
     lines = told.stdout.splitlines()
     assert [text for text in lines if "operator" in text] == lines[:1]  # one heading
     assert {text.split()[1] for text in lines[1:]} == {"left", "tuned", "slow", "other"}
-    with Recording(running.recording) as recording:
+    with Recording(alone.recording) as recording:
         changed = [r.detail["value"] for r in recorded_firings(recording, "tuned") if r.kind == "param"]
-    assert changed[:2] == [2.5, 3.0]
+    assert changed == [2.5, 3.0]
     assert "no graph runs" in dataflow("top", code=2).stderr
-
-
-# The board alone
-
-
-Counts = tuple[int, int, int, int, int, int]
-
-
-def graph_with(*names: str) -> Graph:
-    """A graph of operators with these names, of which a board needs no more."""
-    graph = load_text(GRAPH)
-    return replace(graph, nodes={name: replace(graph.nodes["left"], name=name) for name in names})
-
-
-def status(
-    process: str,
-    *,
-    restarts: int = 0,
-    ended: bool = False,
-    waits: dict[str, dict[tuple[str, str], int]] | None = None,
-    behind: dict[str, tuple[float, float]] | None = None,
-    **counts: Counts,
-) -> ProcessStatus:
-    through = frozenset(counts if ended else ())
-    return ProcessStatus(process, counts, dict.fromkeys(counts, restarts), through, waits or {}, behind or {})
-
-
-def test_the_board_follows_operators_from_answer_to_answer() -> None:
-    board = Board(graph_with("camera", "detector", "planner"))
-    board.update(
-        [status("eyes", camera=(10, 10, 0, 0, 10**9, 0)), status("brain", detector=(0, 0, 0, 0, NEVER, 0))], 1.0
-    )
-    sample = board.update(
-        [
-            status("eyes", camera=(40, 40, 0, 0, 4 * 10**9, 0)),
-            status("brain", detector=(5, 5, 6, 10**9, 2 * 10**9, 15 * 10**8)),
-        ],
-        3.0,
-    )
-
-    camera, detector, planner = sample.rows
-    assert (camera.rate, camera.lag, camera.state, camera.process) == (15.0, 0.0, "running", "eyes")
-    assert (detector.rate, detector.load, detector.wall, detector.drop_rate) == (2.5, 0.5, 0.75, 3.0)
-    assert (detector.lag, detector.state) == (2.0, "dropping")
-    assert (planner.state, planner.process, planner.lag) == ("no answer", "", None)
-
-
-def test_the_board_keeps_the_last_counts_of_a_process_that_is_away_and_takes_up_its_successor() -> None:
-    board = Board(graph_with("camera"))
-    board.update([status("eyes", camera=(10, 10, 2, 0, 10**9, 0))], 1.0)
-
-    (away,) = board.update([], 2.0).rows
-    assert (away.state, away.firings, away.dropped, away.rate) == ("no answer", 10, 2, 0.0)
-    (back,) = board.update([status("eyes", restarts=1, camera=(1, 1, 0, 0, 2 * 10**9, 0))], 3.0).rows
-    assert (back.state, back.restarts, back.rate) == ("running", 1, 1.0)
-    (over,) = board.update([status("eyes", restarts=1, ended=True, camera=(5, 5, 0, 0, 2 * 10**9, 0))], 4.0).rows
-    assert over.state == "ended"
-
-
-def test_timeouts_and_late_messages_are_no_drops() -> None:
-    board = Board(graph_with("fusion"))
-    board.update([status("brain", fusion=(10, 10, 0, 0, 10**9, 0))], 1.0)
-    waits = {"fusion": {("image", "timeout"): 3, ("image", "late"): 2, ("cloud", "late"): 1}}
-    sample = board.update([status("brain", fusion=(20, 20, 0, 0, 2 * 10**9, 0), waits=waits)], 2.0)
-
-    (fusion,) = sample.rows
-    assert (fusion.state, fusion.dropped, fusion.timeouts, fusion.late) == ("timeout", 0, 3, 3)
-    headings = next(text for text in printed(sample, 80) if text.startswith("operator")).split()
-    assert headings == ["operator", "process", "state", "Hz", "timeouts", "late", "CPU", "wall", "lag"]
-
-
-@pytest.mark.parametrize(
-    ("read", "sent", "cpu", "told"),
-    [
-        (15.0, 15.1, 0.9, "reading it takes longer than real time"),
-        (
-            15.0,
-            15.1,
-            0.4,
-            "reading it computes for 40% of the time that it takes, and for the rest it waits: for a dev",
-        ),
-        (15.0, 15.1, 0.01, "reading it waits, for a device or a file, and computes next to nothing"),
-        (0.1, 15.1, 0.1, "its process is busy with detector"),
-    ],
-)
-def test_a_source_behind_the_clock_is_named_with_who_holds_it_up(
-    read: float, sent: float, cpu: float, told: str
-) -> None:
-    board = Board(graph_with("camera", "detector"))
-    board.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
-    counts = {"camera": (20, 20, 0, round(cpu * 1e9), 2 * 10**9, 10**9), "detector": (9, 9, 0, 0, 2 * 10**9, 0)}
-
-    sample = board.update([status("all", behind={"camera": (read, sent)}, **counts)], 2.0)
-
-    note = sample.behind["camera"]
-    assert note.startswith(f"source 'camera' is 15.1 s behind the clock: {told}")
-    camera, detector = sample.rows
-    assert (camera.behind_clock, detector.behind_clock) == (15.1, None)
-    row = next(text for text in printed(sample, 100) if text.startswith("camera"))
-    assert row.split()[-2:] == ["15.1", "s"]
-
-
-def printed(sample: Sample, width: int) -> list[str]:
-    """The lines of a sample on a terminal."""
-    console = Console(width=width, file=io.StringIO(), record=True, legacy_windows=False)
-    console.print(shown(sample, RunningGraph("robot", "robot", 1, 0.0, (), 0.0, {})))
-    return [text.rstrip() for text in console.export_text().splitlines()]
-
-
-def test_the_table_fits_a_terminal_of_80_columns() -> None:
-    names = ["robot", "front_camera/depth_decoder", "trajectory_score", "detector"]
-    board = Board(graph_with(*names))
-    counts = dict.fromkeys(names, (12345678, 1, 1234567, 10**9, 10**18, 10**9))
-    board.update([ProcessStatus("perception_process", counts, dict.fromkeys(names, 12), frozenset())], 1.0)
-    more = {name: (12345999, 1, 1239999, 10**10, 10**18 - 10**9 * k, 10**10) for k, name in enumerate(names)}
-    sample = board.update([ProcessStatus("perception_process", more, dict.fromkeys(names, 12), frozenset())], 2.0)
-
-    lines = printed(sample, 80)
-
-    assert max(map(len, lines)) <= 80
-    text = "\n".join(lines)
-    assert "…" not in "".join(each[-50:] for each in lines)  # numbers are whole
-    assert "1,239,999" in text
-    assert "321.0" in text
-
-
-def test_lines_stand_under_their_heading() -> None:
-    board = Board(graph_with("camera", "detector"))
-    board.update([status("all", camera=(10, 10, 0, 0, 10**9, 0), detector=(5, 5, 0, 0, 10**9, 0))], 1.0)
-    sample = board.update(
-        [status("all", camera=(20, 20, 1234, 10**8, 2 * 10**9, 0), detector=(9, 9, 0, 0, 10**9, 0))], 2.0
-    )
-
-    top = heading(sample)
-    for row in sample.rows:
-        text = line(row, sample, 12.0)
-        assert text[top.index("state") :].startswith(row.state)
-        assert text[: top.index("Hz") + 2].endswith(f"{row.rate:.1f}")
-        assert len(text) <= len(top)

@@ -6,6 +6,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from mcap.reader import make_reader
 
 from dataflow.client.attach import find_running, graph_of
 from dataflow.client.recorder import AttachedRecorder, Splitting, Subscription, record, subscribed
@@ -87,6 +88,22 @@ def test_split_files_hold_everything_once_and_static_messages_each(
     for file in files:
         with Recording(file) as recording:
             assert recording.counts("test/left/constant") == {0: 1}
+
+
+def test_every_file_is_compressed_as_is_asked_for(graph: Graph, tmp_path: Path) -> None:
+    split = Splitting(every=30 * MS)
+    with AttachedRecorder(
+        tmp_path / "a.mcap", graph, ["test/smooth/mean"], metadata={}, splitting=split, compression="lz4"
+    ) as recorder:
+        for seq in range(6):
+            recorder.take(said(seq))
+
+    assert len(recorder.tally.files) == 2
+    for file in recorder.tally.files:
+        with Path(file).open("rb") as opened:
+            summary = make_reader(opened).get_summary()
+        assert summary is not None
+        assert {chunk.compression for chunk in summary.chunk_indexes} == {"lz4"}
 
 
 def test_the_oldest_that_wait_are_let_go_when_there_is_no_room() -> None:

@@ -51,6 +51,15 @@ def test_the_networks_see_adapted_images_where_that_is_asked_for(adapt: bool, so
         assert graph.nodes[f"perception/{network}"].inputs["image"] == (f"robot1/perception/{source}",)
 
 
+def test_where_boxes_and_masks_are_given_no_network_runs() -> None:
+    nodes = load_graph(REPOSITORY / "graphs" / "perception_given.yaml").nodes
+    assert not {"perception/detector", "perception/segmenter"} & nodes.keys()
+    lifter, tracker = nodes["perception/lifter"].inputs, nodes["perception/tracker"].inputs
+    assert lifter["detections"] == tracker["detections"] == ("robot1/robot/objects",)
+    assert lifter["segmentation"] == ("robot1/robot/masks",)
+    assert nodes["perception/objects"].inputs["boxes"] == ("robot1/perception/lifter/boxes",)
+
+
 @pytest.mark.parametrize(
     ("name", "folder", "cut", "left_out", "must"),
     [

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from example_messages import example
-from made_bags import header, imus, ros, write_ros1, write_ros2
+from made_bags import header, imus, ros, transform, write_ros1, write_ros2
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -169,6 +169,44 @@ def test_bag_of_ros_goes_through_byte_for_byte_and_unknown_types_survive(tmp_pat
     assert contents(tmp_path / "again", "/box") == contents(bag, "/box")
     with AnyReader([tmp_path / "again"]) as reader:
         assert {c.topic: c.msgcount for c in reader.connections} == {"/imu": 5, "/box": 1, "/humid": 1}
+
+
+def test_static_transforms_of_a_bag_stay_static_in_a_recording_and_on_the_way_back(tmp_path: Path) -> None:
+    rows = [
+        ("/tf_static", START, ros("tf2_msgs/TFMessage", transforms=[transform(0, "base", "camera")])),
+        ("/tf", START, ros("tf2_msgs/TFMessage", transforms=[transform(START, "odom", "base")])),
+        ("/tf_static", START + 5, ros("tf2_msgs/TFMessage", transforms=[transform(0, "base", "lidar")])),
+        ("/tf", START + 9, ros("tf2_msgs/TFMessage", transforms=[transform(START + 9, "odom", "base")])),
+    ]
+    bag = write_ros2(tmp_path / "bag", rows)
+
+    with Material(bag) as material:
+        export_own(material, tmp_path / "own.mcap", Exported())
+    with Recording(tmp_path / "own.mcap") as recording:
+        assert {name: info.static for name, info in recording.streams.items()} == {"tf": False, "tf_static": True}
+        (fixed,) = [r.message for r in recording.messages(["tf_static"])]
+    assert isinstance(fixed, Transforms)
+    assert fixed.child_frames == ("camera", "lidar")
+    assert fixed.stamp == START
+    with Material(tmp_path / "own.mcap") as material:
+        export_ros2(material, tmp_path / "again", Exported())
+
+    with AnyReader([tmp_path / "again"]) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections} == {"/tf": 2, "/tf_static": 1}
+    with Material(tmp_path / "again") as material:
+        export_own(material, tmp_path / "back.mcap", Exported())
+    with Recording(tmp_path / "own.mcap") as one, Recording(tmp_path / "back.mcap") as other:
+        assert one.digests() == other.digests()
+
+
+def test_a_bag_of_static_transforms_alone_becomes_a_recording(tmp_path: Path) -> None:
+    row = ("/tf_static", START, ros("tf2_msgs/TFMessage", transforms=[transform(0, "base", "camera")]))
+
+    with Material(write_ros2(tmp_path / "bag", [row])) as material:
+        export_own(material, tmp_path / "own.mcap", Exported())
+
+    with Recording(tmp_path / "own.mcap") as recording:
+        assert [r.message.child_frames for r in recording.messages()] == [("camera",)]
 
 
 def test_ros_1_bag_becomes_a_ros_2_bag(tmp_path: Path) -> None:

@@ -137,6 +137,18 @@ def test_a_lerobot_dataset_of_format_3_says_which_rows_of_which_file_an_episode_
     ]
 
 
+def test_a_stream_whose_messages_change_in_size_is_named_with_what_leaves_it_out(tmp_path: Path) -> None:
+    streams = arm()
+    longer = JointState(stamp=START + 11 * SECOND // 10, names=("a", "b", "c"), positions=np.zeros(3))
+    late = Image(stamp=START + 12 * SECOND // 10, frame="c", data=np.zeros((12, 16, 3), np.uint8))
+    streams["arm/joints"].append(longer)
+    streams["camera/image"].append(late)
+    path = write(tmp_path / "a.mcap", streams)
+
+    with Material(path) as material, pytest.raises(RecordingError, match=r"--without robot1/arm/joints$"):
+        export_lerobot(material, tmp_path / "set", Exported(), action="cmd/twist")
+
+
 def test_a_single_number_is_a_number_in_the_table_as_lerobot_takes_it(tmp_path: Path) -> None:
     streams = arm()
     streams["arm/joints"] = [Number(stamp=m.stamp, value=float(k)) for k, m in enumerate(streams["camera/image"])]

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from lint_material import MadeMaterial, simulated
 
+import dataflow
 from dataflow.lint.clocks import clock_difference
 from dataflow.lint.contract import Contract
 from dataflow.lint.look import Report, lint
-from dataflow.lint.turning import Turning
+from dataflow.lint.turning import Turning, turning_of
+from operators.sources import SyntheticRgbd
 
 
 def turning(times: np.ndarray, rate, offset: float = 0.0, drift: float = 0.0) -> Turning:
@@ -45,6 +49,31 @@ def test_two_that_do_not_turn_alike_tell_nothing() -> None:
     assert clock_difference(Turning(0, times[:-1], times[1:], noise), turning(times, swaying)) is None
     assert clock_difference(still, turning(times, swaying)) is None
     assert clock_difference(turning(times[:20], swaying), turning(times, swaying)) is None
+
+
+def test_a_few_seconds_tell_nothing_however_alike_they_are() -> None:
+    reference = turning(np.arange(0.0, 40.0, 0.01), swaying)
+    assert clock_difference(turning(np.arange(1.0, 5.0, 0.03), swaying), reference) is None
+    assert clock_difference(turning(np.arange(1.0, 12.0, 0.03), swaying), reference) is not None
+
+
+def test_what_would_be_no_clock_is_not_taken_for_a_drift() -> None:
+    reference = turning(np.arange(0.0, 40.0, 0.01), swaying)
+    assert clock_difference(turning(np.arange(5.0, 35.0, 0.03), swaying, drift=0.05), reference) is None
+
+
+def test_a_camera_that_sways_for_four_seconds_has_no_clock_to_be_judged(tmp_path: Path) -> None:
+    graph = dataflow.Graph("short")
+    graph.add("camera", SyntheticRgbd, frames=120, rate=30, width=160, height=120)
+    graph.run(record=tmp_path / "short.mcap")
+
+    with dataflow.open(tmp_path / "short.mcap") as recording:
+        images, poses = recording["image"], recording["ground_truth"]
+        seen = turning_of(images, "Image", int(images.stamps[0]))
+        true = turning_of(poses, "Pose", int(images.stamps[0]))
+    assert seen is not None
+    assert true is not None
+    assert clock_difference(seen, true) is None
 
 
 def report(contract: Contract | None = None, **sensors: object) -> Report:

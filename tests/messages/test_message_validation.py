@@ -188,6 +188,13 @@ REFUSED: list[tuple[Message, dict[str, Any], str]] = [
     (planes, {"coefficients": [[0, 0, 2, 1]]}, r"Planes\.coefficients\[0\] must have unit length, got \[0\.0, 0\.0, 2"),
     (planes, {"labels": [0, 1]}, r"Planes\.labels\[1\] must be -1 or index the 1 planes"),
     (planes, {"extents": [[1, 1]]}, r"Planes\.extents is given without centers, orientations"),
+    (planes, {"hulls": np.zeros((3, 3))}, r"Planes\.hulls is given without hull_counts"),
+    (planes, {"hulls": np.zeros((3, 3)), "hull_counts": [4]}, r"Planes\.hull_counts\[0\] must lie in \[0, 3\]"),
+    (
+        planes,
+        {"hulls": np.zeros((3, 3)), "hull_counts": [2]},
+        r"hull_counts must add up to the 3 corners of hulls, got 2",
+    ),
     (
         planes,
         {"extents": [[1, -1]], "centers": [[0, 0, 0]], "orientations": [UNIT]},

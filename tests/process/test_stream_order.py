@@ -94,6 +94,16 @@ def test_a_successor_says_where_its_predecessor_had_got_to_and_what_is_missing_o
     assert whole.take(said_by_successor) == Verdict(repeats=True)
 
 
+def test_a_successor_with_nothing_more_to_say_ends_the_stream_again_as_it_ended() -> None:
+    order = StreamOrder((0, 0))
+    *_, over = take_all(order, stream_of(4))[0]
+
+    assert order.take(end(4, 9000)) == Verdict()
+    assert [order.take(end(0, NEVER, incarnation)) for incarnation in (1, 2)] == [Verdict(over)] * 2
+    assert order.take(message(0, 9000, incarnation=2)).taken
+    assert order.take(end(1, 9000, incarnation=2)).taken == end(1, 9000, incarnation=2)
+
+
 def test_an_end_after_a_jump_back_is_no_earlier_than_what_was_promised() -> None:
     order = StreamOrder()
     taken, _ = take_all(order, [message(0), message(1), frontier(2, 700), end(2, 700)])

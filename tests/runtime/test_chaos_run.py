@@ -63,6 +63,20 @@ def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
     assert diagnosed
 
 
+def test_a_process_that_is_started_again_after_its_sources_have_ended_ends_in_order(tmp_path: Path) -> None:
+    """The recorder has their ends, and is told to expect them again: 60 steps of 8 ms, then a hang of 300 ms."""
+    path = tmp_path / "late.mcap"
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=60"], live=True)
+    plan = {"faults": [{"kind": "hang", "operator": "slow", "at": "470ms"}]}
+
+    report = run(graph, live=True, placement="one_process", record=path, faults=plan_of(plan, graph), rate=1.0)
+
+    assert report.restarts == dict.fromkeys(("left", "right", "mix", "slow", "smooth", "merge", "tuned", "sum"), 1)
+    with Recording(path) as recording:
+        assert recording.metadata["dataflow:outcome"]["outcome"] == "complete"
+    assert verify(path, jobs=1).identical
+
+
 def test_a_parameter_that_is_changed_changes_what_comes_after_and_is_repeated(tmp_path: Path) -> None:
     path = tmp_path / "tuned.mcap"
     graph = load_graph(HERE / "chaos.yaml", settings=["count=60"], live=True)

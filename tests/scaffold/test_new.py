@@ -42,7 +42,7 @@ def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
         call("new", "operator", f"Another{kind}", "--kind", kind, "--to", project / "my_robot")
     call("new", "graph", "second", "--to", project / "graphs")
     assert (project / "tests" / "test_anothersource.py").is_file()
-    assert "9 passed" in run_tests(project, tmp_path)
+    assert "11 passed" in run_tests(project, tmp_path)
 
 
 def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> None:
@@ -52,7 +52,7 @@ def test_operators_begin_in_any_folder_and_pass_their_tests(tmp_path: Path) -> N
         *(f"my_{kind}.py" for kind in KINDS),
         *(f"test_my_{kind}.py" for kind in KINDS),
     }
-    assert "4 passed" in run_tests(tmp_path, tmp_path)
+    assert "5 passed" in run_tests(tmp_path, tmp_path)
 
 
 def test_what_is_written_is_in_the_projects_own_format(tmp_path: Path) -> None:

@@ -323,6 +323,10 @@ def _planes(values: Values, rng: Rng) -> None:
     rectangle = ("centers", "orientations", "extents")
     if any(values[name] is None for name in rectangle):
         values.update(dict.fromkeys(rectangle))
+    if count and values["hulls"] is not None and values["hull_counts"] is not None:
+        values["hull_counts"] = np.bincount(rng.integers(0, count, len(values["hulls"])), minlength=count)
+    else:
+        values.update(hulls=None, hull_counts=None)
     if values["labels"] is not None:
         values["labels"] = rng.integers(-1, count, values["labels"].shape, dtype=np.int32)
 

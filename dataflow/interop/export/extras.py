@@ -92,4 +92,5 @@ def tell_left_out(material: Material, what: str, done: Exported) -> None:
 def tell_runs(extras: Extras, done: Exported) -> None:
     """Says that the metadata of a run are not carried over."""
     if extras.runs:
-        done.left_out[RUN_FACTS] = f"{extras.runs} records tell of the run and its firing records, which stay behind"
+        tells = "record tells" if extras.runs == 1 else "records tell"
+        done.left_out[RUN_FACTS] = f"{extras.runs} {tells} of the run and its firing records, which stay behind"

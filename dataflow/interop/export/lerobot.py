@@ -224,8 +224,14 @@ def _vector(key: str, messages: list[Message], streams: list[str], plan: _Plan) 
     names = [f"{stream}/{name}" for stream, (_, found) in zip(streams, parts, strict=True) for name in found]
     known = plan.vectors.setdefault(key, names)
     if known != names:
+        changed = [
+            stream
+            for stream in streams
+            if [n for n in names if n.startswith(f"{stream}/")] != [n for n in known if n.startswith(f"{stream}/")]
+        ]
         raise RecordingError(
-            f"{key}: {len(names)} numbers after {len(known)}: --stream can leave out what changes size"
+            f"{key}: {len(names)} numbers after {len(known)}, and LeRobot takes rows of one length: leave out what "
+            f"changes size with {' '.join(f'--without {stream}' for stream in changed)}"
         )
     values = np.concatenate([found for found, _ in parts])
     plan.statistics.setdefault(key, _Statistics()).add(values[np.newaxis])

@@ -73,6 +73,12 @@ class Material:
         """Streams of some message types, the order of `types` first."""
         return [name for kind in types for name, info in self.streams.items() if info.message_type is kind]
 
+    def first_stamp(self, names: Sequence[str] | None = None) -> int | None:
+        """The stamp of the first message of some streams, or of all, that is not static; None where there is none."""
+        chosen = [self.streams[name] for name in (self.streams if names is None else names)]
+        firsts = [info.first for info in chosen if not info.static and info.first is not None]
+        return max(min(firsts), self.start or 0) if firsts else None
+
     def stored(self, topics: Sequence[str]) -> Iterator[Stored]:
         """Serialised messages of topics by log time, those of the span."""
         low, high = self.start or 0, self.end

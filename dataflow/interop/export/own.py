@@ -13,7 +13,10 @@ from dataflow.recording.layout import BAG
 
 
 def export_own(material: Material, file: Path, done: Exported, *, overwrite: bool = False) -> None:
-    """Writes a recording: every stream as its message type, topics that nothing here reads byte for byte."""
+    """Writes a recording: every stream as its message type, topics that nothing here reads byte for byte.
+
+    Static messages of a bag, which may be stamped by another clock, get the stamp of the first other message.
+    """
     metadata = {BAG: {"file": material.path.name, "clock": material.clock}}
     with RecordingWriter(file, metadata=metadata, overwrite=overwrite) as writer:
         names = {name: name.strip("/") or name for name in material.streams}
@@ -23,9 +26,12 @@ def export_own(material: Material, file: Path, done: Exported, *, overwrite: boo
         for topic in material.untouched:
             writer.add_untouched(topic.name, topic.encoding, topic.schema, topic.channel)
         numbers: dict[str, int] = {}
+        begin = material.first_stamp()
         for recorded in material.messages():
             seq = numbers.get(recorded.stream, 0)
-            writer.write(names[recorded.stream], recorded.message, seq=seq)
+            placed = material.foreign and begin is not None and material.streams[recorded.stream].static
+            message = recorded.message.replace(stamp=begin) if placed else recorded.message
+            writer.write(names[recorded.stream], message, seq=seq)
             numbers[recorded.stream] = seq + 1
             done.count(names[recorded.stream])
         for stored in material.stored([t.name for t in material.untouched]):

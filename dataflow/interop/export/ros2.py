@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -185,7 +184,7 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
             mapped.append(name)
         else:
             done.left_out[material.names[name]] = f"{kind.SCHEMA} has no counterpart in ROS"
-    begin = _first_stamp(material, mapped)
+    begin = material.first_stamp(mapped) or 0
     for recorded in material.messages(mapped) if mapped else ():
         name = recorded.stream
         static = material.streams[name].static
@@ -202,14 +201,6 @@ def _convert(material: Material, names: list[str], writer: Ros2Writer, done: Exp
             raise RecordingError(f"{name} at {recorded.stamp} does not fit into {kind_of}: {error}") from error
         writer.write(topic, schemas[kind_of], data, stamp, latched=static)
         done.count(topic)
-
-
-def _first_stamp(material: Material, names: list[str]) -> int:
-    """The stamp at which static messages are recorded: that of the first other one."""
-    firsts: Iterator[int] = (
-        info.first for name in names if not (info := material.streams[name]).static and info.first is not None
-    )
-    return max(min(firsts, default=0), material.start or 0)
 
 
 def _ros_name(name: str) -> str:

@@ -13,6 +13,7 @@ from dataflow.view.visualizers.clouds import finite_rows
 
 _UNBOUNDED = 2.0  # metres: side of the square that stands for a plane without an extent
 _NORMAL = 0.3  # metres
+_SHEER = 90  # opacity of planes, of 255
 
 
 @visualizer(OccupancyGrid, "space")
@@ -61,7 +62,7 @@ def mesh(canvas: Canvas, message: Mesh) -> None:
 
 @visualizer(Planes, "space")
 def planes(canvas: Canvas, message: Planes) -> None:
-    """The rectangle seen of each plane, else a square where it comes nearest to the origin; and the normals."""
+    """The hull or the rectangle seen of each plane, else a square where it comes nearest to the origin; and normals."""
     paint = colors.of_identities(list(range(message.count)))
     normals = message.coefficients[:, :3]
     if message.centers is not None and message.orientations is not None and message.extents is not None:
@@ -72,23 +73,51 @@ def planes(canvas: Canvas, message: Planes) -> None:
         centers = -normals[shown] * message.coefficients[shown, 3:]
         turned = np.array([matrix_to_quaternion(_basis(n)) for n in normals[shown]]).reshape(-1, 4)
         extents = np.full((len(shown), 2), _UNBOUNDED)
-    half = np.column_stack([extents / 2, np.full(len(shown), 0.002)])
-    canvas.draw(
-        "space",
-        message.frame,
-        rr.Boxes3D(
-            centers=centers,
-            half_sizes=half,
-            quaternions=turned,
-            colors=np.column_stack([paint[shown], np.full(len(shown), 90, np.uint8)]),
-            fill_mode=rr.components.FillMode.Solid,
-        ),
-    )
+    if message.hulls is not None:
+        _hulls(canvas, message, paint)
+    else:
+        half = np.column_stack([extents / 2, np.full(len(shown), 0.002)])
+        canvas.draw(
+            "space",
+            message.frame,
+            rr.Boxes3D(
+                centers=centers,
+                half_sizes=half,
+                quaternions=turned,
+                colors=np.column_stack([paint[shown], np.full(len(shown), _SHEER, np.uint8)]),
+                fill_mode=rr.components.FillMode.Solid,
+            ),
+        )
     canvas.draw(
         "space/normals",
         message.frame,
         rr.Arrows3D(origins=centers, vectors=normals[shown] * _NORMAL, colors=paint[shown]),
     )
+
+
+def _hulls(canvas: Canvas, message: Planes, paint: np.typing.NDArray[np.uint8]) -> None:
+    """Draws the hulls as sheets of triangles around their first corner, and their edges."""
+    hulls = [message.hull(k) for k in range(message.count)]
+    drawn = [k for k, hull in enumerate(hulls) if len(hull) > 2 and np.isfinite(hull).all()]
+    if not drawn:
+        canvas.clear("space")
+        canvas.clear("space/edges")
+        return
+    sizes = np.array([len(hulls[k]) for k in drawn])
+    starts = np.cumsum(sizes) - sizes
+    fans = [start + np.array([[0, i, i + 1] for i in range(1, n - 1)]) for start, n in zip(starts, sizes, strict=True)]
+    sheer = np.column_stack([paint[drawn], np.full(len(drawn), _SHEER, np.uint8)])
+    canvas.draw(
+        "space",
+        message.frame,
+        rr.Mesh3D(
+            vertex_positions=np.concatenate([hulls[k] for k in drawn]),
+            triangle_indices=np.concatenate(fans),
+            vertex_colors=np.repeat(sheer, sizes, axis=0),
+        ),
+    )
+    edges = [np.vstack([hulls[k], hulls[k][:1]]) for k in drawn]
+    canvas.draw("space/edges", message.frame, rr.LineStrips3D(edges, colors=paint[drawn]))
 
 
 def _basis(normal: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:

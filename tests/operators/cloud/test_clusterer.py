@@ -87,16 +87,25 @@ def test_the_partition_does_not_depend_on_the_order_of_points(seed: int) -> None
     assert len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
 
 
-@given(st.integers(0, 500))
-def test_clusters_are_those_of_the_definition(seed: int) -> None:
-    points = np.random.default_rng(seed).uniform(0, 1, (60, 3))
-    labels = dbscan(points, 0.2, 4, np.ones(60, np.intp))
-    near = np.linalg.norm(points[:, None] - points[None], axis=2) <= 0.2
+@given(st.integers(0, 500), st.sampled_from([(0.2, 0.2), (0.05, 0.6)]))
+def test_clusters_are_those_of_the_definition(seed: int, reaches: tuple[float, float]) -> None:
+    rng = np.random.default_rng(seed)
+    points, reach = rng.uniform(0, 1, (60, 3)), rng.uniform(*reaches, 60)
+    labels = dbscan(points, reach, 4, np.ones(60, np.intp))
+    distance = np.linalg.norm(points[:, None] - points[None], axis=2)
+    near = distance <= np.minimum(reach[:, None], reach[None])
     core = near.sum(axis=1) >= 4
     assert (labels[core] >= 0).all()
     same = labels[:, None] == labels[None]
     assert same[near & core[:, None] & core[None]].all()
-    assert ((labels >= 0) == (near & core[None]).any(axis=1)).all()
+    joins = ((distance <= reach[:, None]) & core[None]).any(axis=1)
+    assert ((labels >= 0) == (core | joins)).all()
+
+
+def test_far_points_are_neighbours_at_a_longer_distance_than_near_ones() -> None:
+    pair = np.concatenate([bar((0, y, 0), (0.05, 0.05, 0.05), 0, 400) for y in (0, 0.15)])
+    clusters, _, _, _ = clustered(np.concatenate([pair + np.array([x, 0, 0]) for x in (1.0, 6.0)]))
+    assert clusters.labels.tolist() == [0] * 400 + [1] * 400 + [2] * 800
 
 
 def test_small_and_large_clusters_are_left_out() -> None:

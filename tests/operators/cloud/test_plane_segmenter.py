@@ -106,6 +106,24 @@ def test_the_rectangle_of_a_table_is_what_is_seen_of_it() -> None:
     np.testing.assert_allclose(center, [1.8, -0.8, 0.75], atol=0.03)
 
 
+def test_the_hull_of_a_plane_is_what_is_seen_of_it() -> None:
+    T, parts = optical(), room()
+    corner = parts["table"][:, 0] + parts["table"][:, 1] > 1.6  # a table that lacks one
+    parts["table"] = parts["table"][~corner]
+    planes, surfaces, _ = segmented(cloud(parts, T), T)
+    table = planes.hull(surfaces.labels().index("table"))
+    flat = transform_points(T, table)
+    assert np.ptp(flat[:, 2]) < 0.02
+    x, y = flat[:, 0], flat[:, 1]
+    area = 0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum()  # above 0 where they go round counter-clockwise
+    assert area == pytest.approx(1.2 * 0.8 - 0.5 * 0.4**2, abs=0.04)  # of voxel means: 1 cm less on all sides
+    for k in range(planes.count):
+        assert np.abs(planes.hull(k) @ planes.coefficients[k, :3] + planes.coefficients[k, 3]).max() < 1e-6
+        outward = np.cross(np.roll(planes.hull(k), -1, axis=0) - planes.hull(k), planes.coefficients[k, :3])
+        on = planes.hull(k) @ outward.T - np.einsum("ij,ij->i", planes.hull(k), outward)
+        assert on.max() < 1e-4  # no corner lies outside of an edge
+
+
 def test_without_a_pose_the_parameter_says_which_way_is_up() -> None:
     T = optical()
     given = cloud(room(), T)
@@ -119,6 +137,45 @@ def test_an_upright_plane_with_a_wall_behind_it_is_no_wall_and_stays_in_the_rest
     assert sorted(surfaces.labels()) == ["floor", "other", "wall", "wall"]
     assert planes.inlier_counts[surfaces.labels().index("other")] > 0.9 * len(parts["cupboard"])
     assert rest.count > len(parts["cupboard"])
+
+
+def leaf(angle: float, seed: int = 3) -> np.ndarray:
+    """The leaf of a door, 0.85 m wide, that hangs in the wall at x = 3 and stands open by an angle."""
+    along = 0.85 * np.array([-np.sin(angle), np.cos(angle), 0])
+    return patch((2.99, 0.2, 0), along, (0, 0, 2.0), 1500, np.random.default_rng(seed))
+
+
+@pytest.mark.parametrize("degrees", [12, 25])
+def test_a_door_that_stands_ajar_is_no_wall_and_no_part_of_one(degrees: float) -> None:
+    T, parts = optical(), room(table=False)
+    behind = (parts["wall x"][:, 1] > 0.2) & (parts["wall x"][:, 1] < 1.05) & (parts["wall x"][:, 2] < 2.0)
+    parts["wall x"] = parts["wall x"][~behind]
+    parts["door"] = leaf(np.radians(degrees))
+    planes, surfaces, _ = segmented(cloud(parts, T), T)
+    assert sorted(surfaces.labels()) == ["floor", "other", "wall", "wall"]
+    of = np.repeat(np.arange(len(parts)), [len(p) for p in parts.values()])
+    door = planes.labels == surfaces.labels().index("other")
+    assert (of[door] == list(parts).index("door")).mean() > 0.97
+    normals = planes.coefficients[[name == "wall" for name in surfaces.labels()], :3] @ T[:3, :3].T
+    assert np.abs(normals).max(axis=1) == pytest.approx(1, abs=1e-3)
+
+
+def test_walls_seen_before_tell_that_a_door_seen_alone_stands_ajar() -> None:
+    T, parts = optical(), room(table=False)
+    alone = {"floor": parts["floor"], "door": leaf(np.radians(25))}
+    clouds = [cloud(parts, T, 1), cloud(alone, T, 2)]
+    played = play(PlaneSegmenter(), {"cloud": clouds, "pose": [pose(T, 1), pose(T, 2)]})
+    labels = [surfaces.labels() for surfaces in played["surfaces"] if isinstance(surfaces, Boxes3D)]
+    assert sorted(labels[1]) == ["floor", "other"]
+    _, surfaces, _ = segmented(clouds[1], T)
+    assert sorted(surfaces.labels()) == ["floor", "wall"]  # nothing has told of walls there
+
+
+def test_walls_that_meet_at_no_right_angle_are_found() -> None:
+    T, parts = optical(), room(table=False)
+    parts["wall y"] = patch((0, 2.6, 0), (3, -1.2, 0), (0, 0, 2.4), 700, np.random.default_rng(2))
+    _, surfaces, _ = segmented(cloud(parts, T), T)
+    assert sorted(surfaces.labels()) == ["floor", "wall", "wall"]
 
 
 def test_the_floor_is_remembered_where_only_a_table_is_seen() -> None:

@@ -141,6 +141,19 @@ def test_truth_beyond_the_tolerance_is_no_truth() -> None:
     assert score([near], [true([("mug", A, 1.0)])], tolerance="2ms")["frames"] == 1
 
 
+def test_truth_that_comes_late_is_scored_all_the_same() -> None:
+    metrics = DetectionMetrics()
+    metrics.setup()
+    objects: list[Item] = [("mug", A, 1.0)]
+    late = {2: (true(objects, 0), true(objects, 1)), 5: tuple(true(objects, k) for k in range(2, 6))}
+    for k in range(6):
+        metrics.process(found(objects, k), late.get(k, ()))
+    metrics.finish()
+    figures = metrics.summary()
+    assert (figures["frames"], figures["unmatched_detections"], figures["unmatched_truths"]) == (6, 0, 0)
+    assert figures["recall"] == 1.0
+
+
 def average_precision(hits: list[bool], objects: int) -> float:
     """Mean of the best precision at recall ≥ 0, 0.01 ... 1, of hits by falling score."""
     right = np.cumsum(hits)

@@ -164,7 +164,7 @@ def test_black_and_frozen_images_are_noticed_and_bridged() -> None:
     assert results[10].reason == "left image is black"
     assert results[12].status is Status.TRACKING
     assert errors(results[12:], poses[12:])[0] < 0.1
-    frozen = follow([pairs[9] if 10 <= i < 12 else pair for i, pair in enumerate(pairs)])
+    frozen = follow([*pairs[:10], pairs[9]])
     assert frozen[10].reason == "left image repeats the last one; right image repeats the last one"
 
 

@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from dataflow.cli.main import app
 from operators.training.evaluation import evaluate
-from operators.training.graph_evaluation import data_settings
+from operators.training.graph_evaluation import data_settings, recording_in
 
 GRAPH = """
 graph: scored
@@ -36,7 +37,39 @@ def test_a_graph_is_run_and_its_figures_are_printed(tmp_path: Path) -> None:
     (tmp_path / "scored.yaml").write_text(GRAPH)
     ran = CliRunner().invoke(evaluate, ["graph", str(tmp_path / "scored.yaml"), "--set", "frames=5", "--json"])
     assert ran.exit_code == 0, ran.output
-    assert json.loads(ran.stdout)["figures"]["metrics"]["matched"] == 5
+    figures = json.loads(ran.stdout)["figures"]
+    assert list(figures) == ["metrics"]  # the odometry counts, too, and that is no score
+    assert figures["metrics"]["matched"] == 5
+
+
+def test_a_recording_takes_the_place_of_the_sources(tmp_path: Path) -> None:
+    (tmp_path / "scored.yaml").write_text(GRAPH)
+    recording = tmp_path / "four.mcap"
+    ran = CliRunner().invoke(app, ["run", str(tmp_path / "scored.yaml"), "--record", str(recording), "-q"])
+    assert ran.exit_code == 0, ran.output
+    words = ["graph", str(tmp_path / "scored.yaml"), "--data", str(recording), "--all", "--json"]
+    ran = CliRunner().invoke(evaluate, words)
+    assert ran.exit_code == 0, ran.output
+    told = json.loads(ran.stdout)
+    assert told["recording"] == str(recording)
+    assert told["figures"]["metrics"]["matched"] == 4
+    assert told["figures"]["odometry"]["tracking"] == 4
+
+
+@pytest.mark.parametrize(
+    ("data", "found"),
+    [
+        (["here"], (None, ["here"])),
+        (["path=a.mcap"], (None, ["path=a.mcap"])),  # said to be the parameter's
+    ],
+)
+def test_only_a_recording_by_itself_is_replayed(data: list[str], found: tuple[None, list[str]]) -> None:
+    assert recording_in({"path": 1}, data) == found
+    assert recording_in({"recording": 1}, ["a.mcap"]) == (None, ["a.mcap"])
+    with pytest.raises(FileNotFoundError, match=r"no recording 'nowhere/a\.mcap' \(looked for"):
+        recording_in({}, ["nowhere/a.mcap"])
+    with pytest.raises(ValueError, match="names 2 recordings"):
+        recording_in({}, ["a.mcap", "b.mcap"])
 
 
 @pytest.mark.parametrize(

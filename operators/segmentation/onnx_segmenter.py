@@ -1,0 +1,167 @@
+"""Semantic segmentation with a network in an ONNX file."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages import Diagnostics, Image, SegmentationMap
+from dataflow.messages.diagnostics import Level
+from dataflow.operator import In, Operator, Out, Param
+from operators.detection.fit import Fit, FitMode
+from operators.inference import ModelError, Provider, open_session
+from operators.network_input import Labels, image_input, read_labels, three_channels
+from operators.segmentation.drawing import draw_segmentation
+from operators.segmentation.labelled import labelled
+from operators.segmentation.onnx_answer import at_image, best_of, classes_of, scores_of, told
+from operators.status import Row, status_of_rows
+
+_MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # ImageNet's, by which most were trained
+
+
+class OnnxSegmenter(Operator):
+    """Gives every pixel a class with any exported segmentation network; on the CPU with one thread, the same each time.
+
+    The model has one input, (1, 3, H, W) or (1, H, W, 3) of float, half or uint8, and answers with scores (1, C, H, W)
+    or (1, H, W, C) in any resolution, or with a map of classes (1, H, W) of whole numbers. Scores are brought to the
+    image's size before the best class is taken, so edges are as fine as scores allow. One channel of scores is a class
+    and its background. Size, layout and type are read from the model; class names, palette, mean and deviation from
+    parameters, else from its metadata (`names`, `palette`, `mean`, `std`).
+    """
+
+    stateless = True
+
+    image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
+    segmentation: Out[SegmentationMap] = Out(doc="class of every pixel of the image")
+    painted: Out[Image] = Out(doc="the image in its classes' colours, with `paint`")
+    status: Out[Diagnostics] = Out(doc="the classes in the image: share and mean confidence; a warning if all is void")
+
+    model: str = Param(min_length=1, doc="ONNX file")
+    classes: str | None = Param(
+        None,
+        doc="text file with one class name a line, with or without its colour (`road 128 64 128`); none means the "
+        "names in the model's metadata, or numbers",
+    )
+    provider: Provider = Param("cpu", doc="onnxruntime's execution provider; results repeat bit for bit on the CPU")
+    output: str | None = Param(None, doc="name of the output with scores or classes; none means the first")
+    scores: Literal["logits", "probabilities"] = Param("logits", doc="what scores are")
+    mean: tuple[float, float, float] | None = Param(
+        None, doc="subtracted from a pixel as a share of 1, red first; none: the metadata's, or ImageNet's"
+    )
+    std: tuple[float, float, float] | None = Param(None, doc="what the difference is divided by; the same")
+    bgr: bool = Param(False, doc="the network sees blue first")
+    fit: FitMode = Param("stretch", doc="how the image fills the input")
+    input_size: tuple[int, int] = Param((512, 512), doc="(width, height) where the model leaves it open", unit="px")
+    confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void")
+    class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
+    with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
+    paint: bool = Param(False, live=True, doc="also give the image painted")
+
+    def setup(self) -> None:
+        """Loads the model. Raises FileNotFoundError, or ModelError where parameters do not fit it."""
+        file = self.use_file(self.model)
+        self._session = open_session(file, self.provider)
+        facts = told(file, self._session.get_modelmeta().custom_metadata_map)
+        self._labels = facts.labels if self.classes is None else read_labels(self.use_file(self.classes))
+        mean, std = self.mean or facts.mean, self.std or facts.std
+        if min(self.input_size) < 1 or (std is not None and min(std) <= 0):
+            raise ModelError(f"input_size and std must be above 0, are {self.input_size} and {std}")
+        self._input = image_input(
+            file,
+            self._session,
+            self.input_size,
+            bgr=self.bgr,
+            mean=[255 * value for value in mean or _MEAN],
+            scale=[255 * value for value in std or _DEVIATION],
+        )
+        if self._input.type is np.uint8 and (self.mean, self.std) != (None, None):
+            raise ModelError(f"{file} takes pixels of uint8 as they are: leave mean and std out")
+        found = {each.name: each for each in self._session.get_outputs()}
+        self._output = next(iter(found)) if self.output is None else self.output
+        if self._output not in found:
+            raise ModelError(f"{file} has no output {self._output!r}; it has {', '.join(found)}")
+        self._sure = "int" not in found[self._output].type
+        if not self._sure and (self.confidence_threshold or self.class_thresholds or self.with_confidence):
+            raise ModelError(
+                f"{file} gives classes without scores ({found[self._output].type}), so no confidence is known: leave "
+                f"thresholds and with_confidence out, or name an output with scores"
+            )
+        if self._labels is not None:
+            self._check_thresholds(self._labels)
+
+    def process(self, image: Image) -> dict[str, Any]:
+        """Raises ModelError where the model's output is no scores and no map of classes, or has other classes."""
+        fit = Fit.plan(self.fit, (image.width, image.height), self._input.size)
+        tensor = self._input.tensor(fit.apply(three_channels(image.data)))
+        output = np.asarray(self._session.run([self._output], {self._input.name: tensor})[0])
+        try:
+            classes, confidence, names = self._scored(output, fit) if self._sure else self._mapped(output, fit)
+        except ValueError as error:
+            raise ModelError(f"output {self._output!r} of {self.model}: {error}") from None
+        void = 255 if max(len(names), int(classes.max(initial=0))) <= 255 else 65535
+        made = labelled(
+            image,
+            names,
+            classes.astype(np.uint8 if void == 255 else np.uint16),
+            confidence,
+            least=np.array([self.class_thresholds.get(n, self.confidence_threshold) for n in names], np.float32),
+            with_confidence=self.with_confidence,
+            void=void,
+        )
+        messages = {"segmentation": made, "status": _status(made, confidence)}
+        if self.paint:
+            palette = {} if self._labels is None else self._labels.palette
+            messages["painted"] = draw_segmentation(image, made, palette)
+        return messages
+
+    def _scored(
+        self, output: NDArray[Any], fit: Fit
+    ) -> tuple[NDArray[np.intp], NDArray[np.float32] | None, tuple[str, ...]]:
+        shares = self.scores == "probabilities"
+        scores = scores_of(output, None if self._labels is None else len(self._labels.names), shares)
+        names = tuple(map(str, range(len(scores)))) if self._labels is None else self._labels.names
+        if len(names) != len(scores):
+            raise ValueError(
+                f"there are scores of {len(scores)} classes ({output.shape}), but {len(names)} class names; give the "
+                f"model's own in OnnxSegmenter.classes"
+            )
+        if self._labels is None:
+            self._check_thresholds(Labels(names, {}))
+        planes = np.stack([at_image(plane, fit, cv2.INTER_LINEAR) for plane in scores])
+        return *best_of(planes, shares), names
+
+    def _mapped(self, output: NDArray[Any], fit: Fit) -> tuple[NDArray[np.intp], None, tuple[str, ...]]:
+        classes = at_image(classes_of(output).astype(np.int32), fit, cv2.INTER_NEAREST)
+        names = () if self._labels is None else self._labels.names
+        known = classes[classes != 255] if names and len(names) <= 255 else classes
+        if classes.min(initial=0) < 0 or (names and known.max(initial=0) >= len(names)):
+            raise ValueError(f"it has class {classes.min()} to {known.max()}, but there are {len(names)} class names")
+        return classes, None, names
+
+    def _check_thresholds(self, labels: Labels) -> None:
+        for name, value in self.class_thresholds.items():
+            if name not in labels.names or not 0 <= value <= 1:
+                raise ModelError(
+                    f"OnnxSegmenter.class_thresholds has {name!r}: {value}; it takes shares from 0 to 1 for "
+                    f"{', '.join(labels.names)}"
+                )
+
+
+def _status(made: SegmentationMap, confidence: NDArray[np.float32] | None) -> Diagnostics:
+    """A row for each class in the image with its share and mean confidence."""
+    flat = made.classes.reshape(-1)
+    counts = np.bincount(flat)
+    sums = None if confidence is None else np.bincount(flat, confidence.reshape(-1))
+    rows: list[Row] = []
+    for k in np.flatnonzero(counts).tolist():
+        name = "void" if k == made.void else made.class_names[k] if made.class_names else str(k)
+        share = counts[k] / len(flat)
+        figures = {"share": f"{share:.4f}"}
+        if sums is not None:
+            figures["confidence"] = f"{sums[k] / counts[k]:.4f}"
+        text = ", ".join(f"{key} {value}" for key, value in figures.items())
+        rows.append((name, text, Level.WARN if name == "void" and share == 1 else Level.OK, figures))
+    return status_of_rows(made.stamp, rows)
