@@ -16,7 +16,6 @@ import os
 import sys
 import time
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +26,7 @@ sys.path.insert(0, str(REPOSITORY))
 import cv2  # noqa: E402
 import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
+from odometry_worlds import Drive  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.evaluation.trajectory import align  # noqa: E402
@@ -48,17 +48,6 @@ MOUNTS: dict[str, Any] = {  # the camera of the drive that makes a map is the wo
 }
 TRY = 20  # frames at 10 Hz within which a camera is to be found
 WRONG = (0.2, 0.1)  # metres and radians beyond which a pose is wrong
-
-
-@dataclass(frozen=True, eq=False)
-class Drive:
-    """Images (N, H, W, 3), depths (N, H, W), true camera poses (N, 4, 4), stamps (N,)."""
-
-    image: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    truth: Array
-    stamps: NDArray[np.int64]
-    camera: RgbdCamera
 
 
 def rendered(cache: Path, world: str, seed: int, seconds: int, mount: str | None) -> Drive:

@@ -107,9 +107,14 @@ class SharedPool:
         """Bytes of blocks whose arrays are held by this process, and of those that it has let go of since."""
 
     def room(self, nbytes: int) -> npt.NDArray[np.uint8] | None:
-        """Returns memory to make an array on, held until the last view of it is gone; None when there is none."""
+        """Returns memory to make an array on, held until the last view of it is gone; None when there is none.
+
+        Never waits: None, too, while another thread is at the pool, or this one, whose work a finaliser interrupts.
+        """
         capacity = _capacity(BEFORE + nbytes)
-        with self._lock:
+        if not self._lock.acquire(blocking=False):
+            return None
+        try:
             while self._let_go:
                 self._here -= self._let_go.popleft()
             fits = self._here + capacity <= self.size // _HELD_HERE and not self._closed
@@ -123,7 +128,9 @@ class SharedPool:
             self._arrays[claim.key] = claim
             block.claims = (claim,)
             self._out.setdefault(capacity, deque()).append(block)
-        return array
+            return array
+        finally:
+            self._lock.release()
 
     def _let_array_go(self, claim: _Array) -> None:
         """Nobody here holds an array any more. Called at any moment, on any thread: so without the lock."""

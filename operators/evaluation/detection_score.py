@@ -108,7 +108,8 @@ class DetectionScore:
         matched = {name: self._matched.get(name) or _Matched() for name in names}
         if not names:
             return {}
-        evaluation = self._evaluation(categories=len(names))
+        evaluation = self._evaluation(None, None)
+        evaluation.params.imgIds, evaluation.params.catIds = [0], list(range(len(names)))
         evaluation.params.maxDets = [max(1, *(len(m.scores) for m in matched.values()))]  # each image has had its limit
         evaluation._paramsEval = evaluation.params
         evaluation.evalImgs = [m.as_one_image(len(evaluation.params.iouThrs)) for m in matched.values()]
@@ -118,14 +119,12 @@ class DetectionScore:
         lowest = float(np.float32(self._threshold))  # scores are float32
         return {name: matched[name].score(curves[:, :, k], lowest) for k, name in enumerate(names)}
 
-    def _evaluation(self, categories: int, truth: Any = None, found: Any = None) -> COCOeval:
+    def _evaluation(self, truth: COCO | None, found: COCO | None) -> COCOeval:
         evaluation = self._eval(truth, found, "bbox")
         params = evaluation.params
         params.iouThrs = np.append(params.iouThrs, self._iou)
         params.maxDets = [self._max_detections]
         params.areaRng, params.areaRngLbl = [list(_AREA_RANGE)], ["all"]
-        if truth is None:
-            params.imgIds, params.catIds = [0], list(range(categories))
         return evaluation
 
     def _match(self) -> None:
@@ -140,7 +139,7 @@ class DetectionScore:
         truths, found = list(_truths(frames, numbers)), list(_found(frames, numbers))
         with contextlib.redirect_stdout(io.StringIO()):
             parts = (_coco(self._coco(), images, categories, rows) for rows in (truths, found))
-            evaluation = self._evaluation(len(names), *parts)
+            evaluation = self._evaluation(*parts)
             evaluation.evaluate()
         by_number = [self._matched.setdefault(name, _Matched()) for name in names]
         for row in truths:

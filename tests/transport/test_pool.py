@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from transport_envelopes import carrying
+from transport_envelopes import Holder, carrying
 
 from dataflow.messages import DepthImage
 from dataflow.transport.codec import encode_head, encode_parts, parts_size
@@ -21,22 +21,6 @@ from dataflow.transport.shared import Board, PoolReader, make_board
 
 KIB = 1 << 10
 DEPTH = "robot1/camera/depth"
-
-
-class Holder:
-    """A consumer that releases what it is told to."""
-
-    def __init__(self) -> None:
-        self.done: set[int] = set()
-
-    def released(self, slot: int, generation: int) -> bool:
-        return generation in self.done
-
-    def mapped(self, base: int) -> bool:
-        return True
-
-    def release(self, block: Block) -> None:
-        self.done.add(block.generation)
 
 
 def write(pool: SharedPool, size: int, holder: Holder) -> Block | None:

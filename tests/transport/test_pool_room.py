@@ -12,7 +12,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from transport_envelopes import carrying
+from transport_envelopes import Holder, carrying
 
 from dataflow.messages import DepthImage, Message, PointCloud
 from dataflow.messages.memory import LARGE, copied, make_large_arrays_in
@@ -20,19 +20,6 @@ from dataflow.transport.codec import decode, encode_parts, parts_size
 from dataflow.transport.pool import Block, SharedPool
 
 KIB = 1 << 10
-
-
-class Holder:
-    """A consumer that releases what it is told to."""
-
-    def __init__(self) -> None:
-        self.done: set[int] = set()
-
-    def released(self, slot: int, generation: int) -> bool:
-        return generation in self.done
-
-    def mapped(self, base: int) -> bool:
-        return True
 
 
 @pytest.fixture
@@ -124,6 +111,17 @@ def test_arrays_that_a_process_keeps_leave_most_of_the_pool_to_others(pool: Shar
     again = depth(1)
     assert len(pool._arrays) == 1
     assert again.data.any()
+
+
+def test_an_array_is_made_elsewhere_rather_than_waited_for(pool: SharedPool) -> None:
+    """Another thread may be at the pool; or this one is, and a finaliser makes a message."""
+    with pool._lock:
+        assert pool.room(LARGE) is None
+        message = depth(5)
+    assert (message.data == 5).all()
+    assert not pool._arrays
+    assert depth(6).data.base is not None
+    assert pool.room(LARGE) is not None
 
 
 def test_arrays_outlive_the_pool_and_new_ones_are_made_elsewhere() -> None:
