@@ -14,6 +14,8 @@ import numpy as np
 import pyarrow as pa
 from dora import Node
 
+PAUSE = float(os.environ.get("PAUSE", "0.01"))
+
 
 def answer(node: Any) -> Any:
     while True:
@@ -30,7 +32,7 @@ def main(size: int, count: int) -> list[float]:
     took = []
     time.sleep(1.0)
     for _ in range(count):
-        time.sleep(0.01)
+        time.sleep(PAUSE)
         source[:8] = np.frombuffer(np.int64(time.monotonic_ns()).tobytes(), np.uint8)
         node.send_output("ping", pa.array(source))
         sent = int(np.frombuffer(answer(node).to_numpy().tobytes(), np.int64)[0])

@@ -13,6 +13,8 @@ import time
 
 import numpy as np
 
+PAUSE = float(os.environ.get("PAUSE", "0.01"))
+
 
 def main(size: int, count: int) -> list[float]:
     memory = mmap.mmap(-1, size + 4096)
@@ -28,7 +30,7 @@ def main(size: int, count: int) -> list[float]:
     source = np.zeros(size, np.uint8)
     took = []
     for _ in range(count):
-        time.sleep(0.01)
+        time.sleep(PAUSE)
         source[:8] = np.frombuffer(np.int64(time.monotonic_ns()).tobytes(), np.uint8)
         view[:size] = source
         os.eventfd_write(there, 1)

@@ -48,6 +48,8 @@ class End:
         sample.delete()
         return first
 
+PAUSE = float(os.environ.get("PAUSE", "0.01"))
+
 
 def main(size: int, count: int) -> list[float]:
     name = f"roundtrip/{os.getpid()}"
@@ -62,7 +64,7 @@ def main(size: int, count: int) -> list[float]:
     source = np.zeros(size, np.uint8)
     took = []
     for _ in range(count):
-        time.sleep(0.01)
+        time.sleep(PAUSE)
         source[:8] = np.frombuffer(np.int64(time.monotonic_ns()).tobytes(), np.uint8)
         end.give(source)
         sent = int(end.take().view(np.int64)[0])

@@ -15,6 +15,8 @@ import numpy as np
 
 URL = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=33554432"
 
+PAUSE = float(os.environ.get("PAUSE", "0.01"))
+
 
 def main(size: int, count: int) -> list[float]:
     pid = os.fork()
@@ -31,7 +33,7 @@ def main(size: int, count: int) -> list[float]:
     source = np.zeros(size, np.uint8)
     took = []
     for _ in range(count):
-        time.sleep(0.01)
+        time.sleep(PAUSE)
         source[:8] = np.frombuffer(np.int64(time.monotonic_ns()).tobytes(), np.uint8)
         bus.publish("ping", source.tobytes())
         while not replies:

@@ -6,8 +6,8 @@
 
 VENV is a virtual environment with dora-rs, dora-rs-cli, eclipse-zenoh, iceoryx2, lcm, pyarrow and numpy.
 
-One process sends an array that holds the time, another answers with its first eight bytes, 100 times a second; a round
-trip ends when the first process has the answer as a number. Every contestant's processes are started anew for each
+One process sends an array that holds the time, another answers with its first eight bytes, 100 times a second or after
+the `--pause` that is asked for; a round trip ends when the first process has the answer as a number. Every contestant's processes are started anew for each
 round and size, so one bad placement cannot decide. The figure of a round is its median; the table gives the median over
 rounds and, of the ratio to dora, the smallest and largest over rounds: on a noisy machine ratios of one round mean more
 than times of different ones.
@@ -98,9 +98,11 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--count", type=int, default=150)
     parser.add_argument("--sizes", default="1008,921600,8294400")
+    parser.add_argument("--pause", type=float, default=0.01, help="seconds from one answer to the next message")
     parser.add_argument("--against", type=Path, help="another checkout, as contestant `there`")
     parser.add_argument("--only", default="", help="names of contestants, separated by commas")
     arguments = parser.parse_args()
+    os.environ["PAUSE"] = str(arguments.pause)
     contestants: dict[str, Callable[[int, int], list[float]]] = {"ours": ours(ROOT), "floor": script("floor", None)}
     if arguments.against is not None:
         contestants["there"] = ours(arguments.against.resolve())

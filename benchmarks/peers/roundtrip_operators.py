@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterator, Mapping
 
@@ -11,7 +12,7 @@ import numpy as np
 from dataflow.messages import FeatureVector, Message
 from dataflow.operator import In, Operator, Out, Param, Source
 
-PERIOD = 0.01
+PAUSE = float(os.environ.get("PAUSE", "0.01"))
 
 
 def vector(stamp: int, numbers: np.ndarray) -> FeatureVector:
@@ -29,7 +30,7 @@ class Ping(Source):
     def stream(self) -> Iterator[Mapping[str, Message]]:
         numbers = np.zeros(self.nbytes // 4, np.float32)
         for _ in range(self.count):
-            time.sleep(PERIOD)
+            time.sleep(PAUSE)
             numbers[:2] = np.array([time.monotonic_ns()]).view(np.float32)
             yield {"array": vector(time.time_ns(), numbers)}
 

@@ -15,6 +15,8 @@ import time
 import numpy as np
 import zenoh
 
+PAUSE = float(os.environ.get("PAUSE", "0.01"))
+
 
 def session(*, listen: str | None = None, connect: str | None = None) -> zenoh.Session:
     config = zenoh.Config()
@@ -60,7 +62,7 @@ def main(size: int, count: int) -> list[float]:
         time.sleep(2.0)
         source = np.zeros(size, np.uint8)
         for _ in range(count):
-            time.sleep(0.01)
+            time.sleep(PAUSE)
             source[:8] = np.frombuffer(np.int64(time.monotonic_ns()).tobytes(), np.uint8)
             ping.put(source.tobytes())
             sent = int(np.frombuffer(replies.get(timeout=10), np.int64)[0])
