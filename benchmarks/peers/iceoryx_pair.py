@@ -48,6 +48,7 @@ class End:
         sample.delete()
         return first
 
+
 PAUSE = float(os.environ.get("PAUSE", "0.01"))
 
 

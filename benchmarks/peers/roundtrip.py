@@ -7,10 +7,10 @@
 VENV is a virtual environment with dora-rs, dora-rs-cli, eclipse-zenoh, iceoryx2, lcm, pyarrow and numpy.
 
 One process sends an array that holds the time, another answers with its first eight bytes, 100 times a second or after
-the `--pause` that is asked for; a round trip ends when the first process has the answer as a number. Every contestant's processes are started anew for each
-round and size, so one bad placement cannot decide. The figure of a round is its median; the table gives the median over
-rounds and, of the ratio to dora, the smallest and largest over rounds: on a noisy machine ratios of one round mean more
-than times of different ones.
+the `--pause` that is asked for; a round trip ends when the first process has the answer as a number. Every contestant's
+processes are started anew for each round and size, so one bad placement cannot decide. The figure of a round is its
+median; the table gives the median over rounds and, of the ratio to dora, the smallest and largest over rounds: on a
+noisy machine ratios of one round mean more than times of different ones.
 """
 
 from __future__ import annotations

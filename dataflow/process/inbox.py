@@ -63,13 +63,17 @@ class Inbox:
 
     def get(self, timeout: float) -> Item:
         """Returns the next item, or raises `queue.Empty` when there is none in time, or something else woke it."""
-        if timeout > 0 and self.empty():
+        if timeout > 0 and not self._items:
             self._wait(timeout)
         return self.get_nowait()
 
     def _wait(self, timeout: float) -> None:
         self._asleep = True
-        if not self._items and not sum(not ring.sleep() for ring in self._incoming):
+        arrived = bool(self._items)
+        for ring in self._incoming:
+            if not ring.sleep():
+                arrived = True
+        if not arrived:
             self._turn.release()
             try:
                 self._poll.poll(timeout)

@@ -212,11 +212,13 @@ class OperatorProcess:
         self._take(self._wait_time() if self.inbox.empty() else 0.0)
         if self.orders.left:
             return False
-        self.live.restart_due()
+        if self.live.runners:
+            self.live.restart_due()
         worked = self._work()
         self.outlet.flush_due()
         self.progress.report(idle=self.inbox.empty())
-        self._standing.answer(idle=not worked)  # after the work that was there
+        if self.orders.asked is not None:
+            self._standing.answer(idle=not worked)  # after the work that was there
         return True
 
     def _in_place_of_main(self, act: Callable[[Step], None], step: Step) -> bool:
@@ -265,13 +267,18 @@ class OperatorProcess:
     def _wait_time(self) -> float:
         if self.orders.probing:
             return PROBE_EVERY
-        patient = self.runners.ready.next_due()
-        due = [IDLE_WAIT, self._next_feeding(), self.live.next_due(), self.progress.next_due(), patient]
-        return max(0.0, min(seconds for seconds in due if seconds is not None))
-
-    def _next_feeding(self) -> float | None:
-        """Seconds until a feed may admit what is due by the clock; None where nothing waits for that."""
-        return self.feeding.next_due() if self.orders.released else None
+        wait = IDLE_WAIT
+        if (seconds := self.runners.ready.next_due()) is not None and seconds < wait:
+            wait = seconds
+        if (seconds := self.progress.next_due()) is not None and seconds < wait:
+            wait = seconds
+        if self.live.runners and (seconds := self.live.next_due()) is not None and seconds < wait:
+            wait = seconds
+        if self.feeding.feeds and self.orders.released:  # else nothing of them waits for the clock
+            seconds = self.feeding.next_due()
+            if seconds is not None and seconds < wait:
+                wait = seconds
+        return wait if wait > 0 else 0.0
 
     def _take(self, timeout: float) -> None:
         """Handles what is in the inbox, but not for long; waits up to `timeout` for the first."""
@@ -321,19 +328,20 @@ class OperatorProcess:
         """Runs what is decided; when nothing is and nothing has arrived, admits from the feeds. True when anything was
         done."""
         worked = False
+        feeds, ready, inbox = self.feeding.feeds, self.runners.ready, self.inbox
         while not self.orders.left:
-            if self._step_all() or (self.inbox.empty() and self._admit()):
+            if self._step_all() or (feeds and inbox.empty() and self._admit()):
                 worked = True
-            elif self.inbox.empty():
-                if not self.feeding.feeds:
-                    break
+            elif not feeds or not inbox.empty():
+                break
+            else:
                 self.feeding.promise()
                 if not self._step_all():
                     break
                 worked = True
-            self.progress.report(idle=False)
-            if not self.inbox.empty():
+            if not (feeds or ready.any) or not inbox.empty():
                 break
+            self.progress.report(idle=False)
         if self.orders.released:
             self._standing.end_if_done()
         return worked

@@ -133,6 +133,8 @@ class Outlet:
 
     def push(self) -> None:
         """Sends what has waited for room, as far as there is some, and static messages to who was started again."""
+        if self._fanout.quiet():
+            return
         for keys, link in self._fanout.joined():
             if self._held is None:
                 self._say_again(keys, link)
@@ -256,7 +258,8 @@ class Outlet:
     def record(self, record: FiringRecord) -> None:
         """Keeps a record where it survives this process, ahead of the messages of its firing. What else is done with
         the record of a firing follows its first message, which need not wait for that."""
-        self._note_last()
+        if self._unnoted is not None:
+            self._note_last()
         if self._box is not None:
             self._box.keep(record)
         self._unnoted = record
@@ -288,7 +291,8 @@ class Outlet:
 
     def flush_due(self) -> None:
         """Sends the batches that have waited long enough."""
-        self._note_last()
+        if self._unnoted is not None:
+            self._note_last()
         if time.monotonic() - self._flushed >= BATCH_SECONDS:
             self.flush_all()
 

@@ -39,18 +39,18 @@ class Standing:
 
     def end_if_done(self) -> None:
         """Sends what came of everything, once, when all feeds, sources and operators have ended."""
+        for runner in self._runners.operators:
+            if not runner.ended:
+                return
         if self._ended or not (self._feeding.ended and self._live.ended):
             return
-        if all(runner.ended for runner in self._runners.operators):
-            self._ended = True
-            self._outlet.flush_all()
-            self._progress.report(idle=True)
-            self._channel.send("ended", report=self._progress.final_report(self._moved()))
+        self._ended = True
+        self._outlet.flush_all()
+        self._progress.report(idle=True)
+        self._channel.send("ended", report=self._progress.final_report(self._moved()))
 
     def answer(self, *, idle: bool) -> None:
-        """Answers the supervisor's poll, if there is one. `idle`: a look at everything has just found nothing to do."""
-        if self._orders.asked is None:
-            return
+        """Answers the supervisor's poll. `idle`: a look at everything has just found nothing to do."""
         asked, self._orders.asked = self._orders.asked, None
         self._outlet.flush_all()
         self._channel.send(

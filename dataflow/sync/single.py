@@ -6,7 +6,7 @@ It decides what `Aligner` does, which it falls back upon for everything else; he
 from __future__ import annotations
 
 from dataflow.sync.aligner import Aligner
-from dataflow.sync.entries import Firing, InputValue
+from dataflow.sync.entries import Firing, InputValue, Waiting
 from dataflow.sync.spec import AlignSpec
 from dataflow.sync.stamps import FOREVER, NEVER
 
@@ -40,6 +40,9 @@ class SingleAligner(Aligner):
         stamp = undecided.decided = self._last_firing = self._triggers.decided = entry.stamp
         value: InputValue = {lane.state.name: entry} if self._many else entry
         return Firing(stamp, "fire", False, {lane.input: value}, _NO_NAMES, _NO_NAMES)
+
+    def waiting(self) -> Waiting | None:
+        return super().waiting() if self._lane.entries else None
 
     def idle_frontier(self) -> int:
         frontier = self._lane.frontier

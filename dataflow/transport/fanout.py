@@ -98,6 +98,13 @@ class Fanout:
         pool = self._pool
         return None if pool is None else pool.room(nbytes)
 
+    def quiet(self) -> bool:
+        """Tells whether no link has anything that waits for room, or a consumer that was replaced or has died."""
+        for link in self._links:  # noqa: SIM110 - no generator: this is asked in every turn of a process's loop
+            if not link.quiet():
+                return False
+        return True
+
     def flush(self) -> bool:
         """Sends what has waited for room, as far as there is some; True when nothing is left."""
         return not sum(not link.flush() for link in self._links if link.waiting)

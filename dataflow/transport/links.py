@@ -99,6 +99,10 @@ class Outgoing:
             self.away = True
             self._begin_anew()
 
+    def quiet(self) -> bool:
+        """Tells whether nothing waits for room, and the consumer is the one that it was at the last look."""
+        return not (self._waiting or self.joined or self.away) and self._reader == self._words[READERS]
+
     def present(self) -> bool:
         """Tells whether somebody is there to take what is sent, or is believed to be."""
         self._new_reader()

@@ -36,6 +36,7 @@ never wraps."""
 _SKIP = 0xFFFFFFFF
 _AGAIN = 1 << 16
 _REORDERS = platform.machine() not in ("x86_64", "AMD64")
+_MAIN = threading.main_thread().ident
 
 Bytes = bytes | bytearray | memoryview
 
@@ -130,6 +131,8 @@ class RingWriter(_End):
         if words[_ASLEEP]:
             words[_ASLEEP] = 0
             os.eventfd_write(self._wake, 1)
+            if threading.get_ident() == _MAIN:  # the reader of a source has the turn, which its process may need
+                os.sched_yield()  # for a consumer that was put on this core
         return True
 
     def _has_room(self, needed: int) -> bool:
