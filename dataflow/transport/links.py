@@ -105,7 +105,8 @@ class Outgoing:
 
     def present(self) -> bool:
         """Tells whether somebody is there to take what is sent, or is believed to be."""
-        self._new_reader()
+        if self._reader != self._words[READERS]:
+            self._new_reader()
         return not self.away
 
     def may_borrow(self, size: int, free: Callable[[], int]) -> bool:

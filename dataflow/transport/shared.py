@@ -164,7 +164,8 @@ def is_reference(payload: bytes) -> bool:
     return payload[5:6] == _REFERENCE and payload[:4] == MAGIC and len(payload) >= PRELUDE.size
 
 
-_unpack = partial(msgpack.unpackb, raw=False, use_list=False, max_array_len=8, max_str_len=16, max_map_len=0)
+_FIELDS: Final = (str, *(int,) * 7)
+_unpack: Final = partial(msgpack.unpackb, raw=False, use_list=False, max_array_len=8, max_str_len=16, max_map_len=0)
 
 
 def _reference(body: memoryview, body_bytes: int) -> tuple[Any, ...]:
@@ -174,10 +175,8 @@ def _reference(body: memoryview, body_bytes: int) -> tuple[Any, ...]:
         raise DecodeError(f"reference: {error}") from None
     if (
         len(body) != body_bytes
-        or not isinstance(fields, tuple)
-        or len(fields) != 8
-        or type(fields[0]) is not str
-        or {type(f) for f in fields[1:]} != {int}
+        or fields.__class__ is not tuple
+        or tuple(map(type, fields)) != _FIELDS
         or min(fields[1:]) < 0
     ):
         raise DecodeError("reference: expected [pool id, base, process, descriptor, offset, size, slot, generation]")
