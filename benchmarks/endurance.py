@@ -2,7 +2,7 @@
 
 usage: python benchmarks/endurance.py [--duration 190] [--json]
 
-graphs/chaos/robot.yaml runs live, a process each, and is recorded. After 20 s `dataflow echo` attaches to the decoded
+graphs/chaos/robot.yaml runs live, a process each, and is recorded. 20 s after its processes began, `dataflow echo` attaches to the decoded
 images, and is stopped (SIGSTOP) 5 s later; after 30 s the odometry's process is killed (kill -9) and started again by
 its policy. Memory is the proportional set size (PSS), once a second; compared are the medians of ten seconds: those
 around one minute, and the last ones before the sources end. Exit code 1 if a process grew by more than 5 %, or if the
@@ -75,22 +75,28 @@ def observe(duration: float, recording: Path, report: Path) -> dict[str, list[tu
     stopped: subprocess.Popen[bytes] | None = None
     plan = {ATTACH_AT: "attach", STOP_AT: "stop", KILL_AT: "kill"}
     with report.open("w") as output, subprocess.Popen(command, stdout=output, cwd=ROOT, env=environment) as started:
-        run, begin = psutil.Process(started.pid), time.monotonic()
+        run, begin = psutil.Process(started.pid), None
         try:
             while started.poll() is None:
+                sizes: dict[str, int] = {}
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    sizes = memory(run)
+                if begin is None and KILLED not in sizes:
+                    time.sleep(0.1)
+                    continue
+                begin = begin or time.monotonic()
                 now = time.monotonic() - begin
                 for at in [at for at in plan if now >= at]:
                     what = plan.pop(at)
                     if what == "attach":
-                        words = [*DATAFLOW, "echo", "color/image"]
+                        words = [*DATAFLOW, "echo", "color/image", "--wait", "30"]
                         stopped = subprocess.Popen(words, stdout=subprocess.DEVNULL, env=environment)
                     elif what == "stop" and stopped is not None:
                         stopped.send_signal(signal.SIGSTOP)
                     elif what == "kill":
                         kill(run, KILLED)
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    for name, size in memory(run).items():
-                        samples[name].append((now, size))
+                for name, size in sizes.items():
+                    samples[name].append((now, size))
                 time.sleep(1.0)
         finally:
             if stopped is not None:
