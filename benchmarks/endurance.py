@@ -1,12 +1,12 @@
 """Memory of every process of a live run of three minutes, with a stopped viewer and a killed operator process.
 
-usage: python benchmarks/endurance.py [--duration 190] [--json]
+usage: python benchmarks/endurance.py [--duration 190] [--samples FILE] [--json]
 
-graphs/chaos/robot.yaml runs live, a process each, and is recorded. 20 s after its processes began, `dataflow echo` attaches to the decoded
-images, and is stopped (SIGSTOP) 5 s later; after 30 s the odometry's process is killed (kill -9) and started again by
-its policy. Memory is the proportional set size (PSS), once a second; compared are the medians of ten seconds: those
-around one minute, and the last ones before the sources end. Exit code 1 if a process grew by more than 5 %, or if the
-recording does not verify as identical.
+graphs/chaos/robot.yaml runs live, a process each, and is recorded. 20 s after its processes began `dataflow echo`
+attaches to the decoded images, and is stopped (SIGSTOP) 5 s later; after 30 s the odometry's process is killed
+(kill -9) and started again by its policy. Memory is the proportional set size (PSS), once a second; compared are the
+medians of ten seconds: those around one minute, and the last ones before the sources end. Exit code 1 if a process grew
+by more than 5 %, or if the recording does not verify as identical.
 """
 
 from __future__ import annotations
@@ -110,6 +110,7 @@ def observe(duration: float, recording: Path, report: Path) -> dict[str, list[tu
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--duration", type=float, default=190.0, help="seconds of the live run")
+    parser.add_argument("--samples", type=Path, help="write every sample here: process, seconds, bytes")
     parser.add_argument("--json", action="store_true", help="print the figures as JSON")
     arguments = parser.parse_args()
     if arguments.duration < FIRST_AT + 2 * TAKEN_OVER:
@@ -119,6 +120,9 @@ def main() -> int:
         samples = observe(arguments.duration, recording, report)
         restarts = json.loads(report.read_text())["restarts"]
         verified = subprocess.run([*DATAFLOW, "verify", str(recording), "--quiet"], capture_output=True, cwd=ROOT)
+    if arguments.samples is not None:
+        lines = [f"{name},{moment:.1f},{size}" for name, taken in sorted(samples.items()) for moment, size in taken]
+        arguments.samples.write_text("\n".join(["process,seconds,bytes", *lines]) + "\n")
     end = max(moment for taken in samples.values() for moment, _ in taken)
     rows = []
     for name, taken in sorted(samples.items()):
