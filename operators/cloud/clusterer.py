@@ -22,6 +22,7 @@ from dataflow.messages import (
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.boards import Points, with_contents
 from operators.cloud.clustering import Shape, dbscan, kept, shape_of
 from operators.cloud.filtering import Voxels, finite
 from operators.cloud.gravity import gravity, unit
@@ -35,8 +36,9 @@ class Clusterer(Operator):
     """Divides a cloud into clusters of points that are near each other, and describes each: DBSCAN on its voxels.
 
     Meant for what a `PlaneSegmenter` leaves. Boxes stand upright on gravity, which comes from `pose` as there. With
-    `core_points` 1 the clustering is Euclidean. Equal input gives clusters in the same order; their numbers are no
-    identity over time.
+    `core_points` 1 the clustering is Euclidean. Things in furniture touch it: a large cluster that lies mostly in level
+    and upright surfaces at right angles, with a board among them, is divided into that and what stands on its boards.
+    Equal input gives clusters in the same order; their numbers are no identity over time.
 
     Method: Ester et al., "A density-based algorithm for discovering clusters", 1996; shapes from eigenvalues as in West
     et al., "Context-driven automated target detection in 3D data", 2004.
@@ -63,6 +65,9 @@ class Clusterer(Operator):
     core_points: int = Param(5, ge=1, live=True, doc="points within reach that make a core point, its own included")
     min_points: int = Param(30, ge=1, live=True, doc="fewest points of a cluster")
     max_points: int = Param(1_000_000, ge=1, live=True, doc="most points of a cluster")
+    board: float = Param(
+        0.25, gt=0, live=True, doc="least length of a board of furniture; infinite keeps furniture whole", unit="m"
+    )
 
     def setup(self) -> None:
         """Raises ValueError for an up of length 0."""
@@ -77,7 +82,7 @@ class Clusterer(Operator):
         usable = np.flatnonzero(finite(cloud.points))
         points = cloud.points[usable].astype(np.float64)
         labels = np.full(cloud.count, -1, np.int32)
-        labels[usable] = self._labels(cloud.points[usable])
+        labels[usable] = self._labels(cloud.points[usable], up)
         own = labels[usable]
         shapes = [shape_of(points[own == k], up) for k in range(int(labels.max(initial=-1)) + 1)]
         sizes = np.bincount(labels[labels >= 0], minlength=len(shapes)).astype(np.int64)
@@ -105,7 +110,7 @@ class Clusterer(Operator):
     def summary(self) -> Mapping[str, float | int]:
         return dict(self._counts)
 
-    def _labels(self, points: NDArray[np.float32]) -> NDArray[np.int32]:
+    def _labels(self, points: NDArray[np.float32], up: NDArray[np.float64]) -> NDArray[np.int32]:
         """Returns the cluster (N,) of each point, -1 for none."""
         if not len(points):
             return np.zeros(0, np.int32)
@@ -113,6 +118,9 @@ class Clusterer(Operator):
         means = voxels.means(points)
         reach = self.reach + self.reach_growth * np.linalg.norm(means, axis=1)
         of_voxel = dbscan(means, reach, self.core_points, voxels.counts)
+        of_voxel = with_contents(
+            of_voxel, Points(means, voxels.counts, reach), up, self.core_points, self.min_points, self.board
+        )
         labels = of_voxel[voxels.of]
         sizes = np.bincount(labels[labels >= 0], minlength=int(labels.max(initial=-1)) + 1).astype(np.int64)
         return kept(labels, sizes, self.min_points, self.max_points)

@@ -154,3 +154,50 @@ def test_a_turned_bar_gives_the_turn_of_its_box() -> None:
     x, y = (boxes.orientations[0], quaternion_from_yaw(0.5))
     turn = 2 * np.arccos(min(1.0, abs(float(x @ y))))
     assert min(turn % (np.pi / 2), -turn % (np.pi / 2)) < 0.03
+
+
+def slab(center: Any, size: Any, rng: np.random.Generator) -> np.ndarray:
+    """Points on the faces of an upright box that face the origin, one for each 2 cm², with noise of 3 mm."""
+    faces = []
+    for axis in range(3):
+        for side in (-0.5, 0.5):
+            if side * (center[axis] + side * size[axis]) < 0:
+                own = rng.uniform(-0.5, 0.5, (int(np.prod(np.delete(size, axis)) / 0.0002), 3))
+                own[:, axis] = side
+                faces.append(own * size)
+    return np.concatenate(faces) + center + rng.normal(0, 0.003, (sum(map(len, faces)), 3))
+
+
+def bookcase(rng: np.random.Generator, x: float = 2.0) -> np.ndarray:
+    """Points on the back, the sides and the boards of a bookcase 0.8 m wide that faces the sensor."""
+    back = slab((x + 0.3, 0, 0), (0.02, 0.8, 1.2), rng)
+    sides = [slab((x + 0.15, y, 0), (0.3, 0.02, 1.2), rng) for y in (-0.4, 0.4)]
+    return np.concatenate(
+        [back, *sides, *(slab((x + 0.15, 0, z), (0.3, 0.8, 0.02), rng) for z in (-0.6, -0.2, 0.2, 0.6))]
+    )
+
+
+def test_what_stands_on_boards_is_apart_from_them_and_from_what_stands_on_others() -> None:
+    rng = np.random.default_rng(0)
+    parts = [
+        bookcase(rng),
+        slab((2.08, 0.1, -0.11), (0.14, 0.06, 0.16), rng),  # a book that stands on a board
+        slab((2.1, -0.2, 0.26), (0.12, 0.12, 0.1), rng),  # a box on the board above
+    ]
+    points, truth = np.concatenate(parts), np.repeat([0, 1, 2], [len(p) for p in parts])
+    clusters, boxes, _, _ = clustered(points)
+    for part in range(3):
+        overlap = [((clusters.labels == k) & (truth == part)).sum() / ((clusters.labels == k) | (truth == part)).sum()
+                   for k in range(clusters.count)]  # fmt: skip
+        assert max(overlap) > 0.5
+    assert boxes.count == 3
+    assert clustered(points, board=float("inf"))[1].count == 1
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_large_things_without_boards_stay_whole(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    around = rng.normal(size=(4000, 3))
+    body = around / np.linalg.norm(around, axis=1, keepdims=True) * (0.25, 0.15, 0.6) + (2, 0, 0)
+    door = slab((2, 2, 0), (0.04, 0.9, 2.0), rng)
+    assert clustered(np.concatenate([body, door]))[1].count == 2
