@@ -162,7 +162,9 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
     return samples, fixes, truth, extrinsics, heading
 
 
-def simulator(seed: int, seconds: int) -> tuple[list[float], list[list[float]], list[float], list[float]]:
+def simulator(
+    seed: int, seconds: int, slip: float | None
+) -> tuple[list[float], list[list[float]], list[float], list[float]]:
     """Errors at the outages' ends (m); NEES of position and orientation there and 2 s after; errors between them; the
     root of the trace of the position's covariance at the ends (m), which is what the filter expects of the errors."""
     from dataflow.messages.geometry import quaternion_to_matrix
@@ -178,6 +180,7 @@ def simulator(seed: int, seconds: int) -> tuple[list[float], list[list[float]], 
         heading_sigma=0.05,
         rest=0.5,
         patience=0.5,
+        slip=slip,
         sensors={"sensor/fix": SensorSettings(use="position")},
     )
     operator.setup()
@@ -208,6 +211,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?")
     parser.add_argument("--seconds", type=int, default=36, help="of a drive in the simulator")
     parser.add_argument("--seeds", default="0-20", help="from, and the one to stop before")
+    parser.add_argument("--slip", type=float, help="m/s: the robot rolls (simulator; `EkfFusion`'s parameter)")
     arguments = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
     first, stop = (int(word) for word in arguments.seeds.split("-"))
@@ -221,7 +225,7 @@ def main() -> None:
             )
             squares.append(rmse**2)
         else:
-            ends, nees, errors, expected = simulator(seed, arguments.seconds)
+            ends, nees, errors, expected = simulator(seed, arguments.seconds, arguments.slip)
             all_nees.append(nees)
             all_expected += expected
             squares.append(float(np.mean(np.square(errors))) if errors else math.nan)

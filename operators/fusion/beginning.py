@@ -49,6 +49,16 @@ class Prior:
     headings: int = 12
 
 
+def prior_of(
+    at_origin: bool, heading: float | None, heading_sigma: float, gyro_bias: float, accel_bias: float
+) -> Prior:
+    """Returns what parameters say is known; `at_origin`: the first pose is the world's frame but for the heading."""
+    prior = Prior(heading=heading, heading_sigma=heading_sigma, gyro_bias=gyro_bias, accel_bias=accel_bias)
+    if at_origin:
+        return replace(prior, position_sigma=1e-3, heading=heading or 0.0, heading_sigma=1e-3)
+    return prior
+
+
 def rests(samples: Sequence[Sample], prior: Prior) -> bool:
     """Says whether the readings are those of a body at rest: steady, and of about the strength of gravity."""
     gyro, accel = np.array([s.gyro for s in samples]), np.array([s.accel for s in samples])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -24,7 +23,8 @@ from dataflow.messages import (
     Twist,
 )
 from dataflow.operator import Context, In, Operator, Out, Param, Sampled
-from operators.fusion.beginning import Prior, coasting_node
+from operators.fusion.beginning import Prior, coasting_node, prior_of
+from operators.fusion.constraints import Constraints
 from operators.fusion.control import Command
 from operators.fusion.covariances import Unusable
 from operators.fusion.error_state import POSITION, Noise
@@ -58,6 +58,7 @@ class EkfFusion(Operator):
     as the motion tells of it. So are a position's error that changes slowly, as satellites have (`drift`), and the
     scale of wheels (`scale_sigma`): taken for white noise, these would make the covariance too small.
 
+    `standstill` and `slip` say what is known of the motion without a sensor of it (wheels say both by themselves).
     It begins when the inertial sensor has rested for `rest`, or after `patience` in motion: gravity gives the level,
     rest the gyroscope's bias. With `start: unknown` position and heading come from the measurements; headings all
     around are tried side by side until one is left, and the covariance holds them all. Odometry begins when the
@@ -110,6 +111,8 @@ class EkfFusion(Operator):
     sure: float = Param(1.0, gt=0, doc="odometry begins when the position is known so well", unit="m")
     window: float = Param(1.0, gt=0, doc="how late measurements may come", unit="s")
     max_gap: float = Param(0.1, gt=0, doc="time without inertial samples after which motion is unknown", unit="s")
+    standstill: float | None = Param(None, gt=0, doc="forces straying less for half a second are rest", unit="m/s²")
+    slip: float | None = Param(None, gt=0, doc="deviation of the velocity aside and upwards of what rolls", unit="m/s")
 
     def setup(self) -> None:
         self._begin()
@@ -124,7 +127,8 @@ class EkfFusion(Operator):
         self._origin, self._sure = self.origin, False
         self._ignored: Counter[str] = Counter()
         self._heard = Heard()
-        self._gates = {name: settings.gate(settings.use) for name, settings in self.sensors.items()}
+        self._constraints = Constraints(self.standstill, self.slip)
+        self._gates = self._constraints.gates | {name: s.gate(s.use) for name, s in self.sensors.items()}
         self._places = Places(self.base_frame, "" if self.motion == "inertial" else self.base_frame)
 
     def process(
@@ -165,6 +169,7 @@ class EkfFusion(Operator):
             "filter": None if self._filter is None else self._filter.snapshot(),
             "inertial": self._inertial.snapshot(),
             "silence": self._silence.snapshot(),
+            "constraints": self._constraints.snapshot(),
             "reported": self._reported,
             "stamps": dict(self._heard.stamps),
             "before": self._heard.odometry_state(),
@@ -190,6 +195,8 @@ class EkfFusion(Operator):
             self._inertial.restore({"samples": state["samples"], "stamps": stamps})
         if "silence" in state:
             self._silence.restore(state["silence"])
+        if "constraints" in state:
+            self._constraints.restore(state["constraints"])
         last = state["stamps"] if "inertial" in state else {}
         self._heard.restore(state.get("heard", ()), last, state["before"])
         self._origin = None if state["origin"] is None else (state["origin"][0], state["origin"][1], state["origin"][2])
@@ -243,15 +250,8 @@ class EkfFusion(Operator):
         return True
 
     def _prior(self) -> Prior:
-        prior = Prior(
-            heading=self.heading,
-            heading_sigma=self.heading_sigma,
-            gyro_bias=self.gyro_bias,
-            accel_bias=self.accel_bias,
-        )
-        if self.start == "origin":
-            return replace(prior, position_sigma=1e-3, heading=self.heading or 0.0, heading_sigma=1e-3)
-        return prior
+        at_origin = self.start == "origin"
+        return prior_of(at_origin, self.heading, self.heading_sigma, self.gyro_bias, self.accel_bias)
 
     def _feel(self, name: str, imu: Imu, settings: SensorSettings) -> bool:
         """Takes an inertial sample; False where it is ignored."""
@@ -273,6 +273,8 @@ class EkfFusion(Operator):
         self._silence.felt(sample.time)
         if self._filter is not None:
             self._filter.feel(sample)
+            for sensor, model, noise in self._constraints.after(sample, self._places.of(self.base_frame)):
+                self._filter.measure(Measurement(sample.time, sensor, model, noise))
             return True
         begun = self._inertial.begun(sample, self._prior(), self.gravity, self._places.of(self.base_frame))
         if begun is None:
