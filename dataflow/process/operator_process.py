@@ -131,7 +131,7 @@ class OperatorProcess:
             self.inlet,
             self.outlet,
             self.progress,
-            self._counters_outside,
+            lambda: self.bus.counters(),  # it is opened later
         )
         self._watch: Watchdog | None = None
         self._running = False
@@ -259,26 +259,21 @@ class OperatorProcess:
         if failures:
             raise failures[0]
 
-    def _counters_outside(self) -> dict[str, int]:
-        return self.bus.counters()
-
     # Inbox
 
     def _wait_time(self) -> float:
         if self.orders.probing:
             return PROBE_EVERY
+        due = [self.runners.ready.next_due(), self.progress.next_due()]
+        if self.live.runners:
+            due.append(self.live.next_due())
+        if self.feeding.feeds and self.orders.released:
+            due.append(self.feeding.next_due())
         wait = IDLE_WAIT
-        if (seconds := self.runners.ready.next_due()) is not None and seconds < wait:
-            wait = seconds
-        if (seconds := self.progress.next_due()) is not None and seconds < wait:
-            wait = seconds
-        if self.live.runners and (seconds := self.live.next_due()) is not None and seconds < wait:
-            wait = seconds
-        if self.feeding.feeds and self.orders.released:  # else nothing of them waits for the clock
-            seconds = self.feeding.next_due()
+        for seconds in due:
             if seconds is not None and seconds < wait:
                 wait = seconds
-        return wait if wait > 0 else 0.0
+        return max(0.0, wait)
 
     def _take(self, timeout: float) -> None:
         """Handles what is in the inbox, but not for long; waits up to `timeout` for the first."""
@@ -330,15 +325,13 @@ class OperatorProcess:
         worked = False
         feeds, ready, inbox = self.feeding.feeds, self.runners.ready, self.inbox
         while not self.orders.left:
-            if self._step_all() or (feeds and inbox.empty() and self._admit()):
-                worked = True
-            elif not feeds or not inbox.empty():
-                break
-            else:
+            if not (self._step_all() or (feeds and inbox.empty() and self._admit())):
+                if not feeds or not inbox.empty():
+                    break
                 self.feeding.promise()
                 if not self._step_all():
                     break
-                worked = True
+            worked = True
             if not (feeds or ready.any) or not inbox.empty():
                 break
             self.progress.report(idle=False)
