@@ -53,12 +53,33 @@ class SavedMap:
             "learned": [{"name": each.name, "sha256": each.digest} for each in self.learned],
             "state": state,
         }
-        arrays = {f"learned_{k}": np.frombuffer(each.content, np.uint8) for k, each in enumerate(self.learned)}
+        arrays: dict[str, Any] = {"facts": json.dumps(facts), "arrays": np.frombuffer(bytes(kept), np.uint8)}
+        arrays |= {f"learned_{k}": np.frombuffer(each.content, np.uint8) for k, each in enumerate(self.learned)}
         path.parent.mkdir(parents=True, exist_ok=True)
         partial = path.with_name(f".{path.name}.partial")
         with partial.open("wb") as handle:
-            np.savez_compressed(handle, facts=json.dumps(facts), arrays=np.frombuffer(bytes(kept), np.uint8), **arrays)
+            np.savez_compressed(handle, **arrays)
         partial.replace(path)
+
+    def begun(self, stamp: int, classes: Sequence[str], movers: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Returns the states of objects and surfaces from which a map goes on at `stamp`, with these names of classes.
+
+        What moves by itself (`movers`) is not there any more, nor is what had vanished; times that are not before
+        `stamp` become so. Raises ValueError where a class of the map is not among `classes`.
+        """
+        lacking = [name for name in self.classes if name not in classes]
+        if lacking:
+            raise ValueError(f"the saved map has the classes {lacking}, which boxes do not have: {list(classes)}")
+        place = [list(classes).index(name) for name in self.classes] or [0]
+        objects = []
+        for each in self.objects["objects"]:
+            votes = np.zeros(max(len(classes), 1))
+            votes[place] = each["votes"]
+            if not classes or classes[int(votes.argmax())] not in movers:
+                objects.append({**_before(each, stamp), "votes": votes, "velocity": np.zeros(3)})
+        surfaces = [_before(each, stamp) for each in self.surfaces["surfaces"]]
+        kept = {**self.objects, "objects": objects, "gone": [], "stamp": None}
+        return kept, {**self.surfaces, "surfaces": surfaces}
 
     @classmethod
     def read(cls, path: Path) -> SavedMap:
@@ -113,6 +134,10 @@ def together(*groups: Sequence[LearnedFile]) -> tuple[LearnedFile, ...]:
         for each in group:
             found.setdefault(each.digest, each)
     return tuple(found.values())
+
+
+def _before(entry: Mapping[str, Any], stamp: int) -> dict[str, Any]:
+    return {**entry, "born": min(entry["born"], stamp - 1), "seen": min(entry["seen"], stamp - 1)}
 
 
 def _is_map(path: Path) -> bool:

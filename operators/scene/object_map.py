@@ -330,20 +330,6 @@ class ObjectMap:
             old = MapObject.restored(row, side)
             self.gone[old.id] = (int(stamp), old)
 
-    def take_up(self, stamp: int, place: Sequence[int], classes: int, moving: Sequence[int]) -> None:
-        """Goes on, from `stamp` on, with a map that was restored from another time and had fewer classes.
-
-        `place` gives the class that each of its own is now, of `classes`. What is `moving` is not there any more, nor
-        is what had vanished; times that are not before `stamp` become so.
-        """
-        for each in self.objects.values():
-            votes = np.zeros(classes)
-            votes[list(place)] = each.votes
-            each.votes, each.velocity = votes, np.zeros(3)
-            each.born, each.seen = min(each.born, stamp - 1), min(each.seen, stamp - 1)
-        self.objects = {i: each for i, each in self.objects.items() if each.class_id not in moving}
-        self.gone, self._stamp = {}, None
-
 
 def _direction(eye: Array, cells: Cells) -> Array:
     """Returns the horizontal direction (2,) from the viewer to an object."""

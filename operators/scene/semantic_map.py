@@ -231,17 +231,10 @@ class SemanticMap(Operator):
         """Goes on from a saved map. Raises ValueError where its frame or its classes are others."""
         if saved.frame != self._frame:
             raise ValueError(f"the pose is in {self._frame!r}, {self.map_file} in {saved.frame!r}")
-        lacking = [name for name in saved.classes if name not in self._classes]
-        if lacking:
-            raise ValueError(f"{self.map_file} has the classes {lacking}, which boxes do not have: {self._classes}")
         assert self._map is not None
-        place = [self._classes.index(name) for name in saved.classes] or [0]
-        moving = [k for k, name in enumerate(self._classes) if name in self.movers]
-        self._map.restore(saved.objects)
-        self._map.take_up(stamp, place, max(len(self._classes), 1), moving)
-        self._surfaces.restore(saved.surfaces)
-        for surface in self._surfaces.surfaces.values():
-            surface.born, surface.seen = min(surface.born, stamp - 1), min(surface.seen, stamp - 1)
+        objects, surfaces = saved.begun(stamp, self._classes, self.movers)
+        self._map.restore(objects)
+        self._surfaces.restore(surfaces)
 
     def _made(self) -> ObjectMap:
         settings = MapSettings(
