@@ -17,7 +17,7 @@ from operators.recognition.proposals import F32, Glance, Trunk
 from operators.scene.map_file import learned_files, together
 from operators.weights import shipped
 
-_MAYBE, _STEPS = 0.2, 2  # resemblance from which a box is drawn to the outline, and how often that is repeated
+_MAYBE, _STEPS = 0.003, 2  # probability from which a box is drawn to the outline, and how often that is repeated
 
 
 class LearnedDetector(Operator):
