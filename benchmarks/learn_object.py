@@ -14,13 +14,14 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+from learned_shapes import CHOOSING, JUDGED, ON_FLOOR
 
 from dataflow.messages import Detections2D, Image
 from dataflow.messages.geometry import invert
@@ -33,7 +34,7 @@ from operators.sources.simulator.frames import BODY_TO_OPTICAL, mounted
 from operators.sources.simulator.optics import Optics
 from operators.sources.simulator.renderer import Renderer
 from operators.sources.simulator.scene import Thing, World
-from operators.sources.simulator.shapes import Array, Material, Shape, at, box, ellipsoid, lathe, pose
+from operators.sources.simulator.shapes import Array, pose
 from operators.sources.simulator.truth import detections
 from operators.sources.simulator.worlds import make_world
 from operators.training.learning import learn as command
@@ -47,87 +48,7 @@ KINDS, WITH_TABLES = ("office", "table_top", "corridor"), ("office", "table_top"
 VISIBLE, PIXELS, IOU = 0.5, 300, 0.5
 
 
-def cone() -> Shape:
-    """A traffic cone, 45 cm high: orange with a white band."""
-    orange, white = Material("plain", (0.9, 0.35, 0.08), tile=0.3), Material("plain", (0.92, 0.92, 0.9), tile=0.3)
-    low = at(lathe([(0.12, 0.0), (0.085, 0.14)], orange), z=0.03)
-    band = at(lathe([(0.085, 0.0), (0.055, 0.12)], white), z=0.17)
-    tip = at(lathe([(0.055, 0.0), (0.015, 0.16), (0.0, 0.161)], orange), z=0.29)
-    return box((0.3, 0.3, 0.03), orange, center=(0, 0, 0.015)) + low + band + tip
-
-
-def suitcase() -> Shape:
-    """A blue suitcase that stands on its long side, with straps and a handle."""
-    blue, black = Material("fabric", (0.16, 0.28, 0.6), tile=0.2), Material("plain", (0.1, 0.1, 0.11), tile=0.2)
-    shape = box((0.2, 0.55, 0.38), blue, center=(0, 0, 0.21))
-    for y in (-0.15, 0.15):
-        shape += box((0.21, 0.04, 0.39), black, center=(0, y, 0.21))
-        shape += box((0.03, 0.02, 0.06), black, center=(0, y / 2, 0.42))
-    return shape + box((0.03, 0.17, 0.03), black, center=(0, 0, 0.45))
-
-
-def teapot() -> Shape:
-    """A green teapot, 30 cm wide, with spout, handle and a golden lid."""
-    green, gold = Material("plain", (0.16, 0.47, 0.28), tile=0.2), Material("plain", (0.75, 0.6, 0.24), tile=0.2)
-    shape = at(ellipsoid(0.1, 0.1, 0.085, green), z=0.085)
-    shape += at(lathe([(0.06, 0.0), (0.02, 0.03), (0.0, 0.031)], gold), z=0.16)
-    shape += at(ellipsoid(0.018, 0.018, 0.018, gold), z=0.2) + at(ellipsoid(0.07, 0.022, 0.022, green), x=0.13, z=0.12)
-    return (
-        shape
-        + box((0.02, 0.02, 0.1), gold, center=(-0.14, 0, 0.1))
-        + box((0.06, 0.02, 0.02), gold, center=(-0.11, 0, 0.15))
-    )
-
-
-def helmet() -> Shape:
-    """A yellow safety helmet with a brim and a black stripe."""
-    yellow, black = Material("plain", (0.94, 0.8, 0.12), tile=0.3), Material("plain", (0.08, 0.08, 0.08), tile=0.3)
-    brim = at(lathe([(0.16, 0.0), (0.16, 0.015), (0.11, 0.03)], yellow), x=0.03)
-    return (
-        brim + at(ellipsoid(0.135, 0.115, 0.13, yellow), z=0.03) + box((0.22, 0.025, 0.02), black, center=(0, 0, 0.155))
-    )
-
-
-def bucket() -> Shape:
-    """A red bucket, 30 cm high, with a white rim and a handle."""
-    red, white = Material("plain", (0.75, 0.1, 0.12), tile=0.3), Material("plain", (0.9, 0.9, 0.9), tile=0.3)
-    shape = at(lathe([(0.1, 0.0), (0.14, 0.28)], red), z=0.005)
-    shape += at(lathe([(0.14, 0.0), (0.15, 0.015), (0.14, 0.03)], white), z=0.27)
-    return (
-        shape
-        + box((0.02, 0.24, 0.015), white, center=(0, 0, 0.36))
-        + box((0.02, 0.015, 0.08), white, center=(0, 0.12, 0.32))
-    )
-
-
-def vase() -> Shape:
-    """A blue and white vase with a narrow neck, 34 cm high."""
-    blue, white = Material("plain", (0.12, 0.2, 0.6), tile=0.2), Material("plain", (0.93, 0.93, 0.95), tile=0.2)
-    foot = lathe([(0.05, 0.0), (0.1, 0.1)], white)
-    belly = at(lathe([(0.1, 0.0), (0.09, 0.06), (0.04, 0.12)], blue), z=0.1)
-    return foot + belly + at(lathe([(0.04, 0.0), (0.035, 0.08), (0.06, 0.12)], white), z=0.22)
-
-
-def drum() -> Shape:
-    """A toy drum, 26 cm wide: blue with golden hoops and a white skin."""
-    blue, gold = Material("plain", (0.15, 0.35, 0.7), tile=0.3), Material("plain", (0.8, 0.65, 0.2), tile=0.3)
-    skin = Material("plain", (0.95, 0.93, 0.88), tile=0.3)
-    hoop = lathe([(0.135, 0.0), (0.135, 0.025)], gold)
-    top = at(lathe([(0.13, 0.0), (0.0, 0.002)], skin), z=0.2)
-    return hoop + at(lathe([(0.125, 0.0), (0.125, 0.16)], blue), z=0.02) + at(hoop, z=0.175) + top
-
-
-SHAPES: dict[str, Callable[[], Shape]] = {
-    "cone": cone,
-    "teapot": teapot,
-    "helmet": helmet,
-    "suitcase": suitcase,
-    "bucket": bucket,
-    "vase": vase,
-    "drum": drum,
-}
-JUDGED, CHOOSING = ("cone", "teapot", "helmet"), ("suitcase", "bucket", "vase", "drum")
-ON_FLOOR = ("cone", "suitcase", "bucket", "drum")
+SHAPES = {**JUDGED, **CHOOSING}
 
 
 @dataclass(eq=False)

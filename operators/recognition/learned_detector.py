@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +14,10 @@ from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms, intersection_over_union
 from operators.recognition.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
 from operators.recognition.proposals import F32, Glance, Trunk
+from operators.scene.map_file import learned_files, together
 from operators.weights import shipped
 
-_MAYBE, _STEPS = 0.2, 2  # resemblance from which a box is drawn to the outline, and how often that is repeated
+_MAYBE, _STEPS = 0.003, 2  # probability from which a box is drawn to the outline, and how often that is repeated
 
 
 class LearnedDetector(Operator):
@@ -32,7 +34,9 @@ class LearnedDetector(Operator):
     image: In[Image] = In(doc="RGB, or grey, which is repeated in the three channels")
     detections: Out[Detections2D] = Out(doc="boxes in the image's own pixels, by falling score; learned classes last")
 
-    objects: list[str] = Param(doc="files of `dataflow learn object`, made with these weights")
+    objects: list[str] = Param(
+        doc="files of `dataflow learn object`, made with these weights, or saved maps that hold them"
+    )
     weights: str | None = Param(None, doc="network file of `dataflow train detector`; none means the shipped one")
     score_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="boxes of known classes below are dropped")
     learned_threshold: float = Param(0.3, ge=0, le=1, live=True, doc="and those of learned ones")
@@ -43,11 +47,14 @@ class LearnedDetector(Operator):
         """Loads network and objects. Raises FileNotFoundError, NetworkFileError or LearnedObjectError."""
         given = str(shipped("detector.onnx")) if self.weights is None else self.weights
         file = self.use_file(given)
-        self._learned = [LearnedObject.read(self.use_file(name)) for name in self.objects]
-        if not self._learned:
-            raise LearnedObjectError("objects names no file: make one by `dataflow learn object NAME DATA`")
+        learned = together(*(learned_files(Path(self.use_file(name))) for name in self.objects))
+        if not learned:
+            raise LearnedObjectError(
+                "objects names no file of `dataflow learn object NAME DATA` and no map that was saved with one"
+            )
+        self._learned = [LearnedObject.of(each.content, each.name) for each in learned]
         inner = self._learned[0].inner
-        for name, each in zip(self.objects, self._learned, strict=True):
+        for name, each in zip((each.name for each in learned), self._learned, strict=True):
             if each.detector != self.files[given] or each.inner != inner:
                 raise LearnedObjectError(f"{name} was learned with another detector than {given}: learn it again")
         self._trunk = Trunk(file, inner)

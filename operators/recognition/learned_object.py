@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,8 +80,13 @@ class LearnedObject:
         """Raises FileNotFoundError or LearnedObjectError."""
         if not file.is_file():
             raise FileNotFoundError(f"no learned object {str(file)!r} (looked for {file.absolute()})")
+        return cls.of(file.read_bytes(), str(file))
+
+    @classmethod
+    def of(cls, content: bytes, file: str) -> LearnedObject:
+        """Reads the bytes of a file. Raises LearnedObjectError, which names the file."""
         try:
-            with np.load(file) as kept:
+            with np.load(io.BytesIO(content)) as kept:
                 facts = json.loads(str(kept["facts"]))
                 background, direction = kept["background"], kept["direction"]
                 threshold = float(kept["threshold"])
@@ -95,7 +102,7 @@ class LearnedObject:
                 int(facts["images"]),
                 outline,
             )
-        except (ValueError, KeyError, OSError, TypeError) as error:
+        except (ValueError, KeyError, OSError, EOFError, TypeError, zipfile.BadZipFile) as error:
             raise LearnedObjectError(
                 f"{file} is no learned object ({error}); make one by `dataflow learn object NAME DATA`"
             ) from None

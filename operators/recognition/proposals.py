@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,12 +21,15 @@ if TYPE_CHECKING:
     import onnxruntime
 
 F32 = NDArray[np.float32]
+COLOR = "color"
+"""Names the map of colours among the inner maps."""
 _GRID, _SAMPLES = 2, 3  # parts of a box, and points in each, along a side
+_HUES, _GREYS, _CELL = 8, 4, 4  # colours, and shades without one; pixels along a side of a cell of their map
 
 
 @dataclass(frozen=True, eq=False)
 class Glance:
-    """An image as the network sees it: the grid's raw maps, the trunk's maps (C, H, W), and how it was fitted in."""
+    """An image as the network sees it: the grid's raw maps, the inner maps (C, H, W), and how it was fitted in."""
 
     maps: Sequence[F32]
     trunk: Sequence[F32]
@@ -35,8 +39,8 @@ class Glance:
 class Trunk:
     """A detector's network whose inner maps are given as well; on one CPU thread.
 
-    `inner` names the values that come out beside the detector's outputs (`inner_maps` finds them). Raises
-    FileNotFoundError or NetworkFileError.
+    `inner` names the values that come out beside the detector's outputs (`inner_maps` finds them), and `COLOR` for the
+    image's colours, of which a trunk keeps little. Raises FileNotFoundError or NetworkFileError.
     """
 
     def __init__(self, file: Path, inner: Sequence[str]) -> None:
@@ -46,16 +50,21 @@ class Trunk:
         self.strides = [int(s) for s in network.facts.get("strides", [])]
         if self.anchors.ndim != 3 or len(self.anchors) != len(self.strides):
             raise NetworkFileError(f"{file}: its metadata must hold anchors (levels, anchors, 2) and their strides")
-        self._session: onnxruntime.InferenceSession = open_session(file, reveal=self.inner)
+        self._session: onnxruntime.InferenceSession = open_session(
+            file, reveal=[name for name in self.inner if name != COLOR]
+        )
 
     def look(self, pixels: NDArray[np.uint8]) -> Glance:
         """Runs the network on an image (H, W, 3), RGB."""
         fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self.size)
-        tensor = np.ascontiguousarray(fit.apply(pixels).transpose(2, 0, 1)[None], np.float32)
+        fitted = fit.apply(pixels)
+        tensor = np.ascontiguousarray(fitted.transpose(2, 0, 1)[None], np.float32)
         tensor /= np.float32(255)
         found = self._session.run(None, {self._session.get_inputs()[0].name: tensor})
         known = len(self.strides)
-        return Glance(found[:known], [each[0] for each in found[known:]], fit)
+        maps = dict(zip((name for name in self.inner if name != COLOR), found[known:], strict=True))
+        inner = [color_map(fitted) if name == COLOR else maps[name][0] for name in self.inner]
+        return Glance(found[:known], inner, fit)
 
     def propose(self, glance: Glance, threshold: float, most: int) -> F32:
         """Returns boxes (N, 4) in the network's pixels around anything, whatever its class, by falling score."""
@@ -65,11 +74,29 @@ class Trunk:
         return found.boxes[kept]
 
     def describe(self, glance: Glance, boxes: F32) -> F32:
-        """Returns (N, D): each trunk map averaged over the four quarters of each box (N, 4), of length 1 a map."""
+        """Returns (N, D): each inner map averaged over the four quarters of each box (N, 4), of length 1 a map."""
         parts = [_pooled(each, boxes, self.size) for each in glance.trunk]
         return np.concatenate(
             [part / np.maximum(np.linalg.norm(part, axis=1, keepdims=True), 1e-6) for part in parts], 1
         )
+
+
+def color_map(pixels: NDArray[np.uint8]) -> F32:
+    """Returns (12, H/4, W/4): shares of eight hues and of four shades of grey in an image (H, W, 3), RGB.
+
+    Neighbouring hues and shades share a pixel that lies between them, as in the soft histograms of van de Weijer and
+    Schmid, "Coloring local feature extraction", 2006; the less colour a pixel has, the more it counts as grey.
+    """
+    hsv = cv2.cvtColor(np.ascontiguousarray(pixels, np.uint8), cv2.COLOR_RGB2HSV_FULL).astype(np.float32)
+    hue, value = hsv[..., 0] * np.float32(_HUES / 256), hsv[..., 2] / np.float32(255)
+    chroma = np.clip(2 * (hsv[..., 1] / np.float32(255)) * value, 0, 1)
+    around = np.abs((hue[None] - np.arange(_HUES, dtype=np.float32)[:, None, None] + _HUES / 2) % _HUES - _HUES / 2)
+    shades = np.arange(_GREYS, dtype=np.float32)[:, None, None]
+    apart = np.abs(value[None] * np.float32(_GREYS - 1) - shades)
+    shares = np.concatenate([np.clip(1 - around, 0, 1) * chroma, np.clip(1 - apart, 0, 1) * (1 - chroma)])
+    height, width = shares.shape[1] // _CELL, shares.shape[2] // _CELL
+    cells = shares[:, : height * _CELL, : width * _CELL].reshape(len(shares), height, _CELL, width, _CELL)
+    return np.asarray(cells.mean(axis=(2, 4)), np.float32)
 
 
 def inner_maps(file: Path, strides: Sequence[int] = (4, 8, 16)) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from operators.cloud.filtering import in_range
 from operators.geometry.extrinsics import transform_between
 from operators.scene.class_sizes import CLASS_SIZES, TELLING
 from operators.scene.cuboid import ImageView
+from operators.scene.map_file import LearnedFile, SavedMap, learned_files, together
 from operators.scene.map_nodes import nodes_of, seen_surfaces
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings, Observation
@@ -48,6 +50,9 @@ class SemanticMap(Operator):
     by themselves are followed instead, and forgotten after a while out of sight. Everything else is kept while it is
     out of sight. Surfaces are joined by their planes and by where they lie; there is one floor, and people stand
     on it.
+
+    With `save` the map is written at the end, and with it the classes that were learned for it; `map_file` begins with
+    such a map, in whose frame the pose must be. What moves by itself is not taken over.
 
     Method: after Hughes et al., "Hydra: a real-time spatial perception system", 2022, and Gu et al., "ConceptGraphs",
     2024, with free space from the views themselves.
@@ -93,10 +98,28 @@ class SemanticMap(Operator):
     move_memory: float = Param(120.0, ge=0, doc="time for which a vanished object is known again elsewhere", unit="s")
     surface_views: int = Param(2, ge=1, doc="views of a surface from which it is given")
     max_range: float = Param(6.0, gt=0, doc="farther points are not used", unit="m")
+    map_file: str | None = Param(None, doc="saved map to begin with; an empty one if none")
+    save: str | None = Param(None, doc="file that the map is written to at the end")
+    learned: list[str] = Param(
+        [], doc="files of `dataflow learn object`, or saved maps, whose classes the detector finds: saved with the map"
+    )
 
     def setup(self) -> None:
+        """Raises FileNotFoundError or ValueError for a saved map that is none, or has voxels of another size."""
         self._counts: Counter[str] = Counter()
+        self._known = None if self.map_file is None else SavedMap.read(Path(self.use_file(self.map_file)))
+        if self._known is not None and self._known.voxel != self.voxel:
+            raise ValueError(f"{self.map_file} has voxels of {self._known.voxel} m, but voxel is {self.voxel}")
+        given = [learned_files(Path(self.use_file(name))) for name in self.learned]
+        self._learned: tuple[LearnedFile, ...] = together(() if self._known is None else self._known.learned, *given)
         self._begin()
+
+    def finish(self) -> None:
+        """Writes the map."""
+        if self.save is not None:
+            objects = {} if self._map is None else self._map.snapshot()
+            saved = SavedMap(self._classes, self._frame, self.voxel, objects, self._surfaces.snapshot(), self._learned)
+            saved.write(Path(self.save).expanduser())
 
     def _begin(self) -> None:
         self._map: ObjectMap | None = None
@@ -167,7 +190,7 @@ class SemanticMap(Operator):
         return [] if self._map is None else list(self._map.objects.values())
 
     def on_reset(self, input: str) -> None:
-        """The clock behind an input began anew: so does the map."""
+        """The clock behind an input began anew: so does the map, with the saved one if there is one."""
         self._begin()
 
     def snapshot(self) -> Mapping[str, Any]:
@@ -196,11 +219,22 @@ class SemanticMap(Operator):
         if self._map is None:
             self._classes, self._frame = boxes.class_names, pose.frame
             self._map = self._made()
+            if self._known is not None and self._known.objects:
+                self._take_up(self._known, boxes.stamp)
         if pose.frame != self._frame:
             raise ValueError(f"the pose is in {pose.frame!r}, the map in {self._frame!r}")
         if boxes.class_names != self._classes:
             raise ValueError(f"boxes have the classes {boxes.class_names}, the map has {self._classes}")
         return self._map
+
+    def _take_up(self, saved: SavedMap, stamp: int) -> None:
+        """Goes on from a saved map. Raises ValueError where its frame or its classes are others."""
+        if saved.frame != self._frame:
+            raise ValueError(f"the pose is in {self._frame!r}, {self.map_file} in {saved.frame!r}")
+        assert self._map is not None
+        objects, surfaces = saved.begun(stamp, self._classes, self.movers)
+        self._map.restore(objects)
+        self._surfaces.restore(surfaces)
 
     def _made(self) -> ObjectMap:
         settings = MapSettings(

@@ -61,7 +61,7 @@ def learn_object(
         from operators.detection.custom.folder import read_detection_data
         from operators.recognition.learned_object import learn as fitted
         from operators.recognition.learned_object import shown_in
-        from operators.recognition.proposals import Trunk, inner_maps
+        from operators.recognition.proposals import COLOR, Trunk, inner_maps
         from operators.weights import shipped
 
         detector = shipped("detector.onnx") if weights is None else weights
@@ -73,7 +73,7 @@ def learn_object(
             if not files:
                 raise FileNotFoundError(f"{background} holds no image ({', '.join(sorted(IMAGE_SUFFIXES))})")
             images += [LabelledImage(file, *nothing) for file in files]
-        inner = inner_maps(detector)
+        inner = (*inner_maps(detector), COLOR)
         trunk = Trunk(detector, inner)
         shown = []
         for k, image in enumerate(images):

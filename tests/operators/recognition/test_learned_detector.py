@@ -17,6 +17,7 @@ from operators.detection import CustomDetector
 from operators.recognition import LearnedDetector
 from operators.recognition.learned_object import LearnedObject, LearnedObjectError, Shown, learn, shown_in
 from operators.recognition.proposals import Trunk, inner_maps
+from operators.scene.map_file import LearnedFile, SavedMap
 from operators.training.learning import learn as command
 from operators.weights import shipped
 
@@ -181,3 +182,15 @@ def test_a_file_without_an_outline_leaves_boxes_where_they_are(learned: Path, tm
     boxes = np.array([[3, 4, 30, 50]], np.float32)
     described = np.ones((1, len(first["direction"])), np.float32)
     np.testing.assert_allclose(LearnedObject.read(tmp_path / "first.npz").drawn(boxes, described), boxes)
+
+
+def test_a_saved_map_brings_back_the_classes_that_were_learned_for_it(learned: Path, tmp_path: Path) -> None:
+    room, empty = tmp_path / "room.map.npz", tmp_path / "empty.map.npz"
+    file = LearnedFile(learned.name, learned.read_bytes())
+    SavedMap((), "", 0.03, {}, {}, (file,)).write(room)
+    SavedMap((), "", 0.03, {}, {}).write(empty)
+    shown = [image(scenery(400 + k, sign=True)[0], k) for k in range(3)]
+    by_file, by_map = (play(LearnedDetector(objects=[str(f)]), {"image": shown}).digests() for f in (learned, room))
+    assert by_map == by_file
+    with pytest.raises(OperatorFailure, match="no map that was saved with one"):
+        play(LearnedDetector(objects=[str(empty)]), {"image": shown})
