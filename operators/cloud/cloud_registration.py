@@ -32,7 +32,7 @@ class CloudRegistration(Operator):
     target: Sampled[PointCloud] = Sampled(doc="points of the same scene in the frame of their sensor")
     pose: Out[Pose] = Out(doc="the cloud's sensor in the target's frame, with covariance; none where it failed")
     aligned: Out[PointCloud] = Out(doc="the cloud in the target's frame; none where it failed")
-    status: Out[Diagnostics] = Out(doc="registered or failed, with the reason, overlap, fitness, violation and RMSE")
+    status: Out[Diagnostics] = Out(doc="registered or failed, why, overlap, fitness, violation, score and RMSE")
 
     child_frame: str = Param("", doc="name of the cloud's frame in the pose; the cloud's own where empty")
     voxel: float = Param(0.1, gt=0.005, doc="side of the voxels that the clouds are thinned to", unit="m")
@@ -40,6 +40,14 @@ class CloudRegistration(Operator):
     min_overlap: float = Param(0.5, gt=0, le=1, doc="least share of each cloud that the other sensor could see")
     min_fitness: float = Param(0.87, gt=0, le=1, doc="least share of that which lies on the other cloud")
     max_violation: float = Param(0.04, ge=0, lt=1, doc="most of a cloud that hangs in what the other saw to be free")
+    min_score: float = Param(
+        0.5,
+        lt=1,
+        doc="least score: the share that lies in the other's surfaces, less three times what hangs in free space",
+    )
+    sure_score: float = Param(
+        0.6, doc="a score from which on 0.02 less of `min_fitness` and 0.01 more of `max_violation` suffice"
+    )
 
     def setup(self) -> None:
         self._settings = Settings(
@@ -48,6 +56,8 @@ class CloudRegistration(Operator):
             min_overlap=self.min_overlap,
             min_fitness=self.min_fitness,
             max_violation=self.max_violation,
+            min_score=self.min_score,
+            sure_score=self.sure_score,
         )
         self._target: tuple[PointCloud, Prepared] | None = None
         self._counts: Counter[str] = Counter()
@@ -92,7 +102,13 @@ class CloudRegistration(Operator):
 
 
 def _status(stamp: int, found: Registered) -> Diagnostics:
-    shares = {"overlap": found.overlap, "fitness": found.fitness, "violation": found.violation, "rmse m": found.rmse}
+    shares = {
+        "overlap": found.overlap,
+        "fitness": found.fitness,
+        "violation": found.violation,
+        "score": found.score,
+        "rmse m": found.rmse,
+    }
     return Diagnostics(
         stamp=stamp,
         names=("cloud_registration",),

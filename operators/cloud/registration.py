@@ -25,6 +25,7 @@ Indices = NDArray[np.intp]
 FEWEST = 100  # voxels with a normal that a cloud must have
 _TRIED = 12  # motions that are refined
 _RIVAL = 0.03  # a second motion whose score is that near to the best one's makes the result ambiguous
+_LESS_FITNESS, _MORE_VIOLATION = 0.02, 0.01  # that are asked for where the score is sure
 _CONTRADICTS = 3.0  # times what lies on the other cloud counts what hangs in free space
 _ALIKE = 0.8  # cosine between normals of one surface
 _CORRELATED = 30.0  # voxels whose errors are alike, for the covariance
@@ -33,13 +34,19 @@ _TELLING = 0.03  # share of the surfaces that must face along every direction
 
 @dataclass(frozen=True)
 class Settings:
-    """Lengths in metres; the others are shares."""
+    """Lengths in metres; the others are shares.
+
+    Scores are of `Registered`: none below `min_score` is believed, and a `sure_score` makes up for a little of fitness
+    and violation.
+    """
 
     voxel: float
     trials: int
     min_overlap: float
     min_fitness: float
     max_violation: float
+    min_score: float = -np.inf
+    sure_score: float = np.inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,16 +171,24 @@ def explained(source: Prepared, target: Prepared, T: Array, settings: Settings) 
     one, two = _Seen.of(source, target, T), _Seen.of(target, source, np.asarray(np.linalg.inv(T), np.float64))
     overlap, fitness = min(one.overlap, two.overlap), min(one.fitness, two.fitness)
     violation, settled = max(one.violation, two.violation), one.settled
-    reason = ""
-    if overlap < settings.min_overlap:
-        reason = f"the clouds share {overlap:.0%}"
-    elif fitness < settings.min_fitness:
-        reason = f"{fitness:.0%} of what both saw agree"
-    elif violation > settings.max_violation:
-        reason = f"{violation:.0%} lie where the other sensor saw nothing"
     agreement, rmse = min(one.agreement, two.agreement), max(one.rmse, two.rmse)
     unknown = np.full((6, 6), np.nan)
-    return Registered(T, overlap, fitness, rmse, violation, agreement, settled, unknown, reason)
+    found = Registered(T, overlap, fitness, rmse, violation, agreement, settled, unknown, "")
+    return found.refused(_doubt(found, settings))
+
+
+def _doubt(found: Registered, settings: Settings) -> str:
+    """Returns why a motion is not to be believed; empty where it is."""
+    sure = found.score >= settings.sure_score
+    if found.overlap < settings.min_overlap:
+        return f"the clouds share {found.overlap:.0%}"
+    if found.fitness < settings.min_fitness - (_LESS_FITNESS if sure else 0):
+        return f"{found.fitness:.0%} of what both saw agree"
+    if found.violation > settings.max_violation + (_MORE_VIOLATION if sure else 0):
+        return f"{found.violation:.0%} lie where the other sensor saw nothing"
+    if found.score < settings.min_score:
+        return f"{found.agreement:.0%} of what both saw lie in surfaces that agree"
+    return ""
 
 
 def failure(reason: str) -> Registered:

@@ -108,6 +108,22 @@ def test_a_long_room_is_told_about_its_length() -> None:
     assert explained_at_the_truth(scan(A, 1, niches, long), scan(B, 2, niches, long), A, B).reason == ""
 
 
+def test_surfaces_that_agree_well_make_up_for_a_little_fitness_and_others_are_not_believed() -> None:
+    A, B = at(0.2, 0.1, 0.0), at(0.9, -0.2, 0.6)
+    source, target = (Prepared.of_cloud(scan(T, k, BOXES).astype(np.float32), 0.1) for k, T in enumerate((B, A)))
+    T = invert(A) @ B
+    easy = Settings(0.1, 1, 0.5, 0.5, 0.1)
+    found = explained(source, target, T, easy)
+    assert found.reason == ""
+    strict = replace(easy, min_fitness=found.fitness + 0.01)
+    assert "of what both saw agree" in explained(source, target, T, strict).reason
+    assert (
+        "of what both saw agree" in explained(source, target, T, replace(strict, sure_score=found.score + 0.01)).reason
+    )
+    assert explained(source, target, T, replace(strict, sure_score=found.score - 0.01)).reason == ""
+    assert "surfaces that agree" in explained(source, target, T, replace(easy, min_score=found.score + 0.01)).reason
+
+
 def tried(x: float, agreement: float, violation: float = 0.0, overlap: float = 0.8, settled: bool = True) -> Registered:
     """A motion by x metres, with what speaks for it."""
     T = se3.exp(np.array([x, 0, 0, 0, 0, 0]))
