@@ -2,11 +2,13 @@
 
     python benchmarks/activities.py true FOLDER [--first 600] [--worlds 10]
     python benchmarks/activities.py sensors CACHE [--first 600] [--worlds 10] [--every 1]
+    python benchmarks/activities.py arrivals CACHE [--first 600] [--worlds 10]
 
 *true*: the simulator's boxes, 4 times a second for 45 s; FOLDER keeps them, nothing is rendered. *sensors*: the shipped
 detector and segmenter, depth and true camera poses give a map; CACHE keeps what the networks gave (sensed_worlds.py).
 An agent counts while it is in view, and from sensors where it is mapped (IoU 0.25). An activity is right that is true
 within half a second; `unknown` is wrong. A goal counts one second before an agent begins to sit down or to reach.
+*arrivals*: how many of those the camera could show: its agent in view at that time, and its goal at or before it.
 """
 
 from __future__ import annotations
@@ -87,7 +89,10 @@ def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
 
 
 def sensor_steps(world: World) -> Iterator[Step]:
-    nodes = mapped(world, true=False)
+    yield from steps_of(world, mapped(world, true=False))
+
+
+def steps_of(world: World, nodes: list[SceneGraph]) -> Iterator[Step]:
     for frame, given in zip(world.frames, nodes, strict=True):
         view = set(frame.objects.ids[frame.objects.visible >= 0.3].tolist())
         said = zip(frame.activities.subjects.tolist(), frame.activities.goals, strict=True)
@@ -128,34 +133,50 @@ def compared(steps: list[Step], said: list[dict[int, str]]) -> Counter[str]:
     return counts
 
 
-def arrivals(steps: list[Step], graphs: list[SceneGraph], ofs: list[dict[int, int]], found: Figures) -> None:
-    """Scores the goals of every arrival whose agent and goal are nodes a second before."""
+def arriving(steps: list[Step]) -> Iterator[tuple[int, int, int, int]]:
+    """Yields the agent and the goal of every arrival, with the steps at it and one second before it."""
     for k in range(1, len(steps)):
         for agent, doing in steps[k].doing.items():
             goal = steps[k].goals.get(agent, -1)
             early = [j for j in range(k) if steps[k].nodes.stamp - steps[j].nodes.stamp >= SECOND]
-            if doing not in ARRIVALS or steps[k - 1].doing.get(agent) not in UNDER_WAY or goal < 0 or not early:
-                continue
-            j = early[-1]
-            mine = {t: m for m, t in ofs[j].items()}
-            if agent not in mine or goal not in mine or agent not in steps[j].view:
-                continue
-            graph, me, aim = graphs[j], mine[agent], mine[goal]
-            ids, names = graph.ids.tolist(), [graph.class_names[c] for c in graph.class_ids.tolist()]
-            here = graph.positions[ids.index(me)][:2]
-            offsets = {i: graph.positions[n][:2] - here for n, i in enumerate(ids) if names[n] in CANDIDATES}
-            near = {i: o for i, o in offsets.items() if np.hypot(*o) < 5}
-            found.candidates.append(len(near))
-            found.goals["ours"].append(first(graph, me) == aim)
-            found.goals["nearest"].append(min(near, key=lambda i: float(np.hypot(*near[i])), default=-1) == aim)
-            old = graphs[max(j - 4, 0)]
-            way = here - old.positions[old.ids.tolist().index(me)][:2] if me in old.ids.tolist() else np.zeros(2)
-            ahead = {i: float(o @ way) / max(float(np.hypot(*o)), 1e-6) for i, o in near.items()}
-            found.goals["heading"].append(max(ahead, key=lambda i: ahead[i], default=-1) == aim)
-            since = k
-            while since > 0 and first(graphs[since - 1], me) == aim:
-                since -= 1
-            found.leads.append((steps[k].nodes.stamp - steps[since].nodes.stamp) / SECOND)
+            if doing in ARRIVALS and steps[k - 1].doing.get(agent) in UNDER_WAY and goal >= 0 and early:
+                yield agent, goal, k, early[-1]
+
+
+def shown(steps: list[Step]) -> Counter[str]:
+    """Counts what the camera showed of all arrivals, one second before each."""
+    counts: Counter[str] = Counter()
+    for agent, goal, _, j in arriving(steps):
+        counts["arrivals"] += 1
+        counts["agent in view"] += agent in steps[j].view
+        counts["goal seen too"] += agent in steps[j].view and any(goal in step.view for step in steps[: j + 1])
+        since = [s for s in steps[:j] if steps[j].nodes.stamp - s.nodes.stamp <= SECOND]
+        counts["for a second before"] += all(agent in step.view for step in (*since, steps[j]))
+    return counts
+
+
+def arrivals(steps: list[Step], graphs: list[SceneGraph], ofs: list[dict[int, int]], found: Figures) -> None:
+    """Scores the goals of every arrival whose agent and goal are nodes a second before."""
+    for agent, goal, k, j in arriving(steps):
+        mine = {t: m for m, t in ofs[j].items()}
+        if agent not in mine or goal not in mine or agent not in steps[j].view:
+            continue
+        graph, me, aim = graphs[j], mine[agent], mine[goal]
+        ids, names = graph.ids.tolist(), [graph.class_names[c] for c in graph.class_ids.tolist()]
+        here = graph.positions[ids.index(me)][:2]
+        offsets = {i: graph.positions[n][:2] - here for n, i in enumerate(ids) if names[n] in CANDIDATES}
+        near = {i: o for i, o in offsets.items() if np.hypot(*o) < 5}
+        found.candidates.append(len(near))
+        found.goals["ours"].append(first(graph, me) == aim)
+        found.goals["nearest"].append(min(near, key=lambda i: float(np.hypot(*near[i])), default=-1) == aim)
+        old = graphs[max(j - 4, 0)]
+        way = here - old.positions[old.ids.tolist().index(me)][:2] if me in old.ids.tolist() else np.zeros(2)
+        ahead = {i: float(o @ way) / max(float(np.hypot(*o)), 1e-6) for i, o in near.items()}
+        found.goals["heading"].append(max(ahead, key=lambda i: ahead[i], default=-1) == aim)
+        since = k
+        while since > 0 and first(graphs[since - 1], me) == aim:
+            since -= 1
+        found.leads.append((steps[k].nodes.stamp - steps[since].nodes.stamp) / SECOND)
 
 
 def first(graph: SceneGraph, agent: int) -> int:
@@ -202,7 +223,7 @@ def by_class(counts: Counter[str]) -> dict[str, float]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("fed", choices=["true", "sensors"])
+    parser.add_argument("fed", choices=["true", "sensors", "arrivals"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--first", type=int, default=600)
     parser.add_argument("--worlds", type=int, default=10)
@@ -210,6 +231,9 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="JSON file for all counts")
     options = parser.parse_args()
     seeds = range(options.first, options.first + options.worlds)
+    if options.fed == "arrivals":
+        report_shown(seeds, options.folder)
+        return
     rows: dict[str, Figures] = {}
     for name, steps in (true_worlds if options.fed == "true" else sensed_steps)(seeds, options.folder, options.every):
         rows[name] = figures_of(steps)
@@ -218,6 +242,15 @@ def main() -> None:
         if options.out is not None:
             options.out.write_text(json.dumps({n: vars(f) for n, f in rows.items()}))
     report(rows)
+
+
+def report_shown(seeds: range, folder: Path) -> None:
+    total: Counter[str] = Counter()
+    for world in sensed(seeds, folder):
+        counts = shown(list(steps_of(world, [frame.scene for frame in world.frames])))
+        print(world.name, dict(counts), flush=True)
+        total.update(counts)
+    print("all", dict(total))
 
 
 def true_worlds(seeds: range, folder: Path, _: int) -> Iterator[tuple[str, list[Step]]]:
