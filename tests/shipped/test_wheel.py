@@ -40,7 +40,8 @@ def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Made of the unpacked sdist, as pip does."""
     folder = tmp_path_factory.mktemp("unpacked")
     with tarfile.open(sdist) as archive:
-        archive.extractall(folder, filter="data")
+        safely = {"filter": "data"} if hasattr(tarfile, "data_filter") else {}  # from Python 3.11.4 on
+        archive.extractall(folder, **safely)  # type: ignore[arg-type]
     return build("build_wheel", next(folder.iterdir()), tmp_path_factory.mktemp("wheel"))
 
 
