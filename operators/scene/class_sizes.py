@@ -13,8 +13,7 @@ class Usual:
     """Usual size: shorter and longer side on the ground and height, metres, and spreads of their logs.
 
     What is `round` has the outline of an ellipse, as seen from above. What is leafy shows points that are inside its
-    box, by the share `inset` of half its side. What is `on_floor` stands there, though its foot may be hidden. What is
-    `in_rows` may show its spine alone.
+    box, by the share `inset` of half its side. What is `on_floor` stands there, though its foot may be hidden.
     """
 
     size: tuple[float, float, float]
@@ -22,7 +21,6 @@ class Usual:
     round: bool = False
     inset: float = 0.0
     on_floor: bool = False
-    in_rows: bool = False
 
 
 CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
@@ -44,10 +42,7 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     "mug": (Usual((0.08, 0.11, 0.10), (0.10, 0.10, 0.10), True),),
     "bottle": (Usual((0.07, 0.07, 0.25), (0.12, 0.12, 0.15), True),),
     "robot": (Usual((0.39, 0.41, 0.73), (0.10, 0.10, 0.10)),),
-    "book": (
-        Usual((0.035, 0.16, 0.23), (0.30, 0.12, 0.12), in_rows=True),
-        Usual((0.16, 0.22, 0.035), (0.12, 0.12, 0.30)),
-    ),
+    "book": (Usual((0.035, 0.16, 0.23), (0.30, 0.12, 0.12)), Usual((0.16, 0.22, 0.035), (0.12, 0.12, 0.30))),
     "lamp": (Usual((0.35, 0.35, 1.50), (0.15, 0.15, 0.12), True), Usual((0.18, 0.18, 0.47), (0.15, 0.15, 0.15), True)),
     "bin": (Usual((0.32, 0.32, 0.43), (0.15, 0.15, 0.18), True),),
 }

@@ -25,7 +25,7 @@ _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost points are beyond a side
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN = 0.1  # radians by which the heading that points show strays
-_BOUND = 1.0  # standard deviations beyond which a residual's influence grows no more
+_BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
 _SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
 _ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
 
@@ -59,34 +59,11 @@ def fit_cuboid(
     those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
     where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
     which such things stand is tried, along the heading of `start` and along `heading`, that of most things around, and
-    the best is returned with its number; with `before`, an earlier result, only that one. Of what stands in rows the
-    images may be those of the whole box or of its spine alone, beside which others hide it: what agrees better counts.
+    the best is returned with its number; with `before`, an earlier result, only that one.
 
     `noise` is that of ranges at one metre, m; it grows by the square.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    ways = 2 * len(_priors(usual)[0])
-    spines = [False, True] if any(u.in_rows for u in usual) else [False]
-    if before is not None:
-        spines, before = [before[0] >= ways], (before[0] % ways, before[1])
-    fits = [_fitted(start, views, points, usual, before, heading, noise, spine=spine) for spine in spines]
-    best = min(range(len(fits)), key=lambda k: fits[k][0])
-    _, form, box = fits[best]
-    return form + ways * spines[best], box
-
-
-def _fitted(
-    start: Box,
-    views: Sequence[ImageView],
-    points: Array,
-    usual: Sequence[Usual],
-    before: tuple[int, Box] | None,
-    heading: float | None,
-    noise: float,
-    *,
-    spine: bool,
-) -> tuple[float, int, Box]:
-    """Returns the cost of the best fit, its number and its box; images are of the `spine` alone or of the whole."""
     logs, spreads = _priors(usual)
     if before is None:
         x = _starts(start, views, logs)
@@ -111,8 +88,7 @@ def _fitted(
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
         flat = rows.reshape(-1, 7)
-        shown = _spines(flat, outline, eyes.mean(axis=0)) if spine else outline
-        image = ((_images(flat, P, shown) - boxes) * weights).reshape(len(flat), -1)
+        image = ((_images(flat, P, outline) - boxes) * weights).reshape(len(flat), -1)
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
@@ -134,24 +110,8 @@ def _fitted(
         x = x + step
         if (np.abs(step) < 0.1 * _STEPS).all():
             break
-    costs = _cost(residuals(x[:, None])[:, 0]) + askew
-    best = int(np.argmin(costs))
-    return float(costs[best]), int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6]))
-
-
-def _spines(rows: Array, outline: Array, eye: Array) -> Array:
-    """Returns the outlines (K, C, 3) of boxes (K, 7): of upright thin ones the narrow face towards the viewer (3,).
-
-    Others, and those that are seen from the side only, keep the whole `outline` (C, 3).
-    """
-    c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-    x, y = eye[0] - rows[:, 0], eye[1] - rows[:, 1]
-    k, deep = np.arange(len(rows)), np.argmax(rows[:, 3:5], axis=1)
-    away = np.where(deep == 0, c * x + s * y, c * y - s * x)
-    turned = (rows[:, 5] > rows[k, 4 - deep]) & (np.abs(away) > np.exp(rows[k, 3 + deep]) / 2)
-    made = np.tile(outline, (len(rows), 1, 1))
-    made[k[turned], :, deep[turned]] = 0.5 * np.sign(away[turned, None])
-    return made
+    best = 0 if len(x) == 1 else int(np.argmin(_cost(residuals(x[:, None])[:, 0]) + askew))
+    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6]))
 
 
 def _cost(r: Array) -> Array:
@@ -228,16 +188,16 @@ def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
 def _images(rows: Array, P: Array, outline: Array) -> Array:
     """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V * 3, 4), NaN where partly behind the camera.
 
-    `outline` (C, 3), or one of each box (K, C, 3), are the places in a box of side 1 that are looked at.
+    `outline` (C, 3) are the places in a box of side 1 that are looked at.
     """
     c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-    local = outline * np.exp(rows[:, None, 3:6])
+    local = outline[None] * np.exp(rows[:, None, 3:6])
     corners = np.empty_like(local)
     corners[..., 0] = c[:, None] * local[..., 0] - s[:, None] * local[..., 1]
     corners[..., 1] = s[:, None] * local[..., 0] + c[:, None] * local[..., 1]
     corners[..., 2] = local[..., 2]
     corners += rows[:, None, :3]
-    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), outline.shape[-2], -1, 3)
+    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), len(outline), -1, 3)
     depth = np.maximum(seen[..., 2], 1e-6)
     uv = seen[..., :2] / depth[..., None]
     image = np.concatenate([uv.min(axis=1), uv.max(axis=1)], axis=-1)
