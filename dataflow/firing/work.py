@@ -37,9 +37,9 @@ class Work:
         """Begins to measure; returns the time on the monotonic clock, ns."""
         self._calls += 1
         self._exact = self.mean_ns >= SHORT or not self._calls % EXACT_EVERY
-        if self._exact:
-            self._cpu = time.thread_time_ns()
         self._wall = now = time.monotonic_ns()
+        if self._exact:  # within what the wall clock measures, so that it is never more
+            self._cpu = time.thread_time_ns()
         return now
 
     def end(self) -> None:
@@ -48,15 +48,16 @@ class Work:
         A short call that was not preempted has taken as much CPU time as wall time; one that may have been, at most
         what the thread has taken since its CPU clock was last asked.
         """
-        wall = time.monotonic_ns() - self._wall
         if self._exact:
             self.cpu_ns += time.thread_time_ns() - self._cpu
-        elif wall < PREEMPTED:
-            self.cpu_ns += wall
-        else:
-            now = time.thread_time_ns()
-            self.cpu_ns += min(wall, now - self._cpu)
-            self._cpu = now
+        wall = time.monotonic_ns() - self._wall
+        if not self._exact:
+            if wall < PREEMPTED:
+                self.cpu_ns += wall
+            else:
+                now = time.thread_time_ns()
+                self.cpu_ns += min(wall, now - self._cpu)
+                self._cpu = now
         self.wall_ns += wall
         self.mean_ns += (wall - self.mean_ns) // SETTLES_IN
 

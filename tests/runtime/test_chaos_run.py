@@ -64,10 +64,14 @@ def test_a_run_under_faults_of_every_kind_is_verified_in_the_other_placement(
 
 
 def test_a_process_that_is_started_again_after_its_sources_have_ended_ends_in_order(tmp_path: Path) -> None:
-    """The recorder has their ends, and is told to expect them again: 60 steps of 8 ms, then a hang of 300 ms."""
-    path = tmp_path / "late.mcap"
-    graph = load_graph(HERE / "chaos.yaml", settings=["count=60"], live=True)
-    plan = {"faults": [{"kind": "hang", "operator": "slow", "at": "470ms"}]}
+    """The recorder has their ends, and is told to expect them again: what came in 0.5 s keeps `slow` busy for 3 s, and
+    its hang comes well within these."""
+    text = (HERE / "chaos.yaml").read_text()
+    text = text.replace("{sleep: 0.02}", "{sleep: 0.08}").replace("queue: newest, size: 1", "queue: oldest, size: 100")
+    file, path = tmp_path / "late.yaml", tmp_path / "late.mcap"
+    file.write_text(text)
+    graph = load_graph(file, settings=["count=60"], live=True)
+    plan = {"faults": [{"kind": "hang", "operator": "slow", "at": "900ms"}]}
 
     report = run(graph, live=True, placement="one_process", record=path, faults=plan_of(plan, graph), rate=1.0)
 
