@@ -35,6 +35,7 @@ from typing import Any
 
 import numpy as np
 import xxhash
+from checkouts import word
 
 HERE = Path(__file__).resolve().parent
 CHUNK = 20
@@ -86,13 +87,15 @@ def measure(case: Case, tree: Path, count: int, marks: list[int] | None = None) 
     with tempfile.TemporaryDirectory() as folder:
         graph = Path(folder) / "graph.yaml"
         graph.write_text(json.dumps(graph_of(case, count, marks or [])))  # JSON is YAML
-        placement = "--process-each" if case.each else "--one-process"
+        placement = word(tree, "--process-each" if case.each else "--one-process")
         command = [sys.executable, "-m", "dataflow.cli.main", "run", str(graph), placement, "--json", "--quiet"]
         command += ["--record", str(Path(folder) / "run.mcap")] if case.recorded else []
         command += ["--live"] if case.live else []
         path = os.pathsep.join([str(tree), str(HERE)])
         environment = {**os.environ, "PYTHONPATH": path}
-        done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False, env=environment)
+        done = subprocess.run(
+            command, capture_output=True, text=True, timeout=600, check=False, env=environment, cwd=folder
+        )
         if done.returncode:
             raise SystemExit(f"{case.name}: {done.stderr.strip() or done.stdout.strip()}")
     found = json.loads(done.stdout)["summaries"]["last"]

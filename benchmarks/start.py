@@ -30,6 +30,8 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from checkouts import word
+
 HERE = Path(__file__).resolve().parent
 RELAYS = 5
 GRAPH = HERE.parent / "graphs" / "simulated_robot.yaml"
@@ -56,7 +58,7 @@ class Tree:
     """A checkout whose command is measured, with a folder of running graphs of its own."""
 
     def __init__(self, root: Path, folder: Path) -> None:
-        self.folder = folder
+        self.root, self.folder = root, folder
         self.environment = {
             **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
             "PYTHONPATH": os.pathsep.join([str(root), str(HERE)]),
@@ -64,13 +66,19 @@ class Tree:
         }
 
     def command(self, *words: object) -> list[str]:
-        return [sys.executable, "-P", "-m", "dataflow.cli.main", *map(str, words)]
+        return [sys.executable, "-P", "-m", "dataflow.cli.main", *(word(self.root, str(w)) for w in words)]
 
     def call(self, *words: object) -> tuple[dict[str, Any], float, float]:
         """Runs a command to its end: its JSON, when it was started, and the seconds it took."""
         began = time.monotonic()
         done = subprocess.run(
-            self.command(*words), env=self.environment, capture_output=True, text=True, timeout=150, check=False
+            self.command(*words),
+            env=self.environment,
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            timeout=150,
+            check=False,
         )
         if done.returncode:
             raise SystemExit(f"{' '.join(map(str, words))}: {done.stderr.strip()}")
@@ -81,7 +89,7 @@ class Tree:
         """A light graph that runs meanwhile."""
         graph = light_graph(self.folder, 1_000_000)
         command = self.command("run", graph, "--live", "--process-each", "--quiet")
-        with subprocess.Popen(command, env=self.environment, stdout=subprocess.DEVNULL) as process:
+        with subprocess.Popen(command, env=self.environment, cwd=self.folder, stdout=subprocess.DEVNULL) as process:
             try:
                 seen_within(self, "echo", "source/out", "--wait", WAIT, until=b"FeatureVector")
                 yield
@@ -100,7 +108,12 @@ def seen_within(tree: Tree, *words: object, until: bytes) -> float:
     reading, writing = pty.openpty()
     began = time.monotonic()
     process = subprocess.Popen(
-        tree.command(*words), env=tree.environment, stdin=subprocess.DEVNULL, stdout=writing, stderr=writing
+        tree.command(*words),
+        env=tree.environment,
+        cwd=tree.folder,
+        stdin=subprocess.DEVNULL,
+        stdout=writing,
+        stderr=writing,
     )
     os.close(writing)
     said = b""

@@ -58,26 +58,19 @@ def ours(tree: Path) -> Callable[[int, int], list[float]]:
     """A live run of `roundtrip.yaml` with the code of a checkout, in a Python of its own."""
 
     def run(size: int, count: int) -> list[float]:
-        code = (
-            "import sys\n"
-            f"sys.path.append({str(HERE)!r})\n"
-            "from dataflow.graph import load_graph\n"
-            "from dataflow.supervision.run import run\n"
-            f"settings = ['nbytes={size}', 'count={count}']\n"
-            f"graph = load_graph({str(HERE / 'roundtrip.yaml')!r}, settings=settings, live=True)\n"
-            "print(run(graph, live=True).summaries['pong']['took'])\n"
-        )
-        return parsed(finished([sys.executable, "-P", "-c", code], PYTHONPATH=str(tree)))
+        command = [sys.executable, "-P", "-m", "dataflow.cli.main", "run", str(HERE / "roundtrip.yaml"), "--live"]
+        command += ["--quiet", "--json", "--set", f"nbytes={size}", "--set", f"count={count}"]
+        report = finished(command, PYTHONPATH=os.pathsep.join([str(tree), str(HERE)]))
+        return parsed(json.loads(report)["summaries"]["pong"]["took"])
 
     return run
 
 
 def finished(command: list[str], **environment: str) -> str:
-    """The standard output of a command. Raises `Failed`."""
+    """The standard output of a command, run where no checkout is the current folder. Raises `Failed`."""
+    env = {**os.environ, **environment}
     try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, timeout=120, check=False, env={**os.environ, **environment}
-        )
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False, env=env, cwd=HERE)
     except (subprocess.TimeoutExpired, OSError) as error:
         raise Failed(str(error)) from error
     if done.returncode:
