@@ -24,8 +24,8 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
     `incomplete` (recorded streams to be made again), `records` and `batches` (see `letters.shared_records`), `begin`
     (stamp, or None), `tolerance`.
-    The answer: `operators` (verifications), `comparisons`, `stored`, `digests` by stream, `work` by
-    operator (see `OperatorCounts`), `wall` in seconds.
+    The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
+    stream, `stored`, `wall` in seconds.
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"]) as recording:
@@ -55,7 +55,7 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
         compared = comparer.close(results)
     states = [state for runner in work.runners.values() for state in runner.ports.states.values()]
     return {
-        "operators": [result.to_wire() for result in results.values()],
+        "operators": {name: result.to_wire() for name, result in results.items()},
         "comparisons": {name: asdict(comparison) for name, comparison in compared.items()},
         "stored": [check.result().to_wire() for check in checks.values()],
         "digests": {s.stream: [s.digest.count, s.digest.hexdigest()] for s in states if s.digest is not None},

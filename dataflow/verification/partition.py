@@ -1,4 +1,4 @@
-"""Divides the operators to be verified among workers, so that each has about as much work."""
+"""Divides the operators to be verified among workers, so that the slowest is through as early as can be."""
 
 from __future__ import annotations
 
@@ -21,21 +21,31 @@ class Part:
     checks: tuple[str, ...] = ()
 
 
-def units(graph: Graph, recorded: Collection[str], operators: Collection[str]) -> list[tuple[str, ...]]:
-    """The operators in the smallest groups that can be fed from a recording, each in graph order.
+def units(graph: Graph, held: Collection[str], operators: Collection[str]) -> list[frozenset[str]]:
+    """For each operator that no other of them needs: it, and those that make what it takes and is not `held`.
 
-    An operator whose input was not recorded belongs with the one that makes it again.
+    Each unit can be fed from a recording that holds the streams in `held`. An operator that several need is in each of
+    their units: to repeat it twice costs its time, to repeat it once would cost that they can be repeated side by side.
     """
-    group = {name: {name} for name in operators}
-    for name in operators:
-        for stream in {s for taken in graph.nodes[name].inputs.values() for s in taken}:
+    needs = {name: _needed(graph, held, operators, name) for name in operators}
+    for_others = {maker for name, needed in needs.items() for maker in needed - {name}}
+    alone = [name for name in graph.nodes if name in needs and name not in for_others]
+    found = [needs[name] for name in alone]
+    covered = frozenset[str]().union(*found)
+    loops = [needs[name] for name in graph.nodes if name in needs and name not in covered]  # feed only one another
+    return found + list(dict.fromkeys(loops))
+
+
+def _needed(graph: Graph, held: Collection[str], operators: Collection[str], name: str) -> frozenset[str]:
+    """The operator, and those of `operators` that make its inputs as far as these are not `held`, theirs, and so on."""
+    needed, left = {name}, [name]
+    while left:
+        for stream in {s for taken in graph.nodes[left.pop()].inputs.values() for s in taken}:
             maker = graph.streams[stream].node
-            if stream not in recorded and maker in group and group[maker] is not group[name]:
-                group[name] |= group[maker]
-                for other in group[maker]:
-                    group[other] = group[name]
-    found = {id(members): members for members in group.values()}
-    return [tuple(name for name in graph.nodes if name in members) for members in found.values()]
+            if stream not in held and maker in operators and maker not in needed:
+                needed.add(maker)
+                left.append(maker)
+    return frozenset(needed)
 
 
 def jobs_for(work: Mapping[str, int], cores: int) -> int:
@@ -43,18 +53,23 @@ def jobs_for(work: Mapping[str, int], cores: int) -> int:
     return min(cores, 1 + sum(work.values()) // START_NS)
 
 
-def balanced(groups: Sequence[tuple[str, ...]], work: Mapping[str, int], jobs: int) -> list[tuple[str, ...]]:
-    """At most `jobs` parts of whole groups, none empty: the heaviest group first, to the part with the least work."""
-    parts: list[list[str]] = [[] for _ in range(min(jobs, len(groups)))]
-    loads = [0] * len(parts)
-    for members in sorted(groups, key=lambda g: (-sum(work[name] for name in g), g)):
-        lightest = loads.index(min(loads))
-        parts[lightest] += members
-        loads[lightest] += sum(work[name] for name in members)
-    return [tuple(part) for part in parts]
+def balanced(units: Sequence[frozenset[str]], work: Mapping[str, int], jobs: int) -> list[frozenset[str]]:
+    """At most `jobs` parts of whole units: the heaviest unit first, to the part that is then the least heavy.
+
+    What a part repeats anyway costs it nothing more; what another one repeats already costs it double.
+    """
+    parts: list[set[str]] = [set() for _ in range(min(jobs, len(units)))]
+
+    def load(part: Collection[str]) -> int:
+        return sum(work[name] for name in part)
+
+    for unit in sorted(units, key=lambda unit: (-load(unit), sorted(unit))):
+        placed = unit & frozenset[str]().union(*parts)
+        min(parts, key=lambda part: (load(part | unit) + load(placed - part), bool(part))).update(unit)
+    return [frozenset(part) for part in parts if part]
 
 
-def with_checks(graph: Graph, parts: Sequence[tuple[str, ...]], checks: Collection[str]) -> list[Part]:
+def with_checks(graph: Graph, parts: Sequence[Collection[str]], checks: Collection[str]) -> list[Part]:
     """Each stream to check goes to a part that reads it anyway, else to the one that makes it, else to the first."""
     taken = [{s for name in part for given in graph.nodes[name].inputs.values() for s in given} for part in parts]
     chosen: list[list[str]] = [[] for _ in parts]
@@ -62,4 +77,7 @@ def with_checks(graph: Graph, parts: Sequence[tuple[str, ...]], checks: Collecti
         readers = [k for k, streams in enumerate(taken) if stream in streams]
         makers = [k for k, part in enumerate(parts) if graph.streams[stream].node in part]
         chosen[(readers or makers or [0])[0]].append(stream)
-    return [Part(part, tuple(streams)) for part, streams in zip(parts, chosen, strict=True)]
+    return [
+        Part(tuple(name for name in graph.nodes if name in part), tuple(streams))
+        for part, streams in zip(parts, chosen, strict=True)
+    ]

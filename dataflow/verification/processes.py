@@ -90,11 +90,15 @@ def call_workers(
 
 
 def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
+    shown: dict[str, int] = {}
     for worker in workers:
         if worker.board.steps:
             status.phase = "running"
         for name in worker.call.operators:
             c = worker.board.counts(name)
+            if name in shown and c.firings <= shown[name]:
+                continue  # several repeat it: the one that is further is shown
+            shown[name] = c.firings
             status.process_of[name] = f"worker {worker.number}"
             status.operators[name] = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
     return status

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -196,8 +196,8 @@ def _report(
     task: _Task, answers: Iterable[Mapping[str, Any]], tolerance: float | None, start: float | None
 ) -> VerifyReport:
     answers = list(answers)
-    found = {v["operator"]: Verification.from_wire(v) for answer in answers for v in answer["operators"]}
-    counts = {name: OperatorCounts(*values) for answer in answers for name, values in answer["work"].items()}
+    of = _answer_of_each(answers)
+    found = {name: Verification.from_wire(answer["operators"][name]) for name, answer in of.items()}
     stored = [StoredStream.from_wire(s) for answer in answers for s in answer["stored"]]
     for name in task.operators:
         task.ledger.enter(found[name])
@@ -219,11 +219,16 @@ def _report(
         unchecked=task.unchecked,
         tolerance=tolerance,
         comparisons={
-            name: OutputComparison.from_wire(values)
-            for answer in answers
-            for name, values in answer["comparisons"].items()
+            name: OutputComparison.from_wire(answer["comparisons"][name])
+            for name, answer in of.items()
+            if name in answer["comparisons"]
         },
-        digests={s: (count, digest) for answer in answers for s, (count, digest) in answer["digests"].items()},
+        digests={
+            stream: tuple(answer["digests"][stream])
+            for name, answer in of.items()
+            for stream in nodes[name].outputs.values()
+            if stream in answer["digests"]
+        },
         outputs={name: tuple(nodes[name].outputs.values()) for name in task.operators},
         producers={
             name: frozenset(task.graph.streams[s].node for taken in nodes[name].inputs.values() for s in taken)
@@ -232,8 +237,18 @@ def _report(
         start=start,
         torn=task.torn,
         part=task.ledger.part,
-        work=counts,
+        work={name: OperatorCounts(*answer["work"][name]) for name, answer in of.items()},
     )
+
+
+def _answer_of_each(answers: Sequence[Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
+    """By operator, the answer that tells of it: of those of several workers the first in which it differs, if any."""
+    of: dict[str, Mapping[str, Any]] = {}
+    for answer in answers:
+        for name, verification in answer["operators"].items():
+            if name not in of or (of[name]["operators"][name]["first"] is None and verification["first"] is not None):
+                of[name] = answer
+    return of
 
 
 def _stand_in(task: _Task, name: str, stored: Iterable[StoredStream]) -> StandIn:
@@ -260,15 +275,12 @@ def _repeat(
     culprits = report.culprits
     if not culprits:
         return {}
-    calls = [
-        Call(
-            f"{part.__name__}:{part.repeat_part.__name__}",
-            {**request, "operators": [name for name in one.operators if name in culprits]},
-            one.operators,
-        )
-        for one in task.parts
-        if not set(culprits).isdisjoint(one.operators)
-    ]
+    calls, left = [], set(culprits)
+    for one in task.parts:
+        if here := [name for name in one.operators if name in left]:
+            left.difference_update(here)
+            call = f"{part.__name__}:{part.repeat_part.__name__}"
+            calls.append(Call(call, {**request, "operators": here}, one.operators))
     again = {name: first for answer in workers(calls, **options) for name, first in answer.items()}
     before = {v.operator: v.first for v in report.operators if v.first is not None}
     return {name: again[name] == [before[name].incarnation, before[name].index, before[name].got] for name in culprits}

@@ -16,14 +16,14 @@ loads = st.lists(st.integers(0, 10**9), min_size=1, max_size=12)
 
 
 @given(loads, st.integers(1, 5))
-def test_every_group_is_in_one_part_and_no_part_is_much_heavier_than_another(work: list[int], jobs: int) -> None:
-    groups = [(f"operator {k}",) for k in range(len(work))]
-    by_name = {group[0]: load for group, load in zip(groups, work, strict=True)}
+def test_every_unit_is_in_one_part_and_no_part_is_much_heavier_than_another(work: list[int], jobs: int) -> None:
+    by_name = {f"operator {k}": load for k, load in enumerate(work)}
+    alone = [frozenset({name}) for name in by_name]
 
-    parts = balanced(groups, by_name, jobs)
+    parts = balanced(alone, by_name, jobs)
 
     assert sorted(name for part in parts for name in part) == sorted(by_name)
-    assert len(parts) == min(jobs, len(groups))
+    assert len(parts) == min(jobs, len(work))
     assert all(parts)
     sums = [sum(by_name[name] for name in part) for part in parts]
     assert max(sums) - min(sums) <= max(work)
@@ -33,11 +33,25 @@ def test_an_operator_whose_input_was_not_recorded_is_with_the_one_that_makes_it(
     graph = load_graph(MIXED)
     everything = set(graph.streams)
 
-    assert units(graph, everything, OPERATORS) == [(name,) for name in OPERATORS]
-    assert units(graph, everything - {"test/mix/mixed"}, ["smooth", "sum"]) == [("smooth",), ("sum",)]
-    together = units(graph, everything - {"test/mix/mixed"}, OPERATORS)
-    assert sorted(map(len, together)) == [1, 3]  # mix feeds smooth and merge
-    assert units(graph, [], OPERATORS) == [OPERATORS]
+    assert units(graph, everything, OPERATORS) == [{name} for name in OPERATORS]
+    assert units(graph, everything - {"test/mix/mixed"}, ["smooth", "sum"]) == [{"smooth"}, {"sum"}]
+    assert units(graph, everything - {"test/mix/mixed"}, OPERATORS) == [{"mix", "smooth"}, {"mix", "merge"}, {"sum"}]
+    assert set().union(*units(graph, [], OPERATORS)) == set(OPERATORS)
+
+
+def test_operators_that_feed_only_one_another_are_one_unit() -> None:
+    graph = load_graph(MIXED)  # mix takes what smooth makes of what mix has made
+
+    assert units(graph, set(graph.streams) - {"test/mix/mixed", "test/smooth/mean"}, ["mix", "smooth"]) == [
+        {"mix", "smooth"}
+    ]
+
+
+def test_what_is_cheap_to_repeat_is_repeated_by_several_and_what_is_dear_once() -> None:
+    decoding = [frozenset({"decoder", "odometry"}), frozenset({"decoder", "detector"})]
+
+    assert balanced(decoding, {"decoder": 1, "odometry": 10, "detector": 9}, 2) == decoding
+    assert balanced(decoding, {"decoder": 10, "odometry": 1, "detector": 2}, 2) == [decoding[0] | decoding[1]]
 
 
 def test_a_stream_is_checked_by_a_part_that_reads_it_anyway_else_by_its_maker_else_by_the_first() -> None:
