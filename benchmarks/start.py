@@ -34,8 +34,8 @@ from checkouts import word
 
 HERE = Path(__file__).resolve().parent
 RELAYS = 5
-GRAPH = HERE.parent / "graphs" / "simulated_robot.yaml"
-DEMO = HERE.parent / "recordings" / "demo.mcap"
+GRAPH = "graphs/simulated_robot.yaml"
+DEMO = "recordings/demo.mcap"
 WAIT = 30.0
 
 Figures = dict[str, float]
@@ -162,7 +162,9 @@ def replay(tree: Tree) -> Figures:
     """Replays the demo in its placement, in one process, and from its middle."""
     figures = {}
     for name, cores, words in (("replay", 2, ()), ("replay, one process", 1, ("--one-process",))):
-        report, _, took = tree.call("replay", DEMO, "--graph", GRAPH, "--quiet", "--json", *words)
+        report, _, took = tree.call(
+            "replay", tree.root / DEMO, "--graph", tree.root / GRAPH, "--quiet", "--json", *words
+        )
         work = sum(operator["cpu_ms"] for operator in report["operators"].values()) / 1e3
         figures[f"{name}: start and close"] = took - report["wall_s"]
         figures[f"{name}: operators' work"] = work
@@ -172,12 +174,29 @@ def replay(tree: Tree) -> Figures:
 
 def verify(tree: Tree) -> Figures:
     """Verifies a full recording of 20 s, whole and from near its end, where operators take up a snapshot."""
-    full = tree.folder / "full.mcap"
-    if not full.exists():
-        tree.call("replay", DEMO, "--graph", GRAPH, "--quiet", "--json", "--record", full)
-    _, _, whole = tree.call("verify", full, "--json", "--quiet")
-    _, _, late = tree.call("verify", full, "--json", "--quiet", "--start", "20")
-    return {"verify": whole, "verify the last second": late}
+    full = recorded(tree, "full", "")
+    report, _, whole = tree.call("verify", full, "--json", "--quiet")
+    figures = {"verify": whole}
+    if "reading_cpu_ms" in report:
+        work = (report["reading_cpu_ms"] + sum(operator["cpu_ms"] for operator in report["operators"])) / 1e3
+        figures |= {"verify: work": work, "verify: efficiency": work / (2 * report["wall_s"])}
+    for snapshots, name in (("", "without snapshots"), (", snapshots: 5s", "with them")):
+        file = recorded(tree, f"full{bool(snapshots):d}", snapshots)
+        report, _, late = tree.call("verify", file, "--json", "--quiet", "--start", "20")
+        figures |= {f"verify the last second, {name}": late, f"of it repeating, {name}": report["wall_s"]}
+    return figures
+
+
+def recorded(tree: Tree, name: str, snapshots: str) -> Path:
+    """Replays the demo and records everything; `snapshots` is added to what the graph says of its recordings."""
+    file = tree.folder / f"{name}.mcap"
+    if not file.exists():
+        text = (tree.root / GRAPH).read_text()
+        assert "depth/depth]}" in text
+        graph = tree.folder / f"{name}.yaml"
+        graph.write_text(text.replace("depth/depth]}", f"depth/depth]{snapshots}}}"))
+        tree.call("replay", tree.root / DEMO, "--graph", graph, "--quiet", "--json", "--record", file)
+    return file
 
 
 MEASURES: Mapping[str, Callable[[Tree], Figures]] = {
@@ -196,6 +215,9 @@ def table(rounds: Mapping[str, list[Figures]]) -> str:
     for name in rounds[now][0]:
         cells = [name, f"{statistics.median(each[name] for each in rounds[now]):.2f}"]
         for other in before:
+            if not all(name in each for each in rounds[other]):
+                cells += ["", ""]
+                continue
             ratios = [mine[name] / theirs[name] for mine, theirs in zip(rounds[now], rounds[other], strict=True)]
             cells.append(f"{statistics.median(each[name] for each in rounds[other]):.2f}")
             cells.append(f"{statistics.median(ratios):.2f} ({min(ratios):.2f} - {max(ratios):.2f})")

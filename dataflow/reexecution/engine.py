@@ -28,6 +28,9 @@ End = Callable[[str, int | None, str], None]
 """Is told of the end of every stream: its final stamp and the reason."""
 
 
+_NOTHING: Mapping[str, tuple[int | None, int | None]] = {}
+
+
 class Stuck(RuntimeError):
     """No recorded firing can be made, and nothing is left to read: a fault of the records or of the engine."""
 
@@ -99,7 +102,8 @@ class Recomputation:
     """Recorded operators, driven by their records on one thread.
 
     Re-execution begins at the stamp `begin` (see `records.reading.beginning`) and ends before the firings from `end`
-    on. `made` is given every message that the operators make, `read` every message that is read for them; `ended` the
+    on; `slices` are operators of which only the calls between two stamps are repeated (see `verification.slices`).
+    `made` is given every message that the operators make, `read` every message that is read for them; `ended` the
     ends of the streams that are made.
     """
 
@@ -115,15 +119,18 @@ class Recomputation:
         ended: End | None = None,
         begin: int | None = None,
         end: int | None = None,
+        slices: Mapping[str, tuple[int | None, int | None]] = _NOTHING,
         watcher: Watcher | None = None,
     ) -> None:
         self._fed = frozenset(feeding.streams)
         self._watcher: Watcher = watcher or Unwatched()
         self._ready: dict[str, RecordedRunner] = {}
         consumers: dict[str, list[RecordedRunner]] = {}
-        self.records = {name: list(_until(log.of(name), end)) for name in feeding.operators}
+        ends = {name: slices[name][1] if name in slices else end for name in feeding.operators}
+        self.records = {name: list(_until(log.of(name), ends[name])) for name in feeding.operators}
         outlet = _Outlet(consumers, self._ready, self._fed, made, ended)
         begins = {} if begin is None else _begins(graph, self.records, self._fed, begin)
+        begins |= {name: first for name, (first, _) in slices.items() if first is not None}
         nodes = [graph.nodes[name] for name in feeding.operators]
         taken = {stream for node in nodes for stream in _streams_into(node)}
         inputs = log.digests([graph.nodes[name] for name in {graph.streams[s].node for s in taken}], taken)
@@ -184,6 +191,11 @@ class Recomputation:
             if name != besides:
                 self._watcher.begins("close", name)
                 runner.operator.close()
+
+    @property
+    def reading_cpu_ns(self) -> int:
+        """CPU time that reading the recording took so far."""
+        return self._feed.work.cpu_ns
 
     def results(self) -> Mapping[str, Verification]:
         """The outcome for each operator so far."""

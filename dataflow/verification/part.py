@@ -23,9 +23,10 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
 
     The request: `path`, `graph` (JSON), `operators`, `checks` (recorded streams to compare with their records),
     `incomplete` (recorded streams to be made again), `records` and `batches` (see `letters.shared_records`), `begin`
-    (stamp, or None), `tolerance`.
+    (stamp, or None), `tolerance`, `slices` (by operator the stamps between which its calls are made).
     The answer: by operator `operators` (verifications), `comparisons`, `work` (see `OperatorCounts`); `digests` by
-    stream, `stored`, `wall` in seconds.
+    stream, `stored`, CPU time of `reading` (ns), `wall` in seconds; `slices`: `operator` and `work` of those that are
+    not repeated as a whole.
     """
     graph = Graph.from_json(request["graph"])
     with Recording(request["path"]) as recording:
@@ -47,22 +48,30 @@ def verify_part(request: Mapping[str, Any], board: Board) -> dict[str, Any]:
             made=comparer.made,
             read=read,
             begin=request["begin"],
+            slices=request["slices"],
             watcher=board,
         )
         started = time.monotonic()
         results = work.run()
         wall = time.monotonic() - started
         compared = comparer.close(results)
-    states = [state for runner in work.runners.values() for state in runner.ports.states.values()]
+    slices = request["slices"]
+    counts = {
+        name: [r.firings, r.ports.emitted, 0, r.work.cpu_ns, r.done, r.work.wall_ns] for name, r in work.runners.items()
+    }
     return {
-        "operators": {name: result.to_wire() for name, result in results.items()},
-        "comparisons": {name: asdict(comparison) for name, comparison in compared.items()},
+        "operators": {name: result.to_wire() for name, result in results.items() if name not in slices},
+        "slices": {name: {"operator": results[name].to_wire(), "work": counts[name]} for name in slices},
+        "comparisons": {name: asdict(comparison) for name, comparison in compared.items() if name not in slices},
         "stored": [check.result().to_wire() for check in checks.values()],
-        "digests": {s.stream: [s.digest.count, s.digest.hexdigest()] for s in states if s.digest is not None},
-        "work": {
-            name: [r.firings, r.ports.emitted, 0, r.work.cpu_ns, r.done, r.work.wall_ns]
-            for name, r in work.runners.items()
+        "digests": {
+            state.stream: [state.digest.count, state.digest.hexdigest()]
+            for name, runner in work.runners.items()
+            if name not in slices
+            for state in runner.ports.states.values()
         },
+        "work": {name: values for name, values in counts.items() if name not in slices},
+        "reading": work.reading_cpu_ns,
         "wall": wall,
     }
 

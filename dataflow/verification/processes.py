@@ -32,9 +32,6 @@ SHOW_EVERY = 0.2
 LEAVE_WITHIN = 10.0
 LAST_WORDS = 4000
 
-Locate = Callable[[str, int], str]
-"""(operator, calls that it has repeated) → the call that it is at, in words."""
-
 
 @dataclass(frozen=True, slots=True)
 class Call:
@@ -45,6 +42,8 @@ class Call:
     operators: tuple[str, ...] = ()
 
 
+Locate = Callable[[Call, str, int], str]
+"""(call of the worker, operator, calls that it has repeated) → the call that it is at, in words."""
 Workers = Callable[..., list[Any]]
 """Answers calls as `call_workers` does, with its options."""
 
@@ -55,7 +54,7 @@ def call_workers(
     threads: int,
     descriptors: Sequence[int] = (),
     stall_timeout: float = 120.0,
-    locate: Locate = lambda operator, repeated: "a firing",
+    locate: Locate = lambda call, operator, repeated: "a firing",
     watch: Watch | None = None,
 ) -> list[Any]:
     """The answers to `calls`, each from a process of its own.
@@ -181,8 +180,11 @@ class _Worker:
             doing = "while starting" if phase == "start" else "while reading the recording"
             of = f" (operators {', '.join(self.call.operators)})" if self.call.operators else ""
             return RunFailed(f"worker {self.number}{of} {what} {doing}", words)
-        at = f"{phase}()" if phase != "fire" else self._locate(operator, self.board.counts(operator).repeated)
+        at = f"{phase}()" if phase != "fire" else self._located(operator)
         return RunFailed(f"operator {operator!r} {what} in {at}", words, operator)
+
+    def _located(self, operator: str) -> str:
+        return self._locate(self.call, operator, self.board.counts(operator).repeated)
 
     def __enter__(self) -> Self:
         return self

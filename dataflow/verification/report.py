@@ -59,7 +59,7 @@ class VerifyReport:
     made here, by stream; `outputs` the streams of each operator, `producers` the nodes that it takes from.
     `start`: seconds into the recording, where it began there. `torn`: the recording has no proper end, so what is
     verified is what had been stored. `part`: the recording is a part of another, cut out of it. `work` tells how long
-    each operator worked.
+    each operator worked, `reading` the CPU seconds for which that worker read the recording that read most of it.
     """
 
     operators: tuple[Verification, ...]
@@ -83,6 +83,7 @@ class VerifyReport:
     torn: bool = False
     part: Cut | None = None
     work: Mapping[str, OperatorCounts] = field(default_factory=dict)
+    reading: float = 0.0
 
     @property
     def identical(self) -> bool:
@@ -145,6 +146,7 @@ class VerifyReport:
                 v.to_wire()
                 | {"verdict": self.verdict(v), "repeats": self.repeats(v.operator)}
                 | {"comparison": None if compared is None else compared.as_json()}
+                | {"cpu_ms": self.work[v.operator].cpu_ns / 1e6 if v.operator in self.work else None}
             )
         return {
             "identical": self.identical,
@@ -158,6 +160,7 @@ class VerifyReport:
             "messages": self.messages,
             "streams": self.streams,
             "wall_s": self.wall,
+            "reading_cpu_ms": self.reading * 1e3,
             "real_time_factor": self.span / self.wall if self.wall else None,
             "operators": operators,
             "stood_in": list(self.stood_in),

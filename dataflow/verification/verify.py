@@ -23,7 +23,7 @@ from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.report import OperatorCounts
 from dataflow.supervision.run import Watch
-from dataflow.verification import part, partition
+from dataflow.verification import part, partition, slices
 from dataflow.verification.choice import (
     accountable,
     chosen_operators,
@@ -56,6 +56,7 @@ class _Task:
     stood_in: tuple[str, ...]
     stand_ins: tuple[str, ...]
     incomplete: frozenset[str]
+    held: frozenset[str]
     parts: tuple[partition.Part, ...]
     unchecked: tuple[str, ...]
     facts: tuple[tuple[str, str, str], ...]
@@ -109,16 +110,25 @@ def verify(
             "begin": task.begin,
             "incomplete": sorted(task.incomplete),
             "tolerance": tolerance,
+            "slices": {},
         }
         calls = [
             Call(
                 f"{part.__name__}:{part.verify_part.__name__}",
-                request | {"operators": list(one.operators), "checks": list(one.checks)},
+                request
+                | {"operators": list(one.operators), "checks": list(one.checks)}
+                | {"slices": {name: (cut.begin, cut.end) for name, cut in one.slices.items()}},
                 one.operators,
             )
             for one in task.parts
         ]
-        answers = workers(calls, **options)
+        answers = [*workers(calls, **options)]
+        divided, left = slices.answer(task.graph, task.log, answers)
+        if left:
+            needed = tuple(n for n in task.operators if n in with_makers(task.held, task.graph, left))
+            whole = request | {"operators": list(needed), "checks": [], "slices": {}}
+            answers += workers([Call(f"{part.__name__}:{part.verify_part.__name__}", whole, needed)], **options)
+        answers.append(divided)
         report = _report(task, answers, tolerance, start)
         repeated = _repeat(task, report, request, options, workers)
     return replace(report, repeated=repeated, total=time.monotonic() - began)
@@ -153,9 +163,8 @@ def _prepare(
         sources = set() if first or only else {node.name for node in played.nodes.values() if node.source}
         stand_ins = [n for n in played.nodes if n in feeding | sources and accountable(recording, played, log, n)]
         checks, unchecked = stored_checks(recording, played, log, [*operators, *stand_ins])
-        groups = partition.units(played, held, operators)
-        work = {n: sum(r.duration + partition.PER_FIRING_NS for r in log.of(n)) for n in operators}
-        jobs = jobs or partition.jobs_for(work, len(os.sched_getaffinity(0)))
+        cores = len(os.sched_getaffinity(0))
+        parts = partition.planned(played, log, operators, held=held, jobs=jobs, cores=cores, divide=start is None)
         begin, last = _span(recording, start)
         return _Task(
             path=path,
@@ -166,7 +175,8 @@ def _prepare(
             stood_in=tuple(name for name in played.nodes if name in feeding),
             stand_ins=tuple(stand_ins),
             incomplete=incomplete,
-            parts=tuple(partition.with_checks(played, partition.balanced(groups, work, jobs), checks)),
+            held=frozenset(held),
+            parts=tuple(partition.with_checks(played, parts, checks)),
             unchecked=unchecked,
             facts=_differing_facts(recording.metadata, played),
             begin=None if start is None else begin,
@@ -179,10 +189,11 @@ def _prepare(
 def _locate(task: _Task) -> Locate:
     """Names the call that an operator is at, from the number of calls that it has repeated."""
 
-    def located(operator: str, repeated: int) -> str:
+    def located(call: Call, operator: str, repeated: int) -> str:
         node = task.graph.nodes[operator]
         kept, _ = whole(task.log.of(operator))
-        _, ahead, _ = beginning(kept, task.begin, stateless=node.operator.stateless)
+        begin, _ = call.request["slices"].get(operator, (task.begin, None))
+        _, ahead, _ = beginning(kept, begin, stateless=node.operator.stateless)
         calls = [record for record in ahead if record.kind in CALLS]
         if repeated >= len(calls):
             return "its end"
@@ -193,9 +204,8 @@ def _locate(task: _Task) -> Locate:
 
 
 def _report(
-    task: _Task, answers: Iterable[Mapping[str, Any]], tolerance: float | None, start: float | None
+    task: _Task, answers: Sequence[Mapping[str, Any]], tolerance: float | None, start: float | None
 ) -> VerifyReport:
-    answers = list(answers)
     of = _answer_of_each(answers)
     found = {name: Verification.from_wire(answer["operators"][name]) for name, answer in of.items()}
     stored = [StoredStream.from_wire(s) for answer in answers for s in answer["stored"]]
@@ -213,6 +223,7 @@ def _report(
         messages=sum(v.outputs for v in operators),
         streams=sum(len(nodes[name].outputs) for name in task.operators),
         wall=max(answer["wall"] for answer in answers),
+        reading=max(answer["reading"] for answer in answers) * 1e-9,
         span=task.span,
         stand_ins=tuple(_stand_in(task, name, stored) for name in task.stand_ins),
         stored=tuple(sorted(stored, key=lambda s: s.stream)),

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataflow.graph import load_graph
-from dataflow.verification.partition import START_NS, balanced, jobs_for, units, with_checks
+from dataflow.verification.partition import START_NS, Part, balanced, jobs_for, units, with_checks
 
 MIXED = Path(__file__).resolve().parent.parent / "runtime" / "mixed.yaml"
 OPERATORS = ("mix", "smooth", "merge", "sum")
@@ -33,18 +33,22 @@ def test_an_operator_whose_input_was_not_recorded_is_with_the_one_that_makes_it(
     graph = load_graph(MIXED)
     everything = set(graph.streams)
 
-    assert units(graph, everything, OPERATORS) == [{name} for name in OPERATORS]
-    assert units(graph, everything - {"test/mix/mixed"}, ["smooth", "sum"]) == [{"smooth"}, {"sum"}]
-    assert units(graph, everything - {"test/mix/mixed"}, OPERATORS) == [{"mix", "smooth"}, {"mix", "merge"}, {"sum"}]
-    assert set().union(*units(graph, [], OPERATORS)) == set(OPERATORS)
+    assert units(graph, everything, OPERATORS) == {name: {name} for name in OPERATORS}
+    assert units(graph, everything - {"test/mix/mixed"}, ["smooth", "sum"]) == {"smooth": {"smooth"}, "sum": {"sum"}}
+    assert units(graph, everything - {"test/mix/mixed"}, OPERATORS) == {
+        "smooth": {"mix", "smooth"},
+        "merge": {"mix", "merge"},
+        "sum": {"sum"},
+    }
+    assert set().union(*units(graph, [], OPERATORS).values()) == set(OPERATORS)
 
 
 def test_operators_that_feed_only_one_another_are_one_unit() -> None:
     graph = load_graph(MIXED)  # mix takes what smooth makes of what mix has made
 
-    assert units(graph, set(graph.streams) - {"test/mix/mixed", "test/smooth/mean"}, ["mix", "smooth"]) == [
-        {"mix", "smooth"}
-    ]
+    assert units(graph, set(graph.streams) - {"test/mix/mixed", "test/smooth/mean"}, ["mix", "smooth"]) == {
+        "mix": {"mix", "smooth"}
+    }
 
 
 def test_what_is_cheap_to_repeat_is_repeated_by_several_and_what_is_dear_once() -> None:
@@ -58,7 +62,7 @@ def test_a_stream_is_checked_by_a_part_that_reads_it_anyway_else_by_its_maker_el
     graph = load_graph(MIXED)
     checks = ["test/left/slow", "test/merge/seen", "test/mix/mixed", "test/smooth/mean"]
 
-    parts = with_checks(graph, [("sum",), ("smooth", "merge")], checks)
+    parts = with_checks(graph, [Part(("sum",)), Part(("smooth", "merge"))], checks)
 
     assert [part.checks for part in parts] == [
         ("test/left/slow", "test/merge/seen"),

@@ -62,7 +62,7 @@ def test_a_worker_that_dies_names_the_operator_and_its_call(code: int, phase: st
         call_workers(
             [call("die", code=code, phase=phase)],
             threads=1,
-            locate=lambda operator, repeated: f"firing 7 of {operator} after {repeated}",
+            locate=lambda call, operator, repeated: f"firing 7 of {operator} after {repeated}",
         )
 
     assert raised.value.operator == "smooth"

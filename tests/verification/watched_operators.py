@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 
 import psutil
-from kept_operators import Busy
+from kept_operators import BEGIN, MILLISECOND, Busy, Look
 
-from dataflow.messages import FeatureVector, Imu
+from dataflow.messages import FeatureVector, Image, Imu, Odometry, Transforms
 
 
 class Portless(Busy):
@@ -29,3 +29,47 @@ class Fatal(Busy):
         if self.calls == 10:
             os._exit(7)
         return made
+
+
+class Alone(Look):
+    """`Look`, which has no state, when it says so."""
+
+    stateless = True
+
+
+class Moody(Alone):
+    """Sees something else in one image."""
+
+    def process(
+        self,
+        image: Image,
+        signal: FeatureVector,
+        odometry: Odometry,
+        mounting: Transforms,
+        before: FeatureVector | None,
+        imu: tuple[Imu, ...],
+    ) -> FeatureVector:
+        if image.stamp == BEGIN + 1_000 * MILLISECOND:
+            image = image.replace(data=255 - image.data)
+        return super().process(image, signal, odometry, mounting, before, imu)
+
+
+class Forgetful(Alone):
+    """Says that it has no state, and has one: what it gives follows the number of its calls."""
+
+    def setup(self) -> None:
+        self.calls = 0
+
+    def process(
+        self,
+        image: Image,
+        signal: FeatureVector,
+        odometry: Odometry,
+        mounting: Transforms,
+        before: FeatureVector | None,
+        imu: tuple[Imu, ...],
+    ) -> FeatureVector:
+        self.calls += 1
+        seen = super().process(image, signal, odometry, mounting, before, imu)
+        first = BEGIN + (self.calls - 1) * 50 * MILLISECOND == image.stamp  # as it was from the first image on
+        return seen if first else seen.replace(vectors=seen.vectors + 1)
