@@ -33,7 +33,7 @@ class Slice:
 
 
 def divisible(graph: Graph, log: FiringLog, work: Mapping[str, int]) -> list[str]:
-    """Those of the operators in `work` whose calls may be divided, heaviest first.
+    """Chooses those of the operators in `work` whose calls may be divided, heaviest first.
 
     They are without state, worth dividing, and nothing has happened to them but calls.
     """
@@ -68,7 +68,7 @@ def shares(loads: Sequence[int], makers: Mapping[str, int], work: Mapping[str, i
 
 
 def cut(records: Sequence[FiringRecord], amounts: Sequence[int], per_call: int) -> list[Slice]:
-    """Slices of an operator's records that hold about these amounts of its work (ns), in this order; fewer where one
+    """Cuts an operator's records into slices of about these amounts of its work (ns), in this order; fewer where one
     would be without a call."""
     calls = [record for record in whole(records)[0] if record.kind in CALLS]
     due = list(accumulate(amounts[:-1]))
@@ -83,8 +83,8 @@ def cut(records: Sequence[FiringRecord], amounts: Sequence[int], per_call: int) 
 
 
 def together(found: Sequence[Mapping[str, Any]], records: Sequence[FiringRecord]) -> Mapping[str, Any] | None:
-    """The verification (as on the wire) of an operator whose slices are these; None where they do not show that every
-    call was repeated as recorded."""
+    """Makes the verification (as on the wire) of an operator of those of its slices; None where they do not show that
+    every call was repeated as recorded."""
     verifications = [Verification.from_wire(values) for values in found]
     calls = sum(record.kind in CALLS for record in records)
     verified = sum(v.verified for v in verifications)
@@ -95,7 +95,7 @@ def together(found: Sequence[Mapping[str, Any]], records: Sequence[FiringRecord]
 
 
 def digests(graph: Graph, name: str, records: Sequence[FiringRecord]) -> Mapping[str, list[Any]]:
-    """By stream, the number and the digest of the messages that an operator makes which makes what was recorded."""
+    """Computes, by stream, number and digest of the messages of an operator that makes what was recorded."""
     found = {stream: StreamDigest() for stream in graph.nodes[name].outputs.values()}
     for record in records:
         for digest, emission in zip(found.values(), record.outputs, strict=False):  # a failed call has none
@@ -105,13 +105,13 @@ def digests(graph: Graph, name: str, records: Sequence[FiringRecord]) -> Mapping
 
 
 def sum_of(counts: Sequence[Sequence[int]]) -> list[int]:
-    """What the workers did for one operator, as `OperatorCounts`: the stamp that is done is that of the last."""
+    """Adds up what the workers did for one operator, as `OperatorCounts`: the stamp that is done is that of the last."""
     firings, emitted, dropped, cpu_ns, done, wall_ns = zip(*counts, strict=True)
     return [sum(firings), sum(emitted), sum(dropped), sum(cpu_ns), max(done), sum(wall_ns)]
 
 
 def answer(graph: Graph, log: FiringLog, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
-    """What `answers` say of divided operators, as one answer more; and the operators to be verified as a whole."""
+    """Puts together what `answers` say of divided operators, as one answer more; names those to verify as a whole."""
     told: dict[str, Any] = {"operators": {}, "work": {}, "digests": {}, "comparisons": {}, "stored": []}
     told |= {"reading": 0, "wall": 0.0}
     left = set[str]()
