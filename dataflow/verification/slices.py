@@ -105,7 +105,7 @@ def digests(graph: Graph, name: str, records: Sequence[FiringRecord]) -> Mapping
 
 
 def sum_of(counts: Sequence[Sequence[int]]) -> list[int]:
-    """Adds up what the workers did for one operator, as `OperatorCounts`: the stamp that is done is that of the last."""
+    """Adds up what the workers did for one operator, as `OperatorCounts`: `done` is the last."""
     firings, emitted, dropped, cpu_ns, done, wall_ns = zip(*counts, strict=True)
     return [sum(firings), sum(emitted), sum(dropped), sum(cpu_ns), max(done), sum(wall_ns)]
 
