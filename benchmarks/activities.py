@@ -18,12 +18,13 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scene_graph import acts, macro_f1, majority
 from semantic_map import mapped
-from sensed_worlds import KINDS, World, sensed
+from sensed_worlds import KINDS, World, ids_in_view, sensed
 
 from dataflow.messages import Activity, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
@@ -70,7 +71,7 @@ def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
             frame="world",
             class_names=names,
             ids=episode.ids,
-            class_ids=[names.index(label) for label in episode.labels],
+            class_ids=np.array([names.index(label) for label in episode.labels], np.int32),
             positions=boxes[:, :3],
             sizes=boxes[:, 3:6],
             orientations=quaternion_from_yaw(boxes[:, 6]),
@@ -94,11 +95,11 @@ def sensor_steps(world: World) -> Iterator[Step]:
 
 def steps_of(world: World, nodes: list[SceneGraph]) -> Iterator[Step]:
     for frame, given in zip(world.frames, nodes, strict=True):
-        view = set(frame.objects.ids[frame.objects.visible >= 0.3].tolist())
+        view = ids_in_view(frame.objects, 0.3)
         said = zip(frame.activities.subjects.tolist(), frame.activities.goals, strict=True)
         goals = {i: int(g.rpartition(" ")[2]) if g.rpartition(" ")[2].isdigit() else -1 for i, g in said}
         truth = frame.scene
-        yield Step(given, frame.base, view, acts(frame.activities), goals, lambda g, t=truth: match_nodes(g, t))
+        yield Step(given, frame.base, view, acts(frame.activities), goals, partial(match_nodes, truth=truth))
 
 
 def figures_of(steps: list[Step]) -> Figures:

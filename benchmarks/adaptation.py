@@ -161,14 +161,16 @@ def trajectory_error(shown: list[Image], drive: list[dict[str, Any]], statics: A
     """RMSE of the camera's position, metres, the trajectories aligned."""
     odometry = VisualOdometry()
     odometry.setup()
-    estimate, truth = Trajectory.empty(), Trajectory.empty()
+    estimate, truth = Trajectory([], [], []), Trajectory([], [], [])
     for image, taken in zip(shown, drive, strict=True):
         depth: DepthImage = taken["depth"]
         true: Pose = taken["ground_truth"]
         given = (image, depth, statics["image_info"], statics["depth_info"], statics["extrinsics"])
         found = odometry.process(*given)["odometry"]
-        estimate.append(found.stamp, found.position, found.orientation)
-        truth.append(true.stamp, true.position, true.orientation)
+        for way, pose in ((estimate, found), (truth, true)):
+            way.stamps.append(pose.stamp)
+            way.positions.append(pose.position)
+            way.orientations.append(pose.orientation)
     return absolute_error(match(estimate, truth, 1_000_000), "se3")["ate_rmse_m"]
 
 
@@ -178,7 +180,7 @@ def measured(world: str, seed: int, seconds: int) -> Figures:
     for condition, (_, settings) in CONDITIONS.items():
         statics, drive = frames(world, seed, seconds, settings)
         chosen = drive[EVERY // 2 :: EVERY]
-        known: dict[tuple[str, ...], dict[str, float]] = {}
+        known: dict[tuple[bytes, ...], dict[str, float]] = {}
         for mode, parameters in MODES.items():
             shown = adapted([taken["image"] for taken in drive], parameters)
             key = tuple(image.digest() for image in shown)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Boxes3D, CameraInfo, DepthImage, Image, Planes, Pose, SegmentationMap
+from dataflow.messages import Boxes3D, CameraInfo, DepthImage, Image, Planes, Pose, SegmentationMap, Transforms
 from operators.cloud import CloudBuilder, CloudFilter, Clusterer, PlaneSegmenter
 from operators.cloud.plane_search import covered_area
 from operators.depth import DepthFilter
@@ -208,11 +208,14 @@ def run(world: str, seed: int, frames: int) -> Score:
     info = robot.static_outputs()["depth_info"]
     image_info = robot.static_outputs()["image_info"]
     assert isinstance(info, CameraInfo)
+    assert isinstance(image_info, CameraInfo)
     builder = CloudBuilder(stride=2, max_range=5.0, edge_ratio=0.05)
     segmenter, clusterer, thinner = PlaneSegmenter(), Clusterer(), CloudFilter(voxel=0.03, normal_neighbours=16)
     for operator in (builder, segmenter, clusterer, thinner):
         operator.setup()
     world_walls = walls(world, seed)
+    extrinsics = robot.static_outputs()["extrinsics"]
+    assert isinstance(extrinsics, Transforms)
     for k, messages in enumerate(robot.stream()):
         depth, image, pose, masks, boxes = (
             messages[name] for name in ("depth", "image", "ground_truth", "masks", "boxes")
@@ -222,11 +225,12 @@ def run(world: str, seed: int, frames: int) -> Score:
         assert isinstance(pose, Pose)
         assert isinstance(masks, SegmentationMap)
         assert isinstance(boxes, Boxes3D)
+        assert masks.instances is not None
         # classes and instances of the points: a second cloud whose colours are pixel numbers
         rows, columns = np.mgrid[: depth.height, : depth.width]
         number = (rows * depth.width + columns).astype(np.int64)
         code = np.stack([number >> 16, (number >> 8) & 255, number & 255], axis=-1).astype(np.uint8)
-        cloud = builder.process(depth, image, info, image_info, robot.static_outputs()["extrinsics"])
+        cloud = builder.process(depth, image, info, image_info, extrinsics)
         coded = builder.process(depth, image.replace(data=code), info, image_info)
         assert coded.colors is not None
         pixel = coded.colors.astype(np.int64) @ [65536, 256, 1]

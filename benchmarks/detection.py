@@ -14,6 +14,7 @@ import io
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +27,7 @@ from operators.detection import OnnxDetector
 
 def ground_truth(folder: Path, sizes: dict[str, tuple[int, int]], classes: int) -> COCO:
     """The labels (class cx cy w h, normalised) of the named images as a COCO object; sizes are (width, height)."""
-    annotations = []
+    annotations: list[dict[str, Any]] = []
     for i, (name, (width, height)) in enumerate(sizes.items(), 1):
         file = folder / "labels" / f"{name}.txt"
         for line in file.read_text().splitlines() if file.is_file() else ():

@@ -24,6 +24,7 @@ import time
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import psutil
 
@@ -124,7 +125,7 @@ def main() -> int:
         lines = [f"{name},{moment:.1f},{size}" for name, taken in sorted(samples.items()) for moment, size in taken]
         arguments.samples.write_text("\n".join(["process,seconds,bytes", *lines]) + "\n")
     end = max(moment for taken in samples.values() for moment, _ in taken)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for name, taken in sorted(samples.items()):
         early, late = median(taken, FIRST_AT + TAKEN_OVER / 2), median(taken, end - LAST)
         if early is not None and late is not None:

@@ -103,7 +103,7 @@ def main() -> None:
                 counts["iou"] += round(1e6 * sum(score.ious))
                 if source == "sensors":
                     by_class.update(("missed", name) for name, _ in score.missed)
-                    by_class.update(("false", name) for name, *_ in [*score.doubles, *score.wrong])
+                    by_class.update(("false", str(wrong[0])) for wrong in [*score.doubles, *score.wrong])
         for source, counts in sums.items():
             recall, precision = shares(counts)
             iou = counts["iou"] / 1e6 / max(counts["matched"], 1)

@@ -15,15 +15,18 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
 PERIOD, OUTAGE = 12.0, 3.0
 
 
-def fed(operator, samples, fixes):  # type: ignore[no-untyped-def]
+def fed(operator: Any, samples: Sequence[Any], fixes: Sequence[Any]) -> Iterator[Any]:
     """Gives an operator its messages in the order of their stamps; yields its odometry."""
     from dataflow.operator import Context
 
@@ -35,7 +38,7 @@ def fed(operator, samples, fixes):  # type: ignore[no-untyped-def]
 
 
 @cache
-def recorded(folder: Path):  # type: ignore[no-untyped-def]
+def recorded(folder: Path) -> tuple[list[Any], list[Any]]:
     """The inertial samples and the true poses."""
     from operators.sources import EurocImu
 
@@ -61,7 +64,13 @@ def euroc(folder: Path, seed: int) -> tuple[float, list[float], str]:
             place = place + rng.normal(0, 0.5, 3)
         if (pose.stamp - stamps[0]) * 1e-9 % PERIOD < PERIOD - OUTAGE:
             fixes.append(
-                Pose(stamp=pose.stamp, frame="world", child_frame="imu", position=place, orientation=[0, 0, 0, 1])
+                Pose(
+                    stamp=pose.stamp,
+                    frame="world",
+                    child_frame="imu",
+                    position=place,
+                    orientation=np.array([0.0, 0.0, 0.0, 1.0]),
+                )
             )
     operator = EkfFusion(
         base_frame="imu",
@@ -147,7 +156,7 @@ def driven(seed: int, seconds: int):  # type: ignore[no-untyped-def]
                     frame="world",
                     child_frame="gnss",
                     position=place,
-                    orientation=[0, 0, 0, 1],
+                    orientation=np.array([0.0, 0.0, 0.0, 1.0]),
                     covariance=covariance,
                 )
             )
@@ -184,10 +193,9 @@ def simulator(
         sensors={"sensor/fix": SensorSettings(use="position")},
     )
     operator.setup()
-    process = operator.process
-    operator.process = lambda m, c: process(m, c, extrinsics)  # type: ignore[method-assign, assignment]
+    mounted = SimpleNamespace(process=lambda messages, context: operator.process(messages, context, extrinsics))
     ends, nees, errors, expected = [], [], [], []
-    for estimate in fed(operator, samples, fixes):
+    for estimate in fed(mounted, samples, fixes):
         true = truth[estimate.stamp]
         since = estimate.stamp * 1e-9
         off = true[:3, 3] - estimate.position

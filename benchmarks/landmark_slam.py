@@ -54,7 +54,7 @@ def aligned(points: np.ndarray, onto: np.ndarray) -> np.ndarray:
     a, b = points - points.mean(0), onto - onto.mean(0)
     u, _, vt = np.linalg.svd(a.T @ b)
     R = vt.T @ np.diag([1, np.linalg.det(vt.T @ u.T)]) @ u.T
-    return a @ R.T + onto.mean(0)
+    return np.asarray(a @ R.T + onto.mean(0))
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ from typing import Any
 import cv2
 import numpy as np
 from learned_shapes import CHOOSING, JUDGED, ON_FLOOR
+from sensed_worlds import in_view
 
 from dataflow.messages import Detections2D, Image
 from dataflow.messages.geometry import invert
@@ -93,7 +94,8 @@ def views(name: str, kind: str, seed: int, count: int) -> Iterator[tuple[np.ndar
             world_frame="w",
         )
         rows = np.flatnonzero(truth.ids == id)
-        if len(rows) and truth.visible[rows[0]] >= VISIBLE and truth.pixel_counts[rows[0]] >= PIXELS:
+        if len(rows) and in_view(truth, VISIBLE, PIXELS)[rows[0]]:
+            assert view.color is not None
             made += 1
             noisy = expose(view.color, rng.uniform(0.8, 1.2)) + rng.normal(0, 2, view.color.shape)
             ids = truth.class_ids.copy()
@@ -148,7 +150,7 @@ def written(folder: Path, name: str, count: int, shift: int = 0) -> tuple[Path, 
                 images.append({"id": len(images), "file_name": file, "width": 640, "height": 480})
                 for row in range(truth.count):
                     x1, y1, x2, y2 = truth.boxes[row].tolist()
-                    clear = truth.visible[row] >= VISIBLE and truth.pixel_counts[row] >= PIXELS
+                    clear = in_view(truth, VISIBLE, PIXELS)[row]
                     annotations.append(
                         {
                             "id": len(annotations), "image_id": len(images) - 1, "bbox": [x1, y1, x2 - x1, y2 - y1],
@@ -169,7 +171,8 @@ def detected(folder: Path, detector: CustomDetector | LearnedDetector) -> list[S
     frames = []
     for image in content["images"]:
         pixels = cv2.imread(str(folder / image["file_name"]), cv2.IMREAD_COLOR_RGB)
-        found = detector.process(Image(stamp=image["id"], frame="camera", data=pixels))
+        assert pixels is not None
+        found = detector.process(Image(stamp=image["id"], frame="camera", data=np.asarray(pixels, np.uint8)))
         own = [a for a in content["annotations"] if a["image_id"] == image["id"]]
         boxes = np.array([[x, y, x + w, y + h] for x, y, w, h in (a["bbox"] for a in own)], np.float64).reshape(-1, 4)
         frames.append(
@@ -212,7 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--thresholds", nargs="+", type=float, help="compare these, in the worlds that serve for that")
     options = parser.parse_args(arguments)
     if options.thresholds:
-        _compare(options.folder / "choice", options.objects or CHOOSING, options.views, options.thresholds)
+        _compare(options.folder / "choice", options.objects or list(CHOOSING), options.views, options.thresholds)
         return
     for name in options.objects or JUDGED:
         held_out, file = _learned(options.folder, name, options.views)

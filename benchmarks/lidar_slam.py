@@ -24,6 +24,7 @@ import numpy as np  # noqa: E402
 from lidar_odometry import drift, peer  # noqa: E402
 from lidar_worlds import Drive, rendered  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
+from scipy.linalg import block_diag  # noqa: E402
 
 from dataflow.messages import Odometry  # noqa: E402
 from dataflow.messages.geometry import invert  # noqa: E402
@@ -48,20 +49,21 @@ def scored(drive: Drive, params: dict[str, Any]) -> dict[str, float]:
     """Runs the SLAM, in which the odometry is, and scores both."""
     operator = LidarSlam(**params)
     operator.setup()
-    odometry, poses, spent, squares = [], [], [], []
+    odometry, poses = list[NDArray[np.float64]](), list[NDArray[np.float64]]()
+    spent, squares = list[float](), list[float]()
     origin = invert(drive.truth[0])
     for cloud, T in zip(drive.clouds, drive.truth, strict=True):
         begin = time.process_time()
         messages = operator.process(cloud)
         spent.append(1e3 * (time.process_time() - begin))
-        for port, found in (("odometry", odometry), ("pose", poses)):
+        for port, way in (("odometry", odometry), ("pose", poses)):
             message = messages.get(port)
-            found.append(message.matrix() if isinstance(message, Odometry) else np.full((4, 4), np.nan))
+            way.append(message.matrix() if isinstance(message, Odometry) else np.full((4, 4), np.nan))
         pose = messages.get("pose")
         if isinstance(pose, Odometry) and pose.pose_covariance is not None and len(poses) > 1:
             off = se3.log(invert(origin @ T) @ poses[-1])
-            R = np.kron(np.eye(2), poses[-1][:3, :3])
-            squares.append(off @ np.linalg.solve(R.T @ pose.pose_covariance @ R, off) / 6)
+            R = block_diag(poses[-1][:3, :3], poses[-1][:3, :3])
+            squares.append(float(off @ np.linalg.solve(R.T @ pose.pose_covariance @ R, off)) / 6)
     at = {cloud.stamp: T for cloud, T in zip(drive.clouds, drive.truth, strict=True)}
     graph = operator._mapper.graph
     nodes = list(graph.nodes.values())

@@ -71,7 +71,7 @@ def _render(file: Path, world: str, seed: int, seconds: int, speed: float, route
         np.savez(
             handle,
             points=np.concatenate([cloud.points for cloud in clouds]),
-            offsets=np.concatenate([cloud.time_offsets for cloud in clouds]),  # type: ignore[misc]
+            offsets=np.concatenate([cloud.time_offsets for cloud in clouds]),
             counts=np.array([len(cloud.points) for cloud in clouds]),
             stamps=np.array([cloud.stamp for cloud in clouds], np.int64),
             truth=np.array(truth),

@@ -16,15 +16,19 @@ import argparse
 import math
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+Streams = dict[str, list[Any]]
 KIDNAPS = ((15.0, 0.37), (30.0, 0.5), (45.0, 0.23))
 SENSORS = {"lidar": ("points",), "landmarks": ("sightings",), "both": ("points", "sightings")}
 
 
-def drive(world: str, seed: int, seconds: int = 60, kidnaps=KIDNAPS, faults=()):  # type: ignore[no-untyped-def]
+def drive(world: str, seed: int, seconds: int = 60, kidnaps: Any = KIDNAPS, faults: Any = ()) -> tuple[Any, Streams]:
     """The streams of a drive, static ones apart."""
     from operators.sources import SimulatedRobot
 
@@ -43,7 +47,8 @@ def drive(world: str, seed: int, seconds: int = 60, kidnaps=KIDNAPS, faults=()):
         truth={"poses": 20, "relations": 0, "activities": 0, "boxes": False, "occupancy": True},
     )
     robot.setup()
-    static, streams = robot.static_outputs(), {}
+    static = robot.static_outputs()
+    streams: Streams = {}
     for step in robot.stream():
         for port, message in step.items():
             streams.setdefault(port, []).append(message)
@@ -51,13 +56,13 @@ def drive(world: str, seed: int, seconds: int = 60, kidnaps=KIDNAPS, faults=()):
     return static, streams
 
 
-def localized(static, streams, sensors, **params):  # type: ignore[no-untyped-def]
+def localized(static: Any, streams: Streams, sensors: Sequence[str], **params: Any) -> tuple[Any, Any]:
     """Plays the operator; returns what it gives and itself."""
     from dataflow.testing import play
     from operators.localization import ParticleFilterLocalizer
 
     operator = ParticleFilterLocalizer(**params)
-    inputs = {
+    inputs: dict[str, Any] = {
         "odometry": streams["wheel_odometry"],
         "measurements": {port: streams[port] for port in (*sensors, "imu")},
         "extrinsics": [static["extrinsics"]],
@@ -67,7 +72,7 @@ def localized(static, streams, sensors, **params):  # type: ignore[no-untyped-de
     return play(operator, inputs, static=("extrinsics", "landmark_map", "map"), paranoid=False), operator
 
 
-def errors(poses, truth) -> np.ndarray:  # type: ignore[no-untyped-def]
+def errors(poses: Sequence[Any], truth: Sequence[Any]) -> NDArray[np.float64]:
     """Rows of time (s), distance (m) and turn (deg) from the truth."""
     from dataflow.messages.geometry import yaw_of
 
@@ -156,7 +161,7 @@ def ambiguous(worlds: list[str]) -> None:
                 words = {word: n for word, n in operator.summary().items() if word.startswith("poses ")}
                 print(
                     f"{world} {seed} {name}: right {(len(rows) - wrong) / total:.0%}, wrong {wrong / total:.0%}, "
-                    f"ambiguous {words.get('poses ambiguous', 0) / total:.0%}; {words}",  # type: ignore[operator]
+                    f"ambiguous {words.get('poses ambiguous', 0) / total:.0%}; {words}",
                     flush=True,
                 )
 
@@ -169,8 +174,8 @@ def measure() -> None:
     times: dict[str, list[float]] = {}
     weigh, move = MonteCarlo.weigh, MonteCarlo.move
 
-    def timed(name, method):  # type: ignore[no-untyped-def]
-        def call(self, *arguments):  # type: ignore[no-untyped-def]
+    def timed(name: str, method: Any) -> Any:
+        def call(self: Any, *arguments: Any) -> None:
             began, injected = time.perf_counter(), self.injected
             method(self, *arguments)
             kind = name if name == "move" else f"weigh {type(arguments[1]).__name__}"

@@ -91,7 +91,7 @@ def truth(world: World) -> list[Sheet]:
     """The surfaces of a world as far as clouds show them."""
     seen: dict[tuple[str, int], Cells] = {}
     sheets = walls(world)
-    names = {}
+    names: dict[int, str] = {}
     for frame in world.frames[::4]:
         points, classes, instances = _labelled(frame, world)
         boxes, labels = boxes_of(frame.scene)

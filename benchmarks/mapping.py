@@ -107,7 +107,7 @@ def solid(truth: OccupancyGrid, mesh: Mesh) -> Mask:
     """Cells that hold a surface of the mesh within the band, those on either side of a surface on their border too."""
     points = on_surface(mesh.vertices.astype(np.float64), mesh.triangles, 8000, np.random.default_rng(0))
     points = points[(points[:, 2] >= BAND[0]) & (points[:, 2] <= BAND[1])]
-    found = truth.cells == 100
+    found: Mask = truth.cells == 100
     for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
         cell = np.floor((points[:, :2] + [1e-3 * x, 1e-3 * y] - truth.position[:2]) / truth.resolution).astype(int)
         cell = cell[(cell >= 0).all(axis=1) & (cell < found.shape[::-1]).all(axis=1)]
@@ -120,7 +120,9 @@ def _last(scored: Scored) -> tuple[PointCloud, Pose]:
     scored.mapper.period = 1
     frame = scored.truth.frame
     nothing = PointCloud(stamp=scored.stamp, frame="none", points=np.zeros((0, 3), np.float32))
-    return nothing, Pose(stamp=scored.stamp, frame=frame, position=[0, 0, 0], orientation=[0, 0, 0, 1])
+    return nothing, Pose(
+        stamp=scored.stamp, frame=frame, position=np.zeros(3), orientation=np.array([0.0, 0.0, 0.0, 1.0])
+    )
 
 
 def _iou(a: Mask, b: Mask) -> float:
@@ -191,7 +193,7 @@ class Ours:
         nothing = DepthImage(
             stamp=stamp, frame=self.info.frame, data=np.zeros((self.info.height, self.info.width), np.float32)
         )
-        pose = Pose(stamp=stamp, frame=frame, position=[0, 0, 0], orientation=[0, 0, 0, 1])
+        pose = Pose(stamp=stamp, frame=frame, position=np.zeros(3), orientation=np.array([0.0, 0.0, 0.0, 1.0]))
         mesh = self.operator.process(nothing, pose, self.info)["mesh"]
         assert isinstance(mesh, Mesh)
         return mesh.vertices.astype(np.float64), mesh.triangles
@@ -205,11 +207,11 @@ def on_surface(vertices: Array, triangles: NDArray[Any], per_square_metre: float
     chosen = rng.choice(len(corners), int(area.sum() * per_square_metre), p=area / area.sum())
     root, second = np.sqrt(rng.random(len(chosen))), rng.random(len(chosen))
     weights = np.stack([1 - root, root * (1 - second), root * second], axis=1)
-    return np.einsum("nk,nkd->nd", weights, corners[chosen])
+    return np.asarray(np.einsum("nk,nkd->nd", weights, corners[chosen]), np.float64)
 
 
 def near(points: Array, others: Array, distance: float) -> Mask:
-    return np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0])
+    return np.asarray(np.isfinite(cKDTree(others).query(points, distance_upper_bound=distance)[0]))
 
 
 def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
@@ -233,6 +235,7 @@ def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
                 assert isinstance(depth, DepthImage)
                 assert isinstance(pose, Pose)
                 assert isinstance(ideal, DepthImage)
+                frame = pose.frame
                 begin = time.process_time()
                 one.add(depth, pose)
                 spent.append(1e3 * (time.process_time() - begin))
@@ -244,7 +247,7 @@ def surface(worlds: list[str], seeds: list[int], seconds: int) -> None:
             due = due[near(due, np.concatenate(returns), 0.02)]
             tree = cKDTree(still)
             begin = time.process_time()
-            vertices, triangles = one.mesh(depth.stamp, pose.frame)
+            vertices, triangles = one.mesh(depth.stamp, frame)
             took = time.process_time() - begin
             found = on_surface(vertices, triangles, 1000, rng)
             off = tree.query(found, distance_upper_bound=0.3)[0]

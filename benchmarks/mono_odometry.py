@@ -16,6 +16,7 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 REPOSITORY = Path(__file__).resolve().parent.parent
@@ -78,8 +79,8 @@ def _render(file: Path, world: str, seed: int, seconds: int) -> None:
         truth={"poses": 10, "boxes": False, "relations": 0, "activities": 0},
     )
     robot.setup()
-    static = dict(robot.static_outputs())
-    messages = [dict(m) for m in robot.stream()]
+    static: dict[str, Any] = dict(robot.static_outputs())
+    messages: list[dict[str, Any]] = [dict(m) for m in robot.stream()]
     truth = np.array([m["ground_truth"].matrix() for m in messages])
     T_base_camera = invert(messages[0]["true_base"].matrix()) @ truth[0]
     file.parent.mkdir(parents=True, exist_ok=True)

@@ -95,7 +95,7 @@ def _rendered(world: str, seed: int, mount: str) -> tuple[Pixels, NDArray[np.flo
     )
     robot.setup()
     try:
-        seen = [m for m in robot.stream() if "image" in m and "ground_truth" in m]
+        seen: list[Any] = [m for m in robot.stream() if "image" in m and "ground_truth" in m]
     finally:
         robot.close()
     return (
@@ -113,7 +113,7 @@ def colors(view: Pixels) -> NDArray[np.float32]:
     """A histogram of 8 levels of each colour, as the root of its shares (their product is Bhattacharyya's)."""
     bins = (view // 32).reshape(-1, 3).astype(np.int64) @ (64, 8, 1)
     counts = np.bincount(bins, minlength=512).astype(np.float32)
-    return np.sqrt(counts / counts.sum())
+    return np.asarray(np.sqrt(counts / counts.sum()), np.float32)
 
 
 def shrunk(view: Pixels) -> NDArray[np.float32]:

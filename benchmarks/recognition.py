@@ -56,7 +56,8 @@ class Torchvision(ClassifierTask):
 
     @property
     def network(self) -> nn.Module:
-        return self.resnet
+        resnet: nn.Module = self.resnet
+        return resnet
 
     def loss(self, batch: tuple[Tensor, Tensor], device: torch.device) -> dict[str, Tensor]:
         images, labels = batch
@@ -78,6 +79,8 @@ class Fcn(nn.Module):
             whole.load_state_dict(given, strict=False)
         self.features = whole.features[:14]
         self.head = torchvision.models.segmentation.fcn.FCNHead(96, classes)
+        self.mean: Tensor
+        self.deviation: Tensor
         self.register_buffer("mean", torch.tensor([0.485, 0.456, 0.406]).view(1, 3, 1, 1))
         self.register_buffer("deviation", torch.tensor([0.229, 0.224, 0.225]).view(1, 3, 1, 1))
 

@@ -54,8 +54,12 @@ Figures = dict[str, float]
 
 def roundtrip(count: int, folder: Path) -> Figures:
     """Round trips in µs without recording and with it, and the ratios to the unrecorded median."""
-    plain = ours({})(VGA_BYTES, count)[WARM_UP:]
-    recorded = ours({"record": str(folder / "trip.mcap"), "overwrite": True})(VGA_BYTES, count)[WARM_UP:]
+    plain = ours(HERE.parent)(VGA_BYTES, count)[WARM_UP:]
+    trip = folder / "trip.mcap"
+    recorded = ours(HERE.parent, record=trip)(VGA_BYTES, count)[WARM_UP:]
+    with Recording(trip) as recording:
+        assert recording.streams["roundtrip/ping/array"].count == count
+    trip.unlink()
     half = statistics.median(plain)
     figures = {}
     for name, took in (("unrecorded", plain), ("recorded", recorded)):
@@ -77,7 +81,8 @@ def frames(file: Path) -> None:
     with Recording(HERE.parent / "recordings" / "demo.mcap") as recording:
         for stream, decoder in decoders.items():
             for _, recorded in zip(range(FRAMES), recording.messages([stream]), strict=False):
-                data = decoder.process(recorded.message).data
+                made: Any = decoder.process(recorded.message)
+                data = made.data
                 found[stream].append(data.repeat(2, axis=0).repeat(2, axis=1))
     color, depth = (np.stack(each) for each in found.values())
     noisy = np.rint(color + noise.normal(0, COLOR_NOISE, color.shape)).clip(0, 255).astype(np.uint8)
@@ -140,7 +145,7 @@ def bare(images: Path, seconds: float, folder: Path) -> Figures:
     count = int(seconds * RATE)
     began = time.process_time()
     with file.open("wb") as opened:
-        writer = Writer(opened, compression=CompressionType.LZ4)
+        writer: Any = Writer(opened, compression=CompressionType.LZ4)
         writer.start()
         channels = [writer.register_channel(topic, "protobuf", 0) for topic in ("image", "depth")]
         for k in range(count):

@@ -100,8 +100,8 @@ def open3d_icp(threads: int) -> bytes:
 
 
 def kiss_icp(threads: int) -> bytes:
-    from kiss_icp.config import KISSConfig  # type: ignore[import-untyped]
-    from kiss_icp.kiss_icp import KissICP  # type: ignore[import-untyped]
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
 
     config = KISSConfig()
     config.data.deskew = False

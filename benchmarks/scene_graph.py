@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from semantic_map import mapped, scored, seen
-from sensed_worlds import Frame, World, sensed
+from sensed_worlds import Frame, World, ids_in_view, sensed
 
 from dataflow.messages import Activity, SceneGraph
 from operators.scene import SceneGraphBuilder
@@ -39,7 +39,7 @@ def compare_acts(world: World, frames: list[Frame], made: list[tuple[Activity, d
         said = {of[i]: a for i, a in acts(message).items() if i in of}
         now = acts(frames[k].activities)
         around = [acts(f.activities) for f in frames if abs(f.cloud.stamp - frames[k].cloud.stamp) <= 500_000_000]
-        view = set(frames[k].objects.ids[frames[k].objects.visible >= 0.3].tolist())
+        view = ids_in_view(frames[k].objects, 0.3)
         for agent, true in now.items():
             if agent in said and agent in view:
                 right = any(a.get(agent) == said[agent] for a in around)
@@ -48,7 +48,7 @@ def compare_acts(world: World, frames: list[Frame], made: list[tuple[Activity, d
 
 
 def macro_f1(counts: Counter[str]) -> float:
-    pairs = [(*key.split("|"), n) for key, n in counts.items()]
+    pairs = [(*key.partition("|")[::2], n) for key, n in counts.items()]
     scores = []
     for name in {t for t, _, _ in pairs}:
         hit = sum(n for t, s, n in pairs if t == s == name)
@@ -81,6 +81,7 @@ def goals(frames: list[Frame], graphs: list[SceneGraph]) -> dict[str, list[bool]
             here = graph.positions[ids.index(agent)][:2]
             way = here - old.positions[old.ids.tolist().index(agent)][:2] if agent in old.ids.tolist() else np.zeros(2)
             offsets = {ids[i]: graph.positions[i][:2] - here for i in candidates}
+            assert graph.relation_scores is not None
             heads = {
                 ids[o]: float(graph.relation_scores[r])
                 for r, (s, p, o) in enumerate(graph.relations())
@@ -143,21 +144,21 @@ def main() -> None:
             print(world.name, fed, told, "activities", round(macro_f1(found["acts"]), 3), flush=True)
             if options.out is not None:
                 options.out.write_text(json.dumps(rows, default=str))
-    for fed, found in rows.items():
-        if not found:
+    for fed, worlds in rows.items():
+        if not worlds:
             continue
         for key in ("recall", "precision", "f1 mapped", "f1 all"):
-            values = [r[key] for r in found if key in r]
+            values = [r[key] for r in worlds if key in r]
             if values:
                 print(f"{fed} {key}: mean {np.mean(values):.3f}, worst {min(values):.3f}")
         total = RelationScore()
-        for row in found:
+        for row in worlds:
             total.counts.update(row["relations"])
         print(f"{fed} by predicate:", {p: round(total.f1("mapped", f" {p}"), 3) for p in PREDICATES})
-        said: Counter[str] = sum((r["acts"] for r in found), Counter())
+        said: Counter[str] = sum((r["acts"] for r in worlds), Counter())
         print(f"{fed} activities: macro-F1 {macro_f1(said):.3f} pooled; majority {majority(said):.3f}; {dict(said)}")
         for name in ("ours", "nearest", "heading"):
-            right = [x for r in found for x in r["goals"].get(name, [])]
+            right = [x for r in worlds for x in r["goals"].get(name, [])]
             if right:
                 print(f"{fed} goals, {name}: {np.mean(right):.2f} of {len(right)}")
 

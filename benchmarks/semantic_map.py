@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sensed_worlds import Mapper, World, sensed
+from sensed_worlds import Mapper, World, in_view, sensed
 
 from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
 from operators.scene.scoring import MOVERS, NodeScore, PlainlySeen, score_nodes
@@ -31,8 +31,7 @@ def mapped(world: World, *, true: bool, **params: Any) -> list[SceneGraph]:
         detections: Detections2D = frame.objects if true else frame.detections
         masks: SegmentationMap = frame.masks if true else frame.segmentation
         if true:
-            enough = (frame.objects.visible >= 0.2) & (frame.objects.pixel_counts >= 100)
-            detections = chosen(frame.objects, enough)
+            detections = chosen(frame.objects, in_view(frame.objects, 0.2, 100))
         nodes.append(mapper.take(world, frame, detections, masks)[1])
     return nodes
 

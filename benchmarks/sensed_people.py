@@ -13,7 +13,7 @@ from pathlib import Path
 
 from scene_graph import acts
 from semantic_map import mapped
-from sensed_worlds import World, sensed
+from sensed_worlds import World, ids_in_view, sensed
 
 from operators.recognition.sensed_people import SensedTrack, sensed_tracks, write_tracks
 from operators.sources.simulator.classes import ACTIVITIES
@@ -26,7 +26,7 @@ def tracks_of(world: World) -> list[SensedTrack]:
         [frame.base for frame in frames],
         [frame.scene for frame in frames],
         [acts(frame.activities) for frame in frames],
-        [set(frame.objects.ids[frame.objects.visible >= 0.3].tolist()) for frame in frames],
+        [ids_in_view(frame.objects, 0.3) for frame in frames],
         ACTIVITIES,
     )
 

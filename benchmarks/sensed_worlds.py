@@ -11,6 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dataflow.messages import (
     Activity,
     Boxes3D,
@@ -57,6 +60,19 @@ class World:
     image_info: CameraInfo
     extrinsics: Transforms
     frames: list[Frame]
+
+
+def in_view(objects: Detections2D, share: float, pixels: int = 0) -> NDArray[np.bool_]:
+    """Which objects show at least this share of themselves, and so many pixels."""
+    assert objects.visible is not None
+    assert objects.pixel_counts is not None
+    return (objects.visible >= share) & (objects.pixel_counts >= pixels)
+
+
+def ids_in_view(objects: Detections2D, share: float) -> set[int]:
+    """The ids of those."""
+    assert objects.ids is not None
+    return set(objects.ids[in_view(objects, share)].tolist())
 
 
 class Mapper:

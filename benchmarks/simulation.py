@@ -109,12 +109,11 @@ def _one(seed: int) -> dict[str, Any]:
             result = check(scenario, Path(folder))
         except Violation as violation:
             small, said = shrink(scenario, Path(folder), violation)
-            counts: dict[str, int] = {}
             plan = small.describe()
-            return {"seed": seed, "verdict": "broken", "violation": said, "plan": plan, "counts": counts}
+            return {"seed": seed, "verdict": "broken", "violation": said, "plan": plan, "counts": {}}
     outcome = result.outcome
     verdict = result.verdict + (", the run failed" if outcome.failure is not None else "")
-    counts = {
+    counts: dict[str, Any] = {
         "simulated_s": round(outcome.seconds, 3),
         "live": int(scenario.live),
         "killed": len(outcome.killed),

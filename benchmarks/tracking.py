@@ -63,6 +63,7 @@ def simulated_truth(world: str, seed: int, seconds: int) -> list[list[list[float
     for messages in robot.stream():
         objects = messages.get("objects")
         if isinstance(objects, Detections2D):
+            assert objects.ids is not None
             shares = objects.visible if objects.visible is not None else np.ones(objects.count)
             rows = zip(objects.ids.tolist(), objects.boxes.tolist(), shares.tolist(), strict=True)
             frames.append([[i, *box, share] for i, box, share in rows if share >= 0.3 and area(box) >= 100])
@@ -147,7 +148,8 @@ def bootstrap(first: dict[str, Any], second: dict[str, Any], metric: str) -> tup
     difference = np.array([first[name][metric] - second[name][metric] for name in first])
     rng = np.random.default_rng(0)
     means = difference[rng.integers(0, len(difference), (4000, len(difference)))].mean(axis=1)
-    return tuple(np.percentile(means, [2.5, 97.5]).tolist())  # type: ignore[return-value]
+    low, high = np.percentile(means, [2.5, 97.5]).tolist()
+    return low, high
 
 
 def truths(venv: Path, first_world: int, seconds: int) -> dict[str, Any]:

@@ -65,6 +65,8 @@ def main() -> None:
                 if blind[i] <= 0 and rng.random() < 0.9:
                     kept.append(j)
             count = int(rng.poisson(0.2))
+            assert graph.orientations is not None
+            assert graph.sizes is not None
             centers = graph.positions[kept] + rng.normal(0, 0.08, (len(kept), 3))
             spots = rng.uniform([-4, -4, 0.3], [4, 4, 1.2], (count, 3))
             raw.extend(np.linalg.norm(centers - graph.positions[kept], axis=1))

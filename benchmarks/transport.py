@@ -65,6 +65,7 @@ def consume(mode: str, endpoint: str) -> None:
             if envelope.kind is Kind.END:
                 return
             if envelope.message is not None:
+                assert isinstance(envelope.message, Image)
                 assert envelope.message.data[-1, -1, 0] == envelope.seq % IMAGES
                 count += 1
             echo.put(ACK.pack(count, time.monotonic_ns()))

@@ -77,8 +77,8 @@ def _render(file: Path, world: str, seed: int, seconds: int, mount: str | None) 
         truth={"poses": 10, "boxes": False, "relations": 0, "activities": 0},
     )
     robot.setup()
-    static = dict(robot.static_outputs())
-    messages = [dict(m) for m in robot.stream()]
+    static: dict[str, Any] = dict(robot.static_outputs())
+    messages: list[dict[str, Any]] = [dict(m) for m in robot.stream()]
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
         file,

@@ -61,7 +61,8 @@ def main() -> None:
             for name, found in (("controller", theirs), ("WheelOdometry", ours)):
                 error = planar(found[-1], found[0].matrix()) - planar(truth[-1], truth[0].matrix())
                 error[2] = math.remainder(error[2], 2 * math.pi)
-                C = found[-1].pose_covariance[np.ix_([0, 1, 5], [0, 1, 5])]
+                covariance: Any = found[-1].pose_covariance
+                C = covariance[np.ix_([0, 1, 5], [0, 1, 5])]
                 nees = float(error @ np.linalg.solve(C, error)) / 3
                 rows.setdefault(name, []).append([way, math.hypot(*error[:2]), math.degrees(abs(error[2])), nees])
         for name, row in rows.items():

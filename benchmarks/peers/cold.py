@@ -22,6 +22,7 @@ import resource
 import statistics
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -60,14 +61,15 @@ class Pair:
         self.marks: dict[str, int] = {}
         self.reader: Any = None
         operators = roundtrip_operators
-        operators.time = SimpleNamespace(  # type: ignore[assignment]
+        clock = SimpleNamespace(
             sleep=lambda seconds: self.hub.switch(), monotonic_ns=self._marked("begun"), time_ns=time.time_ns
         )
+        vars(operators)["time"] = clock
         for cls, method, name in ((operators.Echo, "process", "relayed"), (operators.Pong, "process", "taken")):
             setattr(cls, method, self._after_mark(name, getattr(cls, method)))
-        os.eventfd_write = self._after_mark("woken", os.eventfd_write)  # type: ignore[assignment]
-        live_sources.threading = SimpleNamespace(  # type: ignore[assignment]
-            Thread=self._reader, Event=live_sources.threading.Event, TIMEOUT_MAX=live_sources.threading.TIMEOUT_MAX
+        vars(os)["eventfd_write"] = self._after_mark("woken", os.eventfd_write)
+        vars(live_sources)["threading"] = SimpleNamespace(
+            Thread=self._reader, Event=threading.Event, TIMEOUT_MAX=threading.TIMEOUT_MAX
         )
         self.near, self.far = self._processes(size)
 

@@ -14,14 +14,20 @@ import io
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import supervision as sv
 import trackers
+from numpy.typing import NDArray
 from trackeval.metrics import CLEAR, HOTA, Identity
 
+Frames = list[dict[str, Any]]
+Rows = list[list[list[float]]]
+Array = NDArray[np.float64]
 
-def track(use: str, parameters: dict, rate: float, frames: list) -> list:
+
+def track(use: str, parameters: dict[str, Any], rate: float, frames: Frames) -> Rows:
     tracker = getattr(trackers, use)(frame_rate=rate, **parameters)
     result = []
     for frame in frames:
@@ -33,14 +39,14 @@ def track(use: str, parameters: dict, rate: float, frames: list) -> list:
     return result
 
 
-def iou(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def iou(a: Array, b: Array) -> Array:
     low, high = np.maximum(a[:, None, :2], b[None, :, :2]), np.minimum(a[:, None, 2:], b[None, :, 2:])
     shared = np.prod(np.maximum(high - low, 0), axis=2)
     areas = [np.prod(x[:, 2:] - x[:, :2], axis=1) for x in (a, b)]
-    return shared / np.maximum(areas[0][:, None] + areas[1][None, :] - shared, 1e-9)
+    return np.asarray(shared / np.maximum(areas[0][:, None] + areas[1][None, :] - shared, 1e-9))
 
 
-def judge(frames: list, results: list) -> dict[str, float]:
+def judge(frames: Frames, results: Rows) -> dict[str, float]:
     sides = []
     for rows in ([f["truth"] for f in frames], results):
         names = {i: k for k, i in enumerate(sorted({int(r[0]) for frame in rows for r in frame}))}
@@ -66,7 +72,7 @@ def judge(frames: list, results: list) -> dict[str, float]:
 def main() -> None:
     folder = Path(sys.argv[1])
     sequences, ours, peers = (json.loads((folder / f"{n}.json").read_text()) for n in ("sequences", "ours", "peers"))
-    figures: dict[str, dict] = {}
+    figures: dict[str, dict[str, Any]] = {}
     for name, sequence in sequences.items():
         frames = sequence["frames"]
         results = {label: made[name] for label, made in ours.items()}

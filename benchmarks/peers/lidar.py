@@ -53,7 +53,8 @@ def vgicp(data: Any, scans: list[Any]) -> tuple[list[Any], list[float]]:
 
     size = 0.3 if data["indoors"] else 1.0
     planes = small_gicp.GaussianVoxelMap(size)
-    poses, cpu, T, step = [], [], np.eye(4), np.eye(4)
+    poses, cpu = list[Any](), list[float]()
+    T, step = np.eye(4), np.eye(4)
     for points, _ in scans:
         begin = time.process_time()
         distance = np.linalg.norm(points, axis=1)

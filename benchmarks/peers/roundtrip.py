@@ -54,12 +54,13 @@ def dora(peers: Path) -> Callable[[int, int], list[float]]:
     return run
 
 
-def ours(tree: Path) -> Callable[[int, int], list[float]]:
-    """A live run of `roundtrip.yaml` with the code of a checkout, in a Python of its own."""
+def ours(tree: Path, record: Path | None = None) -> Callable[[int, int], list[float]]:
+    """A live run of `roundtrip.yaml` with the code of a checkout, in a Python of its own; recorded, if asked."""
 
     def run(size: int, count: int) -> list[float]:
         command = [sys.executable, "-P", "-m", "dataflow.cli.main", "run", str(HERE / "roundtrip.yaml"), "--live"]
         command += ["--quiet", "--json", "--set", f"nbytes={size}", "--set", f"count={count}"]
+        command += [] if record is None else ["--record", str(record), "--overwrite"]
         report = finished(command, PYTHONPATH=os.pathsep.join([str(tree), str(HERE)]))
         return parsed(json.loads(report)["summaries"]["pong"]["took"])
 

@@ -55,9 +55,11 @@ def main(size: int, count: int) -> list[float]:
     took = []
     with session(listen=endpoint) as opened:
         replies = queue.SimpleQueue[bytes]()
-        opened.declare_subscriber(
-            "pong", zenoh.handlers.Callback(lambda sample: replies.put(bytes(sample.payload)), indirect=False)
-        )
+
+        def take(sample: zenoh.Sample) -> None:
+            replies.put(bytes(sample.payload))
+
+        opened.declare_subscriber("pong", zenoh.handlers.Callback(take, indirect=False))
         ping = opened.declare_publisher("ping", congestion_control=zenoh.CongestionControl.BLOCK)
         time.sleep(2.0)
         source = np.zeros(size, np.uint8)

@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import psutil  # type: ignore[import-untyped]
+import psutil
 
 from dataflow.doctor.finding import Finding, State
 from dataflow.recording.facts import machine_facts

@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Sequence
 
-import psutil  # type: ignore[import-untyped]
+import psutil
 
 from dataflow.firing.protocol import Runner
 from dataflow.process.channel import Channel, ChannelClosed

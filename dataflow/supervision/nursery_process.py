@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-import psutil  # type: ignore[import-untyped]
+import psutil
 
 from dataflow.process.polling import readable
 

@@ -77,7 +77,7 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
 def _plan(scenario: Scenario, graph: Graph, path: Path) -> RunPlan:
     return RunPlan(
         graph,
-        placement=scenario.placement,  # type: ignore[arg-type]
+        placement=scenario.placement,
         record=path,
         live=scenario.live,
         faults=iter(scenario.faults) if scenario.faults and scenario.live else None,

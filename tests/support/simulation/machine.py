@@ -462,7 +462,7 @@ class System:
         self.world.wait()
 
 
-class Selector(selectors._BaseSelectorImpl):  # type: ignore[name-defined,misc]
+class Selector(selectors._BaseSelectorImpl):
     """`selectors.DefaultSelector`: finds what is ready, in any order."""
 
     def __init__(self, system: System) -> None:
@@ -477,7 +477,7 @@ class Selector(selectors._BaseSelectorImpl):  # type: ignore[name-defined,misc]
             task = world.task
             assert task is not None
             waiters = [
-                each for fd in self._fd_to_key if fd in self._system.things for each in self._system.things[fd].waiters
+                each for fd in self.get_map() if fd in self._system.things for each in self._system.things[fd].waiters
             ]
             for each in waiters:
                 each.add(task)
@@ -491,7 +491,8 @@ class Selector(selectors._BaseSelectorImpl):  # type: ignore[name-defined,misc]
 
     def _ready(self) -> list[tuple[selectors.SelectorKey, int]]:
         found, things = [], self._system.things
-        for fd, key in self._fd_to_key.items():
+        for key in self.get_map().values():
+            fd = key.fd
             thing = things.get(fd)
             if thing is None:
                 continue
@@ -586,7 +587,9 @@ class Signals:
 
     def pidfd_send_signal(self, descriptor: int, number: int) -> None:
         world, process = self._system.world, self._system.things[descriptor].process
-        does = {signal.SIGKILL: world.kill, signal.SIGSTOP: world.freeze, signal.SIGCONT: world.thaw}[number]
+        does = {int(signal.SIGKILL): world.kill, int(signal.SIGSTOP): world.freeze, int(signal.SIGCONT): world.thaw}[
+            number
+        ]
         world.after(world.latency(), lambda: None if process.dead else does(process))
 
 

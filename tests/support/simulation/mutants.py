@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
@@ -46,9 +47,11 @@ class CreditLost(Mutant):
     def replaced(self) -> Mapping[tuple[type, str], Callable[..., Any]]:
         right = Window.cover
 
+        heard: Counter[int] = Counter()
+
         def cover(self: Window, frontier: int) -> None:
-            self.heard = getattr(self, "heard", 0) + 1  # type: ignore[attr-defined]
-            if self.heard % 5:
+            heard[id(self)] += 1
+            if heard[id(self)] % 5:
                 right(self, frontier)
 
         return {(Window, "cover"): cover}

@@ -97,7 +97,7 @@ class Simulation:
         with contextlib.ExitStack() as stack:
             stack.callback(sys.setswitchinterval, interval)
             stack.enter_context(bindings.bound(self._bindings()))
-            stack.enter_context(contextlib.redirect_stderr(_Words(self)))  # type: ignore[type-var]
+            stack.enter_context(contextlib.redirect_stderr(_Words(self)))
             time = machine.Time(self.world)
             before = operators.Effort.sleep, operators.Effort.now
             operators.Effort.sleep, operators.Effort.now = time.sleep, time.time
@@ -142,7 +142,7 @@ class Simulation:
         time, threads = machine.Time(world), machine.Threading(world)
         process, supervision = "dataflow.process", "dataflow.supervision"
         endpoints = SimpleNamespace(close=lambda: None)
-        facts = {"threads": {}}
+        facts: dict[str, Any] = {"threads": {}}
         return {
             **dict.fromkeys(bindings.clocks(), time),
             (f"{process}.main", "threading"): threads,

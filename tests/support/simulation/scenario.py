@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 from dataflow.chaos.plan import Fault
 from dataflow.graph import Graph, load_text
+from dataflow.graph.model import Placement
 from simulation.run import Happening, Machine
 
 _USE = "use: simulation.operators"
@@ -80,7 +81,7 @@ class Scenario:
     work: float
     reading: float
     policy: str
-    placement: str
+    placement: Placement
     window: int
     snapshots: bool
     machine: Machine
