@@ -48,7 +48,8 @@ def planned(
     whole = units(graph, held, operators)
     alone = {name: work[name] for name in whole if divide and jobs > 1 and not _takes_its_own(graph, held, name)}
     divided = {name: (work[name], whole.pop(name)) for name in slices.divisible(graph, log, alone)}
-    parts = [set(part) for part in balanced(list(whole.values()), work, jobs)]
+    level = sum(work.values()) // jobs if divided else 0
+    parts = [set(part) for part in balanced(list(whole.values()), work, jobs, level)]
     if divided:
         parts += [set() for _ in range(jobs - len(parts))]
     cuts: list[dict[str, Slice]] = [{} for _ in parts]
@@ -107,19 +108,27 @@ def jobs_for(work: Mapping[str, int], cores: int) -> int:
     return min(cores, 1 + sum(work.values()) // START_NS)
 
 
-def balanced(units: Sequence[frozenset[str]], work: Mapping[str, int], jobs: int) -> list[frozenset[str]]:
+def balanced(
+    units: Sequence[frozenset[str]], work: Mapping[str, int], jobs: int, level: int = 0
+) -> list[frozenset[str]]:
     """At most `jobs` parts of whole units: the heaviest unit first, to the part that is then the least heavy.
 
-    What a part repeats anyway costs it nothing more; what another one repeats already costs it double.
+    What a part repeats anyway costs it nothing more; what another one repeats already costs it double. Up to a `level`
+    to which other work fills the parts, a unit goes where it adds least.
     """
     parts: list[set[str]] = [set() for _ in range(min(jobs, len(units)))]
 
     def load(part: Collection[str]) -> int:
         return sum(work[name] for name in part)
 
+    def cost(part: set[str], unit: frozenset[str], placed: frozenset[str]) -> tuple[bool, int, int, bool]:
+        then = load(part | unit)
+        above = then > level
+        return above, then + load(placed - part) if above else then - load(part), then, bool(part)
+
     for unit in sorted(units, key=lambda unit: (-load(unit), sorted(unit))):
         placed = unit & frozenset[str]().union(*parts)
-        min(parts, key=lambda part: (load(part | unit) + load(placed - part), bool(part))).update(unit)
+        min(parts, key=lambda part: cost(part, unit, placed)).update(unit)
     return [frozenset(part) for part in parts if part]
 
 

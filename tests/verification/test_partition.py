@@ -58,6 +58,14 @@ def test_what_is_cheap_to_repeat_is_repeated_by_several_and_what_is_dear_once() 
     assert balanced(decoding, {"decoder": 10, "odometry": 1, "detector": 2}, 2) == [decoding[0] | decoding[1]]
 
 
+def test_where_other_work_levels_the_parts_a_unit_goes_where_it_adds_least() -> None:
+    decoding = [frozenset({"decoder", "odometry"}), frozenset({"decoder", "cloud"}), frozenset({"score"})]
+    work = {"decoder": 2, "odometry": 10, "cloud": 4, "score": 1}
+
+    assert balanced(decoding, work, 2) == [decoding[0], decoding[1] | decoding[2]]
+    assert balanced(decoding, work, 2, level=20) == [decoding[0] | decoding[1], decoding[2]]
+
+
 def test_a_stream_is_checked_by_a_part_that_reads_it_anyway_else_by_its_maker_else_by_the_first() -> None:
     graph = load_graph(MIXED)
     checks = ["test/left/slow", "test/merge/seen", "test/mix/mixed", "test/smooth/mean"]
