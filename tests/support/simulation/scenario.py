@@ -95,9 +95,13 @@ class Scenario:
 
     @property
     def may_fail(self) -> bool:
-        """Whether anything happens that the run need not outlive."""
+        """Whether anything happens that the run need not outlive.
+
+        A run that is stopped while a process is to be started again ends at once; one that is frozen past its deadline is.
+        """
+        kinds = [h.kind for h in self.happenings]
         ends = any(h.kind.startswith("kill") or h.fields.get("span", 0) > PATIENCE for h in self.happenings)
-        ends = ends or sum(h.kind == "stop" for h in self.happenings) > 1
+        ends = ends or kinds.count("stop") > 1 or ("deadline" in self.policy and {"freeze", "stop"} <= set(kinds))
         return ends or self.machine.room is not None or any(f.kind in ("raise", "hang") for f in self.faults)
 
     def describe(self) -> str:
