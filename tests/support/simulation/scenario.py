@@ -97,7 +97,7 @@ class Scenario:
     def may_fail(self) -> bool:
         """Whether anything happens that the run need not outlive.
 
-        A run that is stopped while a process is to be started again ends at once; one that is frozen past its deadline is.
+        A run that is stopped while a process is to be started again ends at once, as after a freeze beyond a deadline.
         """
         kinds = [h.kind for h in self.happenings]
         ends = any(h.kind.startswith("kill") or h.fields.get("span", 0) > PATIENCE for h in self.happenings)
