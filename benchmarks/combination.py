@@ -226,11 +226,12 @@ def main() -> None:
     for case, (sensors, fault) in POSE_CASES.items():
         posed = [pose_errors(seed, sensors, fault) for seed in seeds]
         told = [one for run in posed for one in named(run[3], fault, "estimates")]
-        far, turned, nees_of = ([value for run in posed for value in run[i]] for i in range(3))
+        far = [value for run in posed for value in run[0]]
+        turned = [value for run in posed for value in run[1]]
+        nees = float(np.mean([value for run in posed for value in run[2]]))
         worst = max(rms(run[0]) for run in posed)
         print(
-            f"| {case} | {100 * rms(far):.1f} | {rms(turned):.2f} | {100 * worst:.1f} | {np.mean(nees_of):.2f} "
-            f"| {share(told)} |",
+            f"| {case} | {100 * rms(far):.1f} | {rms(turned):.2f} | {100 * worst:.1f} | {nees:.2f} | {share(told)} |",
             flush=True,
         )
 

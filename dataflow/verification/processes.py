@@ -89,17 +89,21 @@ def call_workers(
 
 
 def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
-    shown: dict[str, int] = {}
+    seen: dict[str, OperatorCounts] = {}
     for worker in workers:
         if worker.board.steps:
             status.phase = "running"
         for name in worker.call.operators:
             c = worker.board.counts(name)
-            if name in shown and c.firings <= shown[name]:
+            told = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
+            before = seen.get(name)
+            if before is not None and name in worker.call.request.get("slices", ()):
+                told = told.after(before)
+            elif before is not None and told.firings <= before.firings:
                 continue  # several repeat it: the one that is further is shown
-            shown[name] = c.firings
+            seen[name] = told
             status.process_of[name] = f"worker {worker.number}"
-            status.operators[name] = OperatorCounts(c.firings, c.emitted, 0, c.cpu_ns, c.done, c.wall_ns)
+            status.operators[name] = told
     return status
 
 

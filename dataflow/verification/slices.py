@@ -7,7 +7,8 @@ serve only to show that all is as recorded: an operator of which one shows anyth
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from functools import reduce
 from itertools import accumulate, pairwise
 from typing import Any
 
@@ -16,6 +17,7 @@ from dataflow.messages.digest import StreamDigest
 from dataflow.records.comparison import Verification
 from dataflow.records.firing import CALLS, WITHHELD, FiringRecord
 from dataflow.records.reading import FiringLog, whole
+from dataflow.supervision.report import OperatorCounts
 
 LEAST_NS = 300_000_000
 """Work that is worth a slice of its own."""
@@ -104,12 +106,6 @@ def digests(graph: Graph, name: str, records: Sequence[FiringRecord]) -> Mapping
     return {stream: [digest.count, digest.hexdigest()] for stream, digest in found.items()}
 
 
-def sum_of(counts: Sequence[Sequence[int]]) -> list[int]:
-    """Adds up what the workers did for one operator, as `OperatorCounts`: `done` is the last."""
-    firings, emitted, dropped, cpu_ns, done, wall_ns = zip(*counts, strict=True)
-    return [sum(firings), sum(emitted), sum(dropped), sum(cpu_ns), max(done), sum(wall_ns)]
-
-
 def answer(graph: Graph, log: FiringLog, answers: Sequence[Mapping[str, Any]]) -> tuple[dict[str, Any], set[str]]:
     """Puts together what `answers` say of divided operators, as one answer more; names those to verify as a whole."""
     told: dict[str, Any] = {"operators": {}, "work": {}, "digests": {}, "comparisons": {}, "stored": []}
@@ -123,6 +119,8 @@ def answer(graph: Graph, log: FiringLog, answers: Sequence[Mapping[str, Any]]) -
             left.add(name)
             continue
         told["operators"][name] = verification
-        told["work"][name] = sum_of([each["work"] for each in of])
+        told["work"][name] = astuple(
+            reduce(lambda base, one: one.after(base), (OperatorCounts(*e["work"]) for e in of))
+        )
         told["digests"] |= digests(graph, name, records)
     return told, left

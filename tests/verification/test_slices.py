@@ -14,6 +14,7 @@ from dataflow.graph import Graph
 from dataflow.recording import Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.reexecution.recorded_run import recorded_graph
+from dataflow.supervision.report import Status
 from dataflow.verification import slices
 from dataflow.verification.slices import LEAST_NS, cut, shares
 from dataflow.verification.verify import verify
@@ -99,9 +100,12 @@ def test_a_divided_operator_gets_the_verdict_and_the_digests_of_one_that_is_not(
 ) -> None:
     graph = with_look(kept, "Alone")
 
-    whole, parts = (verify(kept, graph=graph, jobs=jobs) for jobs in (1, 3))
+    seen: list[Status] = []
+
+    whole, parts = (verify(kept, graph=graph, jobs=jobs, watch=seen.append) for jobs in (1, 3))
 
     assert sum("look" in each for each in divided) > 1
+    assert seen[-1].operators["look"].firings == parts.work["look"].firings
     assert parts.identical
     assert told(parts) == told(whole)
     assert parts.digests == whole.digests
