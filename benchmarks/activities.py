@@ -8,6 +8,7 @@
 detector and segmenter, depth and true camera poses give a map; CACHE keeps what the networks gave (sensed_worlds.py).
 An agent counts while it is in view, and from sensors where it is mapped (IoU 0.25). An activity is right that is true
 within half a second; `unknown` is wrong. A goal counts one second before an agent begins to sit down or to reach.
+Beside the scores: what is true against what is said, and which part of the agents in view was lost where.
 *arrivals*: how many of those the camera could show: its agent in view at that time, and its goal at or before it.
 """
 
@@ -30,6 +31,7 @@ from dataflow.messages import Activity, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from operators.recognition import ActivityRecognizer
 from operators.recognition.episodes import Episode
+from operators.recognition.sensed_people import nearest_agents
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import match_nodes
 from operators.training.simulated_people import read_episodes, write_episodes
@@ -49,16 +51,23 @@ class Step:
     doing: dict[int, str]
     goals: dict[int, int]
     match: Callable[[SceneGraph], dict[int, int]]
+    near: Callable[[SceneGraph], set[int]]
+    """True agents of which a node of their class is within a metre."""
 
 
 @dataclass
 class Figures:
-    """Counts (true|said) by method, and for each arrival the first goal by method, and the lead in seconds."""
+    """Counts (true|said) by method, and for each arrival the first goal by method, and the lead in seconds.
+
+    `seen` are counts of all agents in view: true|said with `not mapped`; `lost` says what became of them.
+    """
 
     acts: dict[str, Counter[str]] = field(default_factory=dict)
     goals: dict[str, list[bool]] = field(default_factory=lambda: {"ours": [], "nearest": [], "heading": []})
     candidates: list[int] = field(default_factory=list)
     leads: list[float] = field(default_factory=list)
+    seen: Counter[str] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)
 
 
 def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
@@ -86,7 +95,9 @@ def true_steps(episode: Episode, stride: int = 2) -> Iterator[Step]:
         agents = episode.agents.tolist()
         doing = dict(zip(agents, episode.activities[row], strict=True))
         goals = dict(zip(agents, episode.goals[row].tolist(), strict=True))
-        yield Step(nodes, robot, set(agents), doing, goals, lambda _: {i: i for i in ids})
+        yield Step(
+            nodes, robot, set(agents), doing, goals, lambda _: {i: i for i in ids}, lambda g: set(g.ids.tolist())
+        )
 
 
 def sensor_steps(world: World) -> Iterator[Step]:
@@ -99,7 +110,14 @@ def steps_of(world: World, nodes: list[SceneGraph]) -> Iterator[Step]:
         said = zip(frame.activities.subjects.tolist(), frame.activities.goals, strict=True)
         goals = {i: int(g.rpartition(" ")[2]) if g.rpartition(" ")[2].isdigit() else -1 for i, g in said}
         truth = frame.scene
-        yield Step(given, frame.base, view, acts(frame.activities), goals, partial(match_nodes, truth=truth))
+        match = partial(match_nodes, truth=truth)
+        near = partial(agents_near, truth=truth)
+        yield Step(given, frame.base, view, acts(frame.activities), goals, match, near)
+
+
+def agents_near(graph: SceneGraph, truth: SceneGraph) -> set[int]:
+    """The agents that have a node of their class near them."""
+    return set(nearest_agents(graph, truth).values())
 
 
 def figures_of(steps: list[Step]) -> Figures:
@@ -107,7 +125,7 @@ def figures_of(steps: list[Step]) -> Figures:
     recognizer, ours, rules = ActivityRecognizer(), SceneGraphBuilder(), SceneGraphBuilder()
     for each in (recognizer, ours, rules):
         each.setup()
-    said: dict[str, list[dict[int, str]]] = {"ours": [], "rules": []}
+    said: dict[str, list[dict[int, str]]] = {"ours": [], "rules": [], "network": []}
     graphs, ofs = [], []
     for step in steps:
         recognized = recognizer.process(step.nodes, step.robot)
@@ -116,9 +134,10 @@ def figures_of(steps: list[Step]) -> Figures:
         graphs.append(built["graph"])
         ofs.append(of)
         alone: Activity = rules.process(step.nodes, step.robot)["activities"]
-        for name, message in (("ours", built["activities"]), ("rules", alone)):
+        for name, message in (("ours", built["activities"]), ("rules", alone), ("network", recognized)):
             said[name].append({of[i]: a for i, a in acts(message).items() if i in of})
     found = Figures({name: compared(steps, given) for name, given in said.items()})
+    losses(steps, said["ours"], said["network"], found)
     arrivals(steps, graphs, ofs, found)
     return found
 
@@ -132,6 +151,22 @@ def compared(steps: list[Step], said: list[dict[int, str]]) -> Counter[str]:
                 right = any(doing.get(agent) == given[agent] for doing in around)
                 counts[f"{true}|{true if right else given[agent]}"] += 1
     return counts
+
+
+def losses(steps: list[Step], ours: list[dict[int, str]], network: list[dict[int, str]], found: Figures) -> None:
+    """Counts what was said of every agent in view, and where those were lost of which it is wrong."""
+    for step, given, raw in zip(steps, ours, network, strict=True):
+        around = [s.doing for s in steps if abs(s.nodes.stamp - step.nodes.stamp) <= SECOND // 2]
+        near = step.near(step.nodes)
+        for agent in step.view & set(step.doing):
+            true, said = step.doing[agent], given.get(agent, "not mapped")
+            right = any(doing.get(agent) == said for doing in around)
+            found.seen[f"{true}|{true if right else said}"] += 1
+            if agent not in given:
+                found.lost["node of another place" if agent in near else "no node within 1 m"] += 1
+            else:
+                by = "rules, as the network does not know" if raw.get(agent) == "unknown" else "network"
+                found.lost[f"{'right' if right else 'wrong'} by {by}"] += 1
 
 
 def arriving(steps: list[Step]) -> Iterator[tuple[int, int, int, int]]:
@@ -189,13 +224,15 @@ def first(graph: SceneGraph, agent: int) -> int:
 
 
 def report(rows: dict[str, Figures]) -> None:
-    for name in ("ours", "rules"):
+    for name in ("ours", "rules", "network"):
         values = [macro_f1(found.acts[name]) for found in rows.values()]
         total: Counter[str] = sum((found.acts[name] for found in rows.values()), Counter())
         print(f"activities, {name}: mean {np.mean(values):.3f}, worst {min(values):.3f}, pooled {macro_f1(total):.3f}")
         if name == "ours":
             print(f"activities, majority class: mean {np.mean([majority(f.acts[name]) for f in rows.values()]):.3f}")
             print("   by class:", by_class(total), "\n   wrong:", {k: n for k, n in total.most_common() if differ(k)})
+    print("agents in view:", dict(sum((found.lost for found in rows.values()), Counter()).most_common()))
+    table(sum((found.seen for found in rows.values()), Counter()))
     for name in ("ours", "nearest", "heading"):
         right = [x for found in rows.values() for x in found.goals[name]]
         worlds = [float(np.mean(found.goals[name])) for found in rows.values() if found.goals[name]]
@@ -205,6 +242,15 @@ def report(rows: dict[str, Figures]) -> None:
     if leads:
         many = [x for found in rows.values() for x in found.candidates]
         print(f"goals: median lead {np.median(leads):.2f} s, candidates {min(many)} to {max(many)}")
+
+
+def table(counts: Counter[str]) -> None:
+    """Prints what is true, a row each, against what is said."""
+    pairs = {tuple(key.split("|")): n for key, n in counts.items()}
+    columns = sorted({said for _, said in pairs})
+    print(f"{'true, said:':>13}", *(f"{name:>12}" for name in columns))
+    for true in sorted({true for true, _ in pairs}):
+        print(f"{true:>13}", *(f"{pairs.get((true, said), 0):12d}" for said in columns))
 
 
 def differ(pair: str) -> bool:

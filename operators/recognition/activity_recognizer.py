@@ -14,6 +14,7 @@ from dataflow.messages import Activity, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.agent_features import AGENTS, AgentWindow, Surroundings
+from operators.recognition.possible import possible
 from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
 from operators.scene.bodies import Body
@@ -36,6 +37,8 @@ class ActivityRecognizer(Operator):
     A vector of an agent's motion in the last 2.5 s, its extent and the seats, tables and drinks around it goes at each
     graph into two LSTM layers, whose state is kept from graph to graph for as long as the agent is in the scene; the
     network answers for a quarter of a second ago. `unknown` stands for what is too unsure, or too long out of sight.
+
+    What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat.
 
     Persons stand, walk, sit down, sit, stand up, reach or drink; balls roll or rest; robots drive or rest. Method:
     Hochreiter and Schmidhuber, "Long short-term memory", 1997; trained on simulated people (`dataflow train activity`).
@@ -111,7 +114,10 @@ class ActivityRecognizer(Operator):
         objects = np.full(len(agents), -1, np.int64)
         if agents:
             states = np.stack([self._agents[b.id].state for b in agents])
-            probabilities[:, :-1], states = self._model.step(np.stack(vectors), states)
+            features = np.stack(vectors)
+            probabilities[:, :-1], states = self._model.step(features, states)
+            probabilities[:, :-1] *= possible(features, self._classes[:-1])
+            probabilities /= np.maximum(probabilities.sum(axis=1, keepdims=True), 1e-6)
         chosen = []
         for k, body in enumerate(agents):
             agent, best = self._agents[body.id], int(probabilities[k].argmax())

@@ -23,7 +23,7 @@ SEATS, TABLES, DRINKS = ("chair",), ("table",), ("mug", "bottle")
 MATTERING = frozenset((*AGENTS, *SEATS, *TABLES, *DRINKS))
 """Classes that features are made of; others change nothing."""
 _SHORT, _LONG = 0.6, 1.6
-_FAR = 3.0  # metres at which things are as good as not there
+FAR = 3.0  # metres at which things are as good as not there
 _REACH = 1.2  # metres up to which something is done to a thing
 
 NAMES = (
@@ -91,7 +91,7 @@ class Surroundings:
         }
         rows = self._now.get(group.get(activity, ""), [])
         near = ((_flat(b.center - body.center) - 2 * self._raised(b), b.id) for b in rows)
-        away, id = min(near, default=(_FAR, -1))
+        away, id = min(near, default=(FAR, -1))
         return id if away < _REACH else -1
 
     def _raised(self, drink: Body) -> float:
@@ -110,39 +110,39 @@ class Surroundings:
         self._now = {}
 
     def _seat(self, now: Look, before: Look) -> tuple[float, float, float, float]:
-        away, seat = min(((_flat(b.center - now.center), b.id, b) for b in self._now["seat"]), default=(_FAR, 0, None))[
+        away, seat = min(((_flat(b.center - now.center), b.id, b) for b in self._now["seat"]), default=(FAR, 0, None))[
             ::2
         ]
-        if seat is None or away >= _FAR:
+        if seat is None or away >= FAR:
             return 1.0, 0.0, 0.0, 0.0
         closing = _flat(seat.center - before.center) - away
         step = now.center - before.center
         along = float(step[:2] @ (seat.center - now.center)[:2]) / max(away, 0.1)
-        return away / _FAR, closing, now.top - seat.bottom - 1.0, along
+        return away / FAR, closing, now.top - seat.bottom - 1.0, along
 
     def _table(self, now: Look, before: Look) -> tuple[float, float, float]:
-        apart, table = min(((_outside(b, now.center), b.id, b) for b in self._now["table"]), default=(_FAR, 0, None))[
+        apart, table = min(((_outside(b, now.center), b.id, b) for b in self._now["table"]), default=(FAR, 0, None))[
             ::2
         ]
-        if table is None or apart >= _FAR:
+        if table is None or apart >= FAR:
             return 1.0, 0.0, 0.0
-        return apart / _FAR, _outside(table, before.center) - apart, table.top
+        return apart / FAR, _outside(table, before.center) - apart, table.top
 
     def _drinks(self, now: Look, before: Look) -> tuple[float, ...]:
         rows = sorted((_flat(b.center - now.center), b.id, b) for b in self._now["drink"])[:6]
         rows.sort(key=lambda row: row[0] - 2 * self._raised(row[2]))
-        if not rows or rows[0][0] >= _FAR:
+        if not rows or rows[0][0] >= FAR:
             return 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0
         away, id, drink = rows[0]
         closing = _flat(drink.center - before.center) - away
         first = self._pasts[id][0]
         seconds = max(self._pasts[id][-1][0] - first[0], 0.1)
         speed = float(np.linalg.norm(drink.center - first[1])) / seconds
-        second = rows[1][0] if len(rows) > 1 else _FAR
+        second = rows[1][0] if len(rows) > 1 else FAR
         lifted = float(drink.center[2]) - self._lowest[id]
         reached = sum(row[0] < 0.9 for row in rows) / 4
-        second = min(second, _FAR) / _FAR
-        return away / _FAR, closing, now.top - float(drink.center[2]), lifted, speed, second, reached
+        second = min(second, FAR) / FAR
+        return away / FAR, closing, now.top - float(drink.center[2]), lifted, speed, second, reached
 
 
 class AgentWindow:

@@ -80,6 +80,22 @@ def test_who_lowers_onto_a_chair_sits_down_and_then_sits_on_it() -> None:
     assert 3.0 <= messages[-1].since[0] * 1e-9 <= 6.0
 
 
+@pytest.mark.parametrize(("away", "allowed"), [(0.3, True), (3.0, False)])
+def test_nobody_sits_down_or_stands_up_without_a_seat_in_reach(away: float, allowed: bool) -> None:
+    chair: Box = 5, "chair", (away, 0.0, 0.0), (0.5, 0.5, 0.9)
+
+    def at(t: float) -> list[Box]:
+        share = float(np.clip((t - 3) / 1.7, 0, 1)) - float(np.clip((t - 7) / 1.7, 0, 1))
+        return [person(0.2 * share, 0.0, 1.7 - 0.4 * share, 0.4 + 0.4 * share), chair]
+
+    messages = play(ActivityRecognizer(), {"nodes": course(11, at)})["activities"]
+    found = {said(m) for m in messages}
+    assert ("sitting_down" in found) == ("standing_up" in found) == allowed
+    for message in messages:
+        assert message.probabilities is not None
+        assert message.probabilities.sum() == pytest.approx(1, abs=1e-4)
+
+
 def test_balls_roll_and_rest_robots_drive_and_rest() -> None:
     def at(t: float) -> list[Box]:
         return [
