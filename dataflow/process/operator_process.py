@@ -91,7 +91,7 @@ class OperatorProcess:
         self.outlet = Outlet(
             channel,
             self.runners.taking,
-            fanout=Fanout(outgoing, pool_bytes=pool_bytes),
+            fanout=Fanout(outgoing, pool_bytes=pool_bytes, gives_way=config.live),
             namespace=self.graph.namespace,
             static=self.static,
             live=config.live,

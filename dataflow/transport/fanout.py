@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import threading
 import time
 from collections.abc import Mapping, Sequence
 
@@ -16,15 +18,25 @@ from dataflow.transport.shared import THRESHOLD
 
 POOL_BYTES = 256 << 20
 MAPPED_WITHIN = 1.0
+SELDOM = 0.001
+"""Seconds between messages for which consumers sleep that are worth a change of process each."""
+_MAIN = threading.main_thread().ident
 
 
 class Fanout:
     """The outgoing links of a process with the keys of their channels, and the pool that large messages lie in.
 
-    `pool_bytes`: its size; 0: messages travel whole.
+    `pool_bytes`: its size; 0: messages travel whole. `gives_way`: a consumer that was woken begins before this process
+    goes on, unless messages come so fast that it is better for both to do several at a time.
     """
 
-    def __init__(self, outgoing: Sequence[tuple[Sequence[str], Outgoing]], *, pool_bytes: int = POOL_BYTES) -> None:
+    def __init__(
+        self,
+        outgoing: Sequence[tuple[Sequence[str], Outgoing]],
+        *,
+        pool_bytes: int = POOL_BYTES,
+        gives_way: bool = False,
+    ) -> None:
         self._links = [link for _, link in outgoing]
         self._keys = [keys for keys, _ in outgoing]
         takers: dict[str, list[tuple[Outgoing, int]]] = {}
@@ -36,6 +48,7 @@ class Fanout:
         self._sent = [0, 0]
         self._shared = [0, 0]
         self._full = 0
+        self._gives_way, self._woke_at = gives_way, 0.0
         self._pool_bytes = pool_bytes
         self._pool: SharedPool | None = None
 
@@ -56,9 +69,25 @@ class Fanout:
         else:
             for link, channel in takers:
                 link.send(channel, parts, size, droppable=droppable)
+        if self._gives_way:
+            self._give_way(takers)
         self._sent[0] += 1
         self._sent[1] += size
         return len(takers)
+
+    def _give_way(self, takers: Sequence[tuple[Outgoing, int]]) -> None:
+        """Lets consumers begin that were woken: they may have been put on this core. Only the main thread does: that
+        which reads a source has the turn of its process, for which answers would wait."""
+        woke = False
+        for link, _ in takers:
+            if link.ring.woke:
+                link.ring.woke, woke = False, True
+        if not woke:
+            return
+        now = time.monotonic()
+        seldom, self._woke_at = now - self._woke_at >= SELDOM, now
+        if seldom and threading.get_ident() == _MAIN:
+            os.sched_yield()
 
     def _lend(
         self,

@@ -68,7 +68,7 @@ class Outgoing:
     """The producer's end of a link. `most`: (messages, bytes) that may wait; None: as many as there are."""
 
     def __init__(self, ring: int, wake: int, board: int, most: tuple[int, int] | None) -> None:
-        self._ring = RingWriter(ring, wake)
+        self._ring = self.ring = RingWriter(ring, wake)
         self._words = self._ring.words
         self._cells = memoryview(mmap.mmap(board, BOARD_BYTES)).cast("Q")
         self._most = most

@@ -36,7 +36,6 @@ never wraps."""
 _SKIP = 0xFFFFFFFF
 _AGAIN = 1 << 16
 _REORDERS = platform.machine() not in ("x86_64", "AMD64")
-_MAIN = threading.main_thread().ident
 
 Bytes = bytes | bytearray | memoryview
 
@@ -80,6 +79,8 @@ class RingWriter(_End):
     def __init__(self, descriptor: int, wake: int) -> None:
         super().__init__(descriptor)
         self._wake = wake
+        self.woke = False
+        """A reader that slept was woken; whoever takes note of that sets it back."""
         self._head = self._words[_HEAD]
         self.largest = self.capacity // 4 - _FRAME.size
         """Bytes of the largest frame that can pass, once there is room."""
@@ -131,8 +132,7 @@ class RingWriter(_End):
         if words[_ASLEEP]:
             words[_ASLEEP] = 0
             os.eventfd_write(self._wake, 1)
-            if threading.get_ident() == _MAIN:  # the reader of a source has the turn, which its process may need
-                os.sched_yield()  # for a consumer that was put on this core
+            self.woke = True
         return True
 
     def _has_room(self, needed: int) -> bool:
