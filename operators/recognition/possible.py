@@ -1,4 +1,4 @@
-"""Which activities an agent's motion and surroundings leave possible, whatever a network makes of them."""
+"""Leaves out activities that an agent's motion and surroundings exclude, whatever a network makes of them."""
 
 from __future__ import annotations
 
