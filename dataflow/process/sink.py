@@ -22,6 +22,7 @@ from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
+from dataflow.process.priority import let_others_begin
 from dataflow.recording import LogLine
 from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
@@ -126,6 +127,8 @@ class SinkProcess:
     def open(self) -> None:
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
+        if self.config.live:
+            let_others_begin()
         self.channel.send("ready", first=None, steps=None)
 
     def run(self) -> None:

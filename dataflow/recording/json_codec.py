@@ -32,7 +32,9 @@ NONE = "_none"
 MAX_LISTED = 64
 MAX_SAFE_INTEGER = 2**53
 
-_encode = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
+LONG_BYTES = 4096
+"""Arrays of this size go into the text as base64 when the rest of it is made: the encoder looks at every character."""
+
 _CANONICAL_NAN = struct.pack("<d", math.nan)
 _FLOAT_WORDS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf}
 _FLOAT_PATTERN = "^(NaN|-?Infinity|0x[0-9a-f]{16})$"
@@ -84,8 +86,36 @@ def decode_fields(value: Any, fields: Iterable[Field]) -> dict[str, Any]:
     return found
 
 
+class _Long:
+    """A long array in a JSON object to be encoded."""
+
+    def __init__(self, data: memoryview) -> None:
+        self.data = data
+
+
+_PLACE = "\0"
+_PLACED = b'"base64":"\\u0000"'
+"""The text in the place of a long array. Before the last ones, a field that somebody has named base64 may read so too."""
+
+
 def encode_object(value: Mapping[str, Any]) -> bytes:
-    return _encode(value).encode()
+    """The text of a JSON object, such as `encode_fields` makes."""
+    long: list[memoryview] = []
+
+    def place(thing: Any) -> str:
+        if not isinstance(thing, _Long):
+            raise TypeError(f"a {type(thing).__name__} is no JSON value")
+        long.append(thing.data)
+        return _PLACE
+
+    text = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":"), default=place).encode(value)
+    if not long:
+        return text.encode()
+    before, *others = text.encode().rsplit(_PLACED, len(long))
+    parts = [before]
+    for data, after in zip(long, others, strict=True):
+        parts += (b'"base64":"', binascii.b2a_base64(data, newline=False), b'"', after)
+    return b"".join(parts)
 
 
 def decode_object(data: Any) -> Any:
@@ -180,12 +210,18 @@ def _encode_array(spec: ArrayField, data: npt.NDArray[Any], plain: dict[str, Any
         exact[spec.name] = {
             "dtype": _dtype_name(data.dtype),
             "shape": list(data.shape),
-            "base64": base64.b64encode(data.data).decode() if data.size else "",
+            "base64": _base64(data),
         }
         return
     plain[spec.name] = data.ravel().tolist()
     if data.ndim != 1 or data.dtype != spec.dtypes[0]:
         exact[spec.name] = {"dtype": _dtype_name(data.dtype), "shape": list(data.shape)}
+
+
+def _base64(data: npt.NDArray[Any]) -> str | _Long:
+    if not data.size:
+        return ""
+    return base64.b64encode(data.data).decode() if data.nbytes < LONG_BYTES else _Long(data.data)
 
 
 def _listable(data: npt.NDArray[Any]) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import math
 import struct
@@ -36,7 +37,7 @@ from dataflow.messages import (
 from dataflow.messages import Path as PathMessage
 from dataflow.recording import Recording, RecordingWriter
 from dataflow.recording.codecs import codec_for
-from dataflow.recording.json_codec import MAX_SAFE_INTEGER
+from dataflow.recording.json_codec import LONG_BYTES, MAX_SAFE_INTEGER
 from dataflow.recording.layout import DIGESTS
 
 TYPES = {name: cls for name, cls in message_types().items() if cls.__module__.startswith("dataflow.messages.")}
@@ -52,6 +53,16 @@ class Awkward(Message, schema="test.Awkward"):
     words: tuple[str, ...] = scalar("strs", "any strings", default=())
     small: Any = array("float32|float64", "N|N 2|N 0", "two dtypes, three shapes", optional=True)
     whole: Any = array("int64|uint64", "K", "integers beyond 2^53", optional=True)
+
+
+class Long(Message, schema="test.Long"):
+    """Long arrays beside texts that look like their places."""
+
+    base64: str = scalar("str", "any text")
+    before: Any = array("uint8", "N", "bytes", optional=True)
+    words: tuple[str, ...] = scalar("strs", "any strings", default=())
+    after: Any = array("float64", "N", "numbers", optional=True)
+    number: int = scalar("int", "any 64-bit integer", default=0)
 
 
 def valid(cls: type[Message], seed: int) -> Message:
@@ -137,6 +148,18 @@ def test_json_keeps_the_shape_of(shape: tuple[int, ...]) -> None:
     back = through_codec(message)
     assert back.small.shape == shape
     assert back.digest() == message.digest()
+
+
+@pytest.mark.parametrize("elements", [LONG_BYTES // 8 - 1, LONG_BYTES // 8, LONG_BYTES], ids="{} elements".format)
+@pytest.mark.parametrize("text", ["\0", '"base64":"\0"', '\\u0000","base64":"', "plain"])
+def test_json_of_long_arrays_is_what_the_encoder_would_write(elements: int, text: str) -> None:
+    numbers, octets = np.linspace(0, 1, elements), np.arange(elements, dtype=np.uint8)
+    message = Long(stamp=3, base64=text, before=octets, words=[text] * 2, after=numbers, number=2**60)
+    [data], _ = codec_for(Long).encode(message)
+    told = json.loads(bytes(data))
+    assert json.dumps(told, ensure_ascii=False, separators=(",", ":")).encode() == bytes(data)
+    assert base64.b64decode(told["_exact"]["after"]["base64"]) == numbers.tobytes()
+    assert through_codec(message).digest() == message.digest()
 
 
 def test_json_integers_beyond_two_to_the_53_are_strings() -> None:
