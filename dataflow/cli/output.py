@@ -17,6 +17,7 @@ import typer
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
+from rich.text import Text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -33,6 +34,10 @@ TRACEBACK = "DATAFLOW_TRACEBACK"
 
 PIPE_WIDTH = 120
 """Columns of tables that go into a file or a pipe, unless COLUMNS says otherwise."""
+
+LONGEST = 10_000
+"""Characters of one wrapped text, such as a cell of a table; of a longer one the rest is counted. A name in somebody's
+recording may have millions, and breaking those into lines takes minutes."""
 
 
 _INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -52,6 +57,8 @@ class _VisibleConsole(Console):
     """Passes everything that is printed through `visible`; styles and cursor movements of its own stay."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        if isinstance(renderable, Text) and len(renderable) > LONGEST and not (options or self.options).no_wrap:
+            renderable = renderable[:LONGEST] + f"… ({len(renderable) - LONGEST:,} more characters)"
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=visible(segment.text))
 

@@ -95,7 +95,7 @@ class _Long:
 
 _PLACE = "\0"
 _PLACED = b'"base64":"\\u0000"'
-"""The text in the place of a long array. Before the last ones, a field that somebody has named base64 may read so too."""
+"""The text in the place of a long array. Before the last ones, a field that is named base64 may read so too."""
 
 
 def encode_object(value: Mapping[str, Any]) -> bytes:

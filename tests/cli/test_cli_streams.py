@@ -152,3 +152,20 @@ def test_names_in_a_recording_are_shown_without_their_escapes(dataflow, tmp_path
             assert "\x9b" not in text
     assert "/[red]x" in json.loads(dataflow("info", path, "--json").stdout)["streams"][0]["name"]
     assert "\\x1b" in dataflow("info", path).stdout
+
+
+def test_a_name_of_a_million_characters_is_cut_and_the_rest_counted(dataflow, tmp_path: Path) -> None:
+    from mcap.writer import Writer
+
+    path = tmp_path / "long.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/" + "x" * 1_000_000, "json", 0)
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    for words in (["info", path], ["diff", path, path]):
+        told = dataflow(*words)
+        assert told.exit_code == 0
+        assert "more characters)" in " ".join(told.stdout.split())
+        assert len(told.stdout) < 100_000

@@ -6,7 +6,7 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
 
@@ -18,7 +18,7 @@ from process_operators import value
 from dataflow.firing.failure import OperatorFailure
 from dataflow.graph import load_text
 from dataflow.names import firings_key
-from dataflow.process import operator_process
+from dataflow.process import live_sources, operator_process
 from dataflow.process.config import ProcessConfig
 from dataflow.process.operator_process import OperatorProcess
 from dataflow.records.black_box import make_black_box, read_black_box
@@ -31,19 +31,28 @@ GRAPH = """\
 graph: one
 namespace: test
 operators:
-  camera: {use: "process_operators:Count"}
+  camera: {use: "process_operators:SOURCE"}
   last: {use: "process_operators:OPERATOR", inputs: {x: camera/count}}
 """
 
 
 class OneProcess:
-    """The process of the operator `last`, without a network: what arrives is put into its inbox."""
+    """The process of one operator, without a network: what arrives is put into its inbox."""
 
-    def __init__(self, operator: str = "Twice", *, live: bool = False, box: int | None = None) -> None:
-        graph = load_text(GRAPH.replace("OPERATOR", operator))
+    def __init__(
+        self,
+        operator: str = "Twice",
+        *,
+        runs: str = "last",
+        source: str = "Count",
+        live: bool = False,
+        box: int | None = None,
+    ) -> None:
+        graph = load_text(GRAPH.replace("OPERATOR", operator).replace("SOURCE", source))
         self.inbox: queue.SimpleQueue[tuple[Any, ...]] = queue.SimpleQueue()
         self.channel = RecordedChannel()
-        config = ProcessConfig("last", graph.to_json(), ["last"], {}, [STREAM], [], live=live, firings=True)
+        takes = [STREAM] if runs == "last" else []
+        config = ProcessConfig(runs, graph.to_json(), [runs], {}, takes, [], live=live, firings=True)
         self.process = OperatorProcess(config, self.channel, self.inbox, box=box)  # type: ignore[arg-type]
         self.process.make()
         for runner in self.process.runners.all:
@@ -184,3 +193,38 @@ def test_records_that_were_lost_on_their_way_are_sent_again(monkeypatch: pytest.
     assert [r for data in sent for r in decode_batch(data).records] == first
     assert read_black_box(memory, {"last": ("y",)}).reached["last"].last
     os.close(memory)
+
+
+@pytest.fixture
+def blocked() -> Iterator[OneProcess]:
+    """The process of a live source that waits for its device."""
+    blocks = process_operators.Blocks
+    blocks.ends.clear()
+    blocks.waiting.clear()
+    blocks.let_go.clear()
+    one = OneProcess(source="Blocks", runs="camera", live=True)
+    one.process.live.in_its_place = lambda act, step: False
+    for part in ("taps", "outside", "bus"):
+        setattr(one.process, part, SimpleNamespace(close=lambda: None))
+    one.process.live.start()
+    assert blocks.waiting.wait(10)
+    yield one
+    blocks.let_go.set()
+
+
+def test_a_source_is_not_closed_while_its_stream_is_read(blocked: OneProcess) -> None:
+    process_operators.Blocks.let_go.set()
+
+    blocked.process.close()
+
+    assert [what for what, _ in process_operators.Blocks.ends] == ["stream", "close"]
+
+
+def test_a_source_whose_stream_does_not_return_is_not_closed_at_all(
+    blocked: OneProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_sources, "RETURN_WITHIN", 0.05)
+
+    blocked.process.close()
+
+    assert process_operators.Blocks.ends == []
