@@ -30,6 +30,9 @@ Mask = npt.NDArray[np.bool_]
 RUN_KINDS = (Kind.FIRINGS, Kind.EVENTS, Kind.LOGS)
 """Channels that lie in chunks of their own."""
 
+TIMES = 2**64
+"""Times in a file are unsigned; those that are read from 2^63 on stand before the epoch."""
+
 
 class Origin:
     """An MCAP file as material: a context manager.
@@ -177,11 +180,11 @@ class Copy:
 
     def message(self, channel: int, raw: RawMessage) -> None:
         """Adds a message of a stream."""
-        self.writer.add_copied(channel, raw.log_time, raw.publish_time, raw.sequence, raw.data)
+        self.writer.add_copied(channel, raw.log_time % TIMES, raw.publish_time, raw.sequence, raw.data)
 
     def record(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
         """Adds a record of the run: firing records, an event, a line of the log."""
-        self.writer.add_record(channel, log_time, sequence, data)
+        self.writer.add_record(channel, log_time % TIMES, sequence, data)
 
     def frames(self, namespace: str, messages: Iterator[Recorded]) -> None:
         """Derives the frame tree for other viewers from the kept messages, as a recorder does."""

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 from made_parts import messages
 from mcap.opcode import Opcode
+from mcap.reader import make_reader
+from mcap.writer import Writer
 
 from dataflow.editing.recover import recover
 from dataflow.messages import Text
@@ -85,6 +87,24 @@ def test_a_sound_file_is_saved_whole(tmp_path: Path) -> None:
 
     assert done.whole
     assert messages(tmp_path / "saved.mcap") == messages(path)
+
+
+def test_a_time_before_the_epoch_is_saved_as_it_is(tmp_path: Path) -> None:
+    path, out = tmp_path / "early.mcap", tmp_path / "out.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/x", "json", 0)
+        for time in (5, 2**64 - 1, 2**63):
+            writer.add_message(channel, time, b"{}", time)
+        writer.finish()
+
+    recover(path, out)
+
+    with out.open("rb") as file:
+        assert [m.log_time for _, _, m in make_reader(file).iter_messages(log_time_order=False)] == [5, 2**64 - 1, 2**63]
+    with Recording(out) as recording:
+        assert [raw.log_time for raw in recording.raw()] == [-(2**63), -1, 5]
 
 
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
