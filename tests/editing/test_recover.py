@@ -102,7 +102,8 @@ def test_a_time_before_the_epoch_is_saved_as_it_is(tmp_path: Path) -> None:
     recover(path, out)
 
     with out.open("rb") as file:
-        assert [m.log_time for _, _, m in make_reader(file).iter_messages(log_time_order=False)] == [5, 2**64 - 1, 2**63]
+        found = make_reader(file).iter_messages(log_time_order=False)
+        assert [message.log_time for _, _, message in found] == [5, 2**64 - 1, 2**63]
     with Recording(out) as recording:
         assert [raw.log_time for raw in recording.raw()] == [-(2**63), -1, 5]
 
