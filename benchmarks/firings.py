@@ -127,19 +127,21 @@ def spent_apart(case: Case, count: int) -> float:
 
 def apart(rounds: int, firings: int) -> str:
     """The CPU time of a firing in chains and fans of processes, as Markdown."""
+    cases = [
+        Case(f"{kind} of {operators}", operators, fan=fan)
+        for kind, fan in (("chain", False), ("fan", True))
+        for operators in (2, 4, 8, 16)
+    ]
+    costs: dict[Case, list[float]] = {case: [] for case in cases}
+    for _ in range(rounds):
+        for case in cases:
+            short, long = firings // (4 * case.operators), firings // case.operators
+            spent = spent_apart(case, long) - spent_apart(case, short)
+            costs[case].append(spent / ((long - short) * case.operators))
     lines = ["| graph | CPU, µs a firing | x that of 2 operators |", "| --- | --- | --- |"]
-    for kind, fan in (("chain", False), ("fan", True)):
-        base = 0.0
-        for operators in (2, 4, 8, 16):
-            case = Case(f"{kind} of {operators}", operators, fan=fan)
-            short, long = firings // (4 * operators), firings // operators
-            costs = [
-                (spent_apart(case, long) - spent_apart(case, short)) / ((long - short) * operators)
-                for _ in range(rounds)
-            ]
-            cost = statistics.median(costs)
-            base = base or cost
-            lines.append(f"| {case.name}, a process each | {cost * 1e6:.0f} | {cost / base:.2f} |")
+    for case in cases:
+        cost, base = (statistics.median(costs[each]) for each in (case, cases[4 if case.fan else 0]))
+        lines.append(f"| {case.name}, a process each | {cost * 1e6:.0f} | {cost / base:.2f} |")
     return "\n".join(lines)
 
 
