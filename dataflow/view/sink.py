@@ -274,9 +274,9 @@ class ViewerSink:
 
     def _look_again(self, recording: rr.RecordingStream) -> None:
         """Chooses the viewpoint once more, from which all that there is in a file is in view."""
-        if not self._scene.viewpoint.keeps:
+        if not self._scene.viewpoint.knows_more:
             return
-        self._outlook = self._scene.viewpoint.outlook(self._scene.tree)
+        self._outlook = self._scene.viewpoint.outlook(self._scene.tree, whole=True)
         self._lay_out(recording)
 
     def _saved_layout(self, recording: rr.RecordingStream, graph: Graph | None) -> None:

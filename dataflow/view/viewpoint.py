@@ -12,6 +12,8 @@ from dataflow.view.frames import FrameTree
 Vector = npt.NDArray[np.float64]
 _ONE_SIDED = 0.5
 """Length of the mean direction of points that lie more to one side of their sensor than all round it."""
+MOST_PLACES = 2048
+"""Sets of places that are kept; of more, every second one, and so on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +36,9 @@ class Viewpoint:
     _ranges: list[float] = field(default_factory=list)
     _around: list[Vector] = field(default_factory=list)
     _kept: list[Vector] = field(default_factory=list)
+    _places: list[Vector] = field(default_factory=list)
+    _passed: int = 0  # sets of places since the last one that was kept
+    _stride: int = 1
     _ahead: Vector | None = None  # the direction in which one looks, decided once
 
     def saw_range(self, distances: npt.ArrayLike) -> None:
@@ -55,22 +60,38 @@ class Viewpoint:
         if T is not None and np.linalg.norm((p / distances[:, None]).mean(axis=0)) < _ONE_SIDED:
             self._around.append(p @ T[:3, :3].T + T[:3, 3])
 
+    def saw_places(self, T: Vector | None, points: npt.ArrayLike) -> None:
+        """Points (N, 3) where something was, in a frame of pose `T` in the root frame."""
+        self._passed += 1
+        if T is None or self._passed < self._stride:
+            return
+        self._passed = 0
+        p = np.asarray(points, np.float64).reshape(-1, 3)
+        self._places.append(p[np.isfinite(p).all(axis=1)] @ T[:3, :3].T + T[:3, 3])
+        if len(self._places) >= MOST_PLACES:
+            self._places, self._stride = self._places[::2], 2 * self._stride
+
     @property
-    def keeps(self) -> bool:
-        """Tells whether there are points that stay."""
-        return bool(self._kept)
+    def knows_more(self) -> bool:
+        """Tells whether the end of a run shows more than its beginning: points that stay, or places alone."""
+        return bool(self._kept) or self._places_alone()
+
+    def _places_alone(self) -> bool:
+        """Tells whether nothing but places says how large the scene is: no sensor has measured a distance."""
+        return len(self._places) > 1 and not (self._ranges or self._around)
 
     def kept_points(self, points: npt.ArrayLike) -> None:
         """Points (N, 3) in the root frame that stay: the viewpoint is so far off that they are in view."""
         p = np.asarray(points, np.float64).reshape(-1, 3)
         self._kept.append(p[:: max(len(p) // 64, 1)])
 
-    def outlook(self, tree: FrameTree) -> Outlook:
-        """Chooses the viewpoint from which everything seen is in view.
+    def outlook(self, tree: FrameTree, *, whole: bool = False) -> Outlook:
+        """Chooses the viewpoint from which everything seen is in view. `whole`: the run is over.
 
         From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
-        place is in view, since the robot will drive about in it. Up is +z (REP 103), unless the root is itself like an
-        optical frame (y down), as in data sets whose world is their first camera.
+        place is in view, since the robot will drive about in it. Where no sensor measures distances, the whole run is
+        in view once it is over. Up is +z (REP 103), unless the root is itself like an optical frame (y down), as in
+        data sets whose world is their first camera.
         """
         up = np.array([0.0, 0.0, 1.0])
         cameras = [T for frame in self.optical if (T := tree.pose(frame)) is not None]
@@ -92,8 +113,10 @@ class Viewpoint:
         level = self._ahead
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
-        if self._around or self._kept:
-            lower, upper = np.percentile(np.concatenate(self._around + self._kept), [3, 97], axis=0)
+        alone = whole and self._places_alone()
+        if self._around or self._kept or alone:
+            all_of_it = np.concatenate(self._around + self._kept + (self._places if alone else []))
+            lower, upper = np.percentile(all_of_it, [3, 97], axis=0)
             middle = (lower + upper) / 2
             size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
             away = -0.97 * level + 1.05 * up + 0.4 * side

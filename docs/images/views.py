@@ -65,6 +65,7 @@ LATER = {
     "landmarks": 29,
     "localize": 17,
     "mapping": 19,
+    "mono": 11,
     "orientation": 11,
     "places": 15,
     "preprocessing": 5,

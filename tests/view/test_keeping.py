@@ -88,4 +88,4 @@ def test_a_kept_cloud_is_drawn_in_the_root_frame_at_the_stamp_of_its_own_pose(tm
     (drawn_points,) = at(rows(path), "/r/cloud/space/kept", "Points3D:positions")
     assert np.allclose(drawn_points.values, [[5.0, 0.0, 1.0]])
     assert drawn_points.stamp == 10, "the second cloud that saw it"
-    assert state.viewpoint.keeps
+    assert state.viewpoint.knows_more

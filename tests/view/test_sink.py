@@ -253,6 +253,36 @@ def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
     assert nearer[2] < looked.position[2]
 
 
+def test_the_whole_way_of_a_run_without_ranges_is_in_view_when_it_is_over() -> None:
+    scene, away = SceneState(), np.eye(4)
+    away[:3, 3] = [10, 0, 0]
+    for x in np.linspace(0, 40, 5000):
+        scene.viewpoint.saw_places(away, [x, 4 * np.sin(x), 0])
+    scene.viewpoint.posed.setdefault("base")
+    scene.tree.place("world", "base", np.eye(4), owner="r/base", rank=Rank.TREE, stamp=0)
+    assert scene.viewpoint.knows_more
+
+    begun = scene.viewpoint.outlook(scene.tree)
+    over = scene.viewpoint.outlook(scene.tree, whole=True)
+
+    assert begun.target is not None
+    assert over.target is not None
+    assert over.position is not None
+    assert np.linalg.norm(begun.target) < 5
+    assert np.allclose(over.target, [30, 0, 0], atol=1)
+    assert np.linalg.norm(over.position - over.target) > 20
+
+
+def test_places_do_not_move_the_view_of_who_measures_distances() -> None:
+    scene = SceneState()
+    for x in range(100):
+        scene.viewpoint.saw_places(np.eye(4), [x, 0, 0])
+    scene.viewpoint.saw_range(np.full(10, 2.0))
+    assert not scene.viewpoint.knows_more
+    before, over = (scene.viewpoint.outlook(scene.tree, whole=whole).position for whole in (False, True))
+    assert np.array_equal(before, over)
+
+
 def test_hidden_and_unknown_streams_are_passed_over(tmp_path: Path) -> None:
     with ViewerSink(Save(tmp_path / "a.rrd")) as sink:
         with pytest.raises(ViewerError, match="not open"):

@@ -160,6 +160,7 @@ def landmark_sightings(canvas: Canvas, message: LandmarkSightings) -> None:
         )
         return
     shown = finite_rows(points)
+    canvas.scene.viewpoint.saw_places(canvas.scene.tree.pose(message.frame), points[shown])
     canvas.draw(
         "space",
         message.frame,

@@ -157,6 +157,7 @@ def _trail(canvas: Canvas, frame: str, position: npt.NDArray[np.float64]) -> Non
     step = float(np.linalg.norm(position - last.position))
     if step < canvas.scene.options.trail:
         return
+    canvas.scene.viewpoint.saw_places(canvas.scene.tree.pose(frame), position)
     if step <= _GAP:
         color = canvas.scene.trail_color(canvas.stream, canvas.scene.layout.of_type(Pose, Odometry))
         canvas.draw(
