@@ -12,6 +12,8 @@ from dataflow.view.frames import FrameTree
 Vector = npt.NDArray[np.float64]
 _ONE_SIDED = 0.5
 """Length of the mean direction of points that lie more to one side of their sensor than all round it."""
+FARTHEST = 50.0
+"""Metres: half of what is in view, at most."""
 MOST_PLACES = 2048
 """Sets of places that are kept; of more, every second one, and so on."""
 
@@ -73,12 +75,8 @@ class Viewpoint:
 
     @property
     def knows_more(self) -> bool:
-        """Tells whether the end of a run shows more than its beginning: points that stay, or places alone."""
-        return bool(self._kept) or self._places_alone()
-
-    def _places_alone(self) -> bool:
-        """Tells whether nothing but places says how large the scene is: no sensor has measured a distance."""
-        return len(self._places) > 1 and not (self._ranges or self._around)
+        """Tells whether the end of a run shows more than its beginning: points that stay, or a way."""
+        return bool(self._kept) or len(self._places) > 1
 
     def kept_points(self, points: npt.ArrayLike) -> None:
         """Points (N, 3) in the root frame that stay: the viewpoint is so far off that they are in view."""
@@ -89,8 +87,8 @@ class Viewpoint:
         """Chooses the viewpoint from which everything seen is in view. `whole`: the run is over.
 
         From behind and above the cameras, or else the robot; where a sensor scans all round, so high that the whole
-        place is in view, since the robot will drive about in it. Where no sensor measures distances, the whole run is
-        in view once it is over. Up is +z (REP 103), unless the root is itself like an optical frame (y down), as in
+        place is in view, since the robot will drive about in it; and once it is over the whole way, unless it is long.
+        Up is +z (REP 103), unless the root is itself like an optical frame (y down), as in
         data sets whose world is their first camera.
         """
         up = np.array([0.0, 0.0, 1.0])
@@ -113,13 +111,20 @@ class Viewpoint:
         level = self._ahead
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
-        alone = whole and self._places_alone()
-        if self._around or self._kept or alone:
-            all_of_it = np.concatenate(self._around + self._kept + (self._places if alone else []))
-            lower, upper = np.percentile(all_of_it, [3, 97], axis=0)
+        points = self._around + self._kept
+        if whole and len(self._places) > 1 and _extent(self._places, up) <= FARTHEST:
+            points = points + self._places
+        if points:
+            lower, upper = np.percentile(np.concatenate(points), [3, 97], axis=0)
             middle = (lower + upper) / 2
-            size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, 50.0))
+            size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, FARTHEST))
             away = -0.97 * level + 1.05 * up + 0.4 * side
             return Outlook(up, middle + size * away, middle - (0.1 * size * level if self._kept else 0.0))
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
+
+
+def _extent(places: list[Vector], up: Vector) -> float:
+    """Half the diagonal, in the plane, of what nearly all places lie in."""
+    lower, upper = np.percentile(np.concatenate(places), [3, 97], axis=0)
+    return float(np.linalg.norm((upper - lower)[up == 0]) / 2)

@@ -22,7 +22,7 @@ from PIL import Image
 
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
-from dataflow.view import Save, ViewerSink, from_recording
+from dataflow.view import Save, ViewerSink, ViewOptions, from_recording
 
 Picture = npt.NDArray[np.uint8]
 
@@ -74,7 +74,7 @@ LATER = {
     "slam": 25,
     "slam_lidar": 25,
 }
-"""Seconds after the start of which a picture is, where there is little to be seen at first."""
+"""Seconds after the start of which a picture is, where it is not of the end."""
 
 GROWN = "demo"
 """The picture of the whole perception."""
@@ -111,14 +111,15 @@ def perceived(folder: Path) -> tuple[Path, Path]:
     return graph, recorded
 
 
-def at(seconds: float, graph: Path, recorded: Path, file: Path) -> None:
-    """Writes what the viewer shows after so many seconds."""
+def at(seconds: float | None, graph: Path, recorded: Path, file: Path) -> None:
+    """Writes what the viewer shows after so many seconds, or at the end, with as many points as a live one draws."""
     made = load_graph(graph)
     with Recording(recorded) as recording:
         begins = min(i.first for i in recording.streams.values() if i.first is not None and not i.static)
-        with ViewerSink(Save(file, at_end=True)) as sink:
+        with ViewerSink(Save(file, at_end=True), options=ViewOptions()) as sink:
             streams = [name for name, info in recording.streams.items() if info.message_type is not None]
-            from_recording(recording, sink, streams, end=begins + round(seconds * 1e9), graph=made)
+            end = None if seconds is None else begins + round(seconds * 1e9)
+            from_recording(recording, sink, streams, end=end, graph=made)
 
 
 def grown(folder: Path) -> Path:
@@ -141,15 +142,11 @@ def written(pixels: Picture, name: str) -> Path:
 
 def picture(name: str, folder: Path) -> Path:
     """Runs a graph, renders what the viewer shows of it, and writes NAME.png beside this file."""
-    shown = folder / f"{name}.rrd"
-    command = [sys.executable, "-m", "dataflow.cli.main", *VIEWS[name], "--quiet"]
-    if name in LATER:
-        recorded = folder / f"{name}.mcap"
-        subprocess.run([*command, "--record", str(recorded)], cwd=REPOSITORY, check=True)
-        at(LATER[name], REPOSITORY / VIEWS[name][1], recorded, shown)
-        recorded.unlink()
-    else:
-        subprocess.run([*command, "--view", str(shown)], cwd=REPOSITORY, check=True)
+    shown, recorded = folder / f"{name}.rrd", folder / f"{name}.mcap"
+    command = [sys.executable, "-m", "dataflow.cli.main", *VIEWS[name], "--quiet", "--record", str(recorded)]
+    subprocess.run(command, cwd=REPOSITORY, check=True)
+    at(LATER.get(name), REPOSITORY / VIEWS[name][1], recorded, shown)
+    recorded.unlink()
     return written(rendered(shown), f"{name}.png")
 
 
