@@ -117,7 +117,11 @@ class Viewpoint:
         if points:
             lower, upper = np.percentile(np.concatenate(points), [3, 97], axis=0)
             middle = (lower + upper) / 2
-            size = float(np.clip(np.linalg.norm((upper - lower)[up == 0]) / 2, 1.0, FARTHEST))
+            size = float(np.linalg.norm((upper - lower)[up == 0]) / 2)
+            beside = 0.0
+            if not (self._around or self._kept):  # what was seen on the way lies beside it
+                beside = 0.75 * reach if self._ranges else 0.3 * size
+            size = float(np.clip(size + beside, 1.0, FARTHEST))
             away = -0.97 * level + 1.05 * up + 0.4 * side
             return Outlook(up, middle + size * away, middle - (0.1 * size * level if self._kept else 0.0))
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)

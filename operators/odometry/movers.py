@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from operators.geometry.pinhole import Points
 from operators.geometry.se3 import Matrix
 from operators.odometry.alignment import PlaneTerm
+from operators.odometry.surface import Surface
 
 TILE = 8  # patches on a side
 FEWEST = 4  # compared points that a tile is judged by
@@ -52,6 +53,14 @@ class Movers:
         if not self.tiles.any():
             return np.zeros(len(points), np.bool_)
         return np.asarray(self.tiles.ravel()[_tile_of(points, self.K, self.tiles.shape)], np.bool_)
+
+    def left_out_of(self, surface: Surface) -> Surface:
+        """Returns a surface on the same grid without its moving tiles: later views are not to be laid on them."""
+        if not self.tiles.any():
+            return surface
+        h, w = surface.inverse_depth.shape
+        moving = np.kron(self.tiles, np.ones((TILE, TILE), np.bool_))[:h, :w]
+        return Surface(np.where(moving, np.float32(0), surface.inverse_depth), surface.K)
 
     @property
     def share(self) -> float:

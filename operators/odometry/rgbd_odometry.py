@@ -220,7 +220,7 @@ class RgbdOdometry:
 
     def _new_keyframe(self, frame: Frame, fit: Fit) -> bool:
         """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
-        newest, surface = self._map.newest, frame.surface
+        newest, surface = self._map.newest, fit.movers.left_out_of(frame.surface)
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, typical_depth(surface))
         moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * fit.offered)
         starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
@@ -250,7 +250,7 @@ class RgbdOdometry:
             found = with_new(frame.gray, kept, config.corners, layers, config.near, config.far, movers)
         segment = self._map.newest.segment if self._map.keyframes else 0
         return Keyframe(
-            frame.stamp, T, self._covariance, frame.gray, frame.surface,
+            frame.stamp, T, self._covariance, frame.gray, movers.left_out_of(frame.surface),
             found.pixels, found.points, found.ages, segment,
         )  # fmt: skip
 

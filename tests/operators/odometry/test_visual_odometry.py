@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -22,11 +23,12 @@ from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.camera import RgbdCamera
-from operators.odometry.fitting import Fit, Sighting
+from operators.odometry.fitting import Fit, Fitter, Sighting
 from operators.odometry.movers import Movers
 from operators.odometry.noise import Noise
 from operators.odometry.rgbd_odometry import RgbdOdometry
 from operators.odometry.settings import RgbdOdometryConfig
+from operators.odometry.surface import Surface
 from operators.odometry.tracking import MEASURED, Status, TrackResult, moved_covariance
 
 SIZE = (320, 240)
@@ -389,6 +391,41 @@ def test_what_moves_before_the_camera_does_not_pull_the_pose() -> None:
     ]
     assert max(steps) < 0.015
     assert errors(results, poses)[0] < 0.03
+
+
+def test_keyframes_hold_nothing_of_what_moves(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames, _ = mover_sequence(25)
+    odometry, fits = RgbdOdometry(camera()), []
+    refine = Fitter.refine
+
+    def noted(*given: Any) -> Fit:
+        fits.append(refine(*given))
+        return fits[-1]
+
+    monkeypatch.setattr(Fitter, "refine", noted)
+    left_out = 0
+    for i, frame in enumerate(frames):
+        result = odometry.track(*frame, i * 100_000_000)
+        if not result.keyframe or not fits or not fits[-1].movers.tiles.any():
+            continue
+        kept = odometry.snapshot().keyframes[-1].surface
+        assert not fits[-1].movers.hold(kept.points()).any()
+        left_out += 1
+    assert left_out > 0
+
+
+def test_a_surface_without_moving_tiles_keeps_the_others() -> None:
+    surface = Surface(np.full((20, 30), 0.5, np.float32), K_DEPTH)
+    assert Movers.none(K_DEPTH, (20, 30)).left_out_of(surface) is surface
+    tiles = np.zeros((3, 4), np.bool_)
+    tiles[0, 1] = tiles[2, 3] = True
+
+    left = Movers(tiles, K_DEPTH).left_out_of(surface).inverse_depth
+
+    assert not left[:8, 8:16].any()
+    assert not left[16:, 24:].any()
+    assert np.count_nonzero(left) == 20 * 30 - 8 * 8 - 4 * 6
+    assert surface.inverse_depth.all()
 
 
 def test_bare_wall_keeps_its_distance_and_admits_the_rest() -> None:
