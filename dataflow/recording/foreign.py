@@ -17,7 +17,7 @@ from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove import FOXGLOVE_SCHEMAS, FoxgloveSchema, stamp_of
 from dataflow.recording.json_codec import decode_object
 
-DEPTH_ENCODINGS = ("32FC1",)
+DEPTH_ENCODINGS = ("32FC1", "16UC1")
 _PREFERRED = {"foxglove.PoseInFrame": "Pose", "foxglove.RawImage": "Image"}
 """The message type of a Foxglove schema that serves several."""
 

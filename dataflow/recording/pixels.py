@@ -14,6 +14,8 @@ Pixels = npt.NDArray[Any]
 
 MILLIMETRES = np.float32(1000)
 """In a metre."""
+_PROBED_ROWS = 8
+"""Of a depth image, looked at before all of it is."""
 DEPTH_ENCODINGS = ("32FC1", "64FC1", "16UC1")
 _LAYOUTS: dict[str, tuple[str, int]] = {
     "mono8": ("u1", 1),
@@ -70,6 +72,26 @@ def as_depth(encoding: str, rows: Pixels) -> npt.NDArray[np.float32]:
     if encoding == "16UC1":
         return rows.astype(np.float32) / MILLIMETRES
     return np.ascontiguousarray(rows, np.float32)
+
+
+def as_millimetres(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16] | None:
+    """Returns whole millimetres (H, W) that `as_depth` turns back into the same bits; None where there are none.
+
+    Most depth cameras measure in whole millimetres; half the bytes hold them.
+    """
+    if _in_millimetres(depth[:: max(1, len(depth) // _PROBED_ROWS)]) is None:
+        return None
+    return _in_millimetres(depth)
+
+
+def _in_millimetres(depth: npt.NDArray[np.float32]) -> npt.NDArray[np.uint16] | None:
+    with np.errstate(all="ignore"):  # what is no distance differs below
+        scaled = np.multiply(depth, MILLIMETRES, dtype=np.float32)
+        np.rint(scaled, out=scaled)
+        whole = scaled.astype(np.uint16)
+        np.divide(whole, MILLIMETRES, out=scaled, dtype=np.float32)
+    same = np.array_equal(scaled.view(np.uint32), np.ascontiguousarray(depth, np.float32).view(np.uint32))
+    return whole if same else None
 
 
 def stored_rows(encoding: str, width: int, height: int, step: int, data: Pixels, *, big_endian: bool = False) -> Pixels:

@@ -13,12 +13,12 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from dataflow.messages import CameraInfo, CompressedImage, DepthImage, Image
 from dataflow.recording.errors import RecordingError
 from dataflow.recording.foxglove.values import Fields, Parts, frozen, matrix, timestamp_of, with_field
+from dataflow.recording.pixels import as_depth, as_millimetres
 
 UINT32_MAX = 2**32 - 1
 
 
-def _raw_image(message: Image | DepthImage, encoding: str) -> tuple[Parts, tuple[str, ...]]:
-    data = message.data
+def _raw_image(message: Image | DepthImage, encoding: str, data: npt.NDArray[Any]) -> tuple[Parts, tuple[str, ...]]:
     height, width = data.shape[:2]
     proto = RawImage(
         timestamp=timestamp_of(message.stamp),
@@ -32,11 +32,12 @@ def _raw_image(message: Image | DepthImage, encoding: str) -> tuple[Parts, tuple
 
 
 def encode_image(message: Image) -> tuple[Parts, tuple[str, ...]]:
-    return _raw_image(message, "rgb8" if message.data.ndim == 3 else "mono8")
+    return _raw_image(message, "rgb8" if message.data.ndim == 3 else "mono8", message.data)
 
 
 def encode_depth(message: DepthImage) -> tuple[Parts, tuple[str, ...]]:
-    return _raw_image(message, "32FC1")
+    whole = as_millimetres(message.data)
+    return _raw_image(message, "32FC1", message.data) if whole is None else _raw_image(message, "16UC1", whole)
 
 
 def rows_of(proto: RawImage, dtype: str, channels: int) -> npt.NDArray[Any]:
@@ -66,9 +67,13 @@ def decode_image(proto: RawImage) -> Fields:
 
 
 def decode_depth(proto: RawImage) -> Fields:
-    if proto.encoding != "32FC1":
-        raise RecordingError(f"RawImage encoding {proto.encoding!r} is no DepthImage; the one known is 32FC1")
-    return {"frame": proto.frame_id, "data": rows_of(proto, "<f4", 1)}
+    if proto.encoding == "32FC1":
+        return {"frame": proto.frame_id, "data": rows_of(proto, "<f4", 1)}
+    if proto.encoding == "16UC1":
+        depth = as_depth("16UC1", rows_of(proto, "<u2", 1))
+        depth.flags.writeable = False
+        return {"frame": proto.frame_id, "data": depth}
+    raise RecordingError(f"RawImage encoding {proto.encoding!r} is no DepthImage; those known are 32FC1 and 16UC1")
 
 
 def encode_compressed(message: CompressedImage) -> tuple[Parts, tuple[str, ...]]:
