@@ -56,10 +56,10 @@ class Progress:
         self._reported = -REPORT_EVERY
         self._owed = False
 
-    def report(self, *, idle: bool) -> None:
-        """Sends what has changed, if it is time to."""
+    def report(self, *, idle: bool, at_once: bool = False) -> None:
+        """Sends what has changed, if it is time to, or `at_once`."""
         now = self._clock()
-        if now < self._reported + (self._idle if idle else self._every):
+        if not at_once and now < self._reported + (self._idle if idle else self._every):
             self._owed = self._owed or idle
             return
         self._owed = False

@@ -246,6 +246,7 @@ class SinkProcess:
     def _control(self, kind: str, fields: Mapping[str, Any]) -> None:
         match kind:
             case "poll":
+                self._report(time.monotonic())  # what is owed comes first: idle is who owes nothing
                 self.channel.send(
                     "state",
                     round=fields["round"],

@@ -50,9 +50,13 @@ class Standing:
         self._channel.send("ended", report=self._progress.final_report(self._moved()))
 
     def answer(self, *, idle: bool) -> None:
-        """Answers the supervisor's poll. `idle`: a look at everything has just found nothing to do."""
+        """Answers the supervisor's poll. `idle`: a look at everything has just found nothing to do.
+
+        What it was to be told anyway comes first: others may go on by it, and the answer is taken for a proof.
+        """
         asked, self._orders.asked = self._orders.asked, None
         self._outlet.flush_all()
+        self._progress.report(idle=idle, at_once=True)
         self._channel.send(
             "state",
             round=asked,

@@ -88,3 +88,14 @@ def test_counts_that_a_busy_process_has_left_out_follow_when_it_is_idle() -> Non
     one.now += 1.0
     one.progress.report(idle=True)
     assert len(one.channel.of("progress")) == 3
+
+
+def test_what_is_owed_is_told_at_once_to_who_asks() -> None:
+    one = Reporting()
+    one.fires(idle=True)
+    one.fires(idle=True)
+    one.progress.report(idle=True, at_once=True)
+    one.progress.report(idle=True, at_once=True)
+
+    assert one.told == [10, 20]
+    assert one.progress.next_due() is None

@@ -119,3 +119,17 @@ def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys:
     assert recorder.stored.places == [(0, 0)]
     assert (recorder.process.inlet.malformed, recorder.process.inlet.misplaced) == (1, 1)
     assert capsys.readouterr().err.count(KEY) == 2
+
+
+def test_a_recorder_that_is_asked_for_its_state_says_first_that_it_has_ended() -> None:
+    """A supervisor that heard of the state alone would take the run for stuck: all are idle, and one has not ended."""
+    recorder = Recorder()
+    for operator in ("camera", "last"):
+        record = FiringRecord(operator, 0, 0, "finish", 0)
+        recorder.process._receive(firings_key("test", operator), encode_batch([record], last=True))
+    recorder.process._control("poll", {"round": 7})
+
+    kinds = [kind for kind, _ in recorder.channel.sent]
+    assert kinds.index("ended") < kinds.index("state")
+    recorder.process._control("poll", {"round": 8})
+    assert len(recorder.channel.of("ended")) == 1
