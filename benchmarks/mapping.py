@@ -15,11 +15,22 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
 import numpy as np  # noqa: E402
+from moving_things import LastSeen, Movers  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 from scipy.ndimage import binary_dilation  # noqa: E402
 from scipy.spatial import cKDTree  # noqa: E402
 
-from dataflow.messages import CameraInfo, DepthImage, Mesh, Message, OccupancyGrid, Odometry, PointCloud, Pose  # noqa: E402
+from dataflow.messages import (  # noqa: E402
+    CameraInfo,
+    DepthImage,
+    Mesh,
+    Message,
+    OccupancyGrid,
+    Odometry,
+    PointCloud,
+    Pose,
+    SceneGraph,
+)
 from dataflow.messages import Transforms as TransformSet  # noqa: E402
 from dataflow.messages.geometry import transform_points  # noqa: E402
 from operators.cloud.back_projection import Rays, beside_edge, within_range  # noqa: E402
@@ -47,6 +58,14 @@ def robot(world: str, seed: int, seconds: int, **more: Any) -> SimulatedRobot:
     return source
 
 
+def moving_things(world: str, seed: int, seconds: int) -> Movers:
+    """What moves in the same drive."""
+    none = {"rate": 0.0}
+    source = robot(world, seed, seconds, depth_camera=none, lidar=none, truth={"relations": 4.0, "spatial": False})
+    found = (messages.get("scene") for messages in source.stream())
+    return Movers({scene.stamp: scene for scene in found if isinstance(scene, SceneGraph)})
+
+
 def depth_cloud(depth: DepthImage, info: CameraInfo) -> PointCloud:
     rays = Rays.through(info.K, (info.width, info.height), 3)
     usable = within_range(depth.data, 3, 0.3, 6.0) & ~beside_edge(depth.data, 3, 0.05)
@@ -56,10 +75,11 @@ def depth_cloud(depth: DepthImage, info: CameraInfo) -> PointCloud:
 class Scored:
     """One mapper on one sensor, with the true cells that its points fell into."""
 
-    def __init__(self, truth: OccupancyGrid, solid: Mask, **params: Any) -> None:
+    def __init__(self, truth: OccupancyGrid, solid: Mask, movers: Movers, **params: Any) -> None:
         self.mapper = OccupancyMapper(period=1_000_000, **params)
         self.mapper.setup()
         self.truth, self.solid, self.far = truth, solid, params["far"]
+        self.last_seen = LastSeen(truth, movers, BAND)
         self.touched = np.zeros(truth.cells.shape, np.bool_)
         self.milliseconds: list[float] = []
         self.stamp = 0
@@ -71,6 +91,7 @@ class Scored:
         self.stamp = cloud.stamp
         seen = placed(cloud, pose, extrinsics)
         assert seen is not None
+        self.last_seen.add(self.stamp, seen.origin, seen.points, self.far)
         p = seen.points[np.linalg.norm(seen.points - seen.origin, axis=1) <= self.far]
         p = p[(p[:, 2] >= BAND[0]) & (p[:, 2] < BAND[1])]
         cell = np.floor((p[:, :2] - self.truth.position[:2]) / self.truth.resolution).astype(int)
@@ -82,11 +103,13 @@ class Scored:
 
         Scored are the cells that the map knows or a point fell into. Taken cells that no point fell into (the inside
         of furniture) are left out of taken, and count as wrong where the map calls them free. Cells that are neither
-        free nor hold a surface (the inside of walls, where no robot can be) are left out of taken.
+        free nor hold a surface (the inside of walls, where no robot can be) are left out of taken. Where somebody stood
+        when the sensor last looked, neither is wrong.
         """
+        held = self.last_seen.held & ~self.solid
         found = _on_grid(self.mapper.process(*_last(self))["map"], self.truth)
-        taken, free = found > 50, (found >= 0) & (found <= 50)
-        true_free = (self.truth.cells == 0) & ~self.solid
+        taken, free = (found > 50) & ~held, (found >= 0) & (found <= 50) & ~held
+        true_free = (self.truth.cells == 0) & ~self.solid & ~held
         seen = self.solid & self.touched
         known = (found >= 0) | self.touched
         near_true, near_found = (binary_dilation(m, np.ones((3, 3))) for m in (self.solid, taken))
@@ -158,7 +181,8 @@ def occupancy(worlds: list[str], seeds: list[int], seconds: int) -> None:
             assert isinstance(info, CameraInfo)
             assert isinstance(extrinsics, TransformSet)
             true = solid(truth, mesh)
-            scored = {"lidar": Scored(truth, true, far=8.0), "depth": Scored(truth, true, far=5.0)}
+            movers = moving_things(world, seed, seconds)
+            scored = {name: Scored(truth, true, movers, far=far) for name, far in (("lidar", 8.0), ("depth", 4.0))}
             for messages in source.stream():
                 depth, points = messages.get("depth"), messages.get("points")
                 base, camera = messages.get("true_base"), messages.get("ground_truth")

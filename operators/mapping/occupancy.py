@@ -21,11 +21,13 @@ _STEP = 0.75  # cells between the samples of a ray
 class GridSettings:
     """Lengths in metres. `hit` and `miss` are added log-odds, which stay within ±`bound`.
 
-    `band` holds the heights that matter, `growth` (1/m) times the squared range is how far above the band's lower end a
-    surface must lie to be no noisy floor, `near` and `far` bound the ranges; farther rays tell of what they pass.
+    `layer` is the height of a slice, as near as whole slices fill the band. `band` holds the heights that matter,
+    `growth` (1/m) times the squared range is how far above the band's lower end a surface must lie to be no noisy
+    floor, `near` and `far` bound the ranges; farther rays tell of what they pass.
     """
 
     resolution: float
+    layer: float
     band: tuple[float, float]
     growth: float
     near: float
@@ -47,7 +49,7 @@ class ColumnGrid:
     def __init__(self, settings: GridSettings) -> None:
         self._settings = settings
         low, high = settings.band
-        self._slices = max(1, round((high - low) / settings.resolution))
+        self._slices = max(1, round((high - low) / settings.layer))
         self._corner: Cubes = np.zeros(2, np.int32)  # column and row of the first cell, in cells from the origin
         self._odds = np.zeros((self._slices, 0, 0), np.float32)
 

@@ -37,18 +37,26 @@ class OccupancyMapper(Operator):
     status: Out[Diagnostics] = Out(doc="points and cells; a warning for a cloud or a pose that tells nothing")
 
     resolution: float = Param(0.05, gt=0.005, doc="side of a cell", unit="m")
+    layer: float = Param(
+        0.025, gt=0.005, doc="height of a cube; a table top that is seen from its edge needs low ones", unit="m"
+    )
     lower: float = Param(0.05, doc="lowest height in the poses' frame that is in the robot's way", unit="m")
     upper: float = Param(1.5, doc="highest such height", unit="m")
     floor_growth: float = Param(
-        0.004, ge=0, doc="this times the squared range is added to `lower`: a far floor is noisy", unit="1/m"
+        0.002, ge=0, doc="this times the squared range is added to `lower`: a far floor is noisy", unit="1/m"
     )
     near: float = Param(0.3, ge=0, doc="nearer points are the robot itself", unit="m")
-    far: float = Param(8.0, gt=0, doc="farther points are not entered; rays to them free what they pass", unit="m")
+    far: float = Param(
+        8.0,
+        gt=0,
+        doc="farther points are not entered, rays to them free what they pass; as far as noise is below half a cell",
+        unit="m",
+    )
     hit: float = Param(1.0, gt=0, doc="log-odds that a point adds to its cube")
-    miss: float = Param(0.3, gt=0, doc="log-odds that a ray takes from the cubes that it passes")
+    miss: float = Param(0.35, gt=0, doc="log-odds that a ray takes from the cubes that it passes")
     bound: float = Param(3.5, gt=0, le=20, doc="most that is remembered, in log-odds: less forgets movers faster")
     period: int = Param(5, ge=1, live=True, doc="the map comes with every so many clouds")
-    most_cubes: int = Param(50_000_000, ge=1, doc="the largest map; a larger one ends the run")
+    most_cubes: int = Param(100_000_000, ge=1, doc="the largest map; a larger one ends the run")
 
     def setup(self) -> None:
         """Raises ValueError for a band or a range that holds nothing."""
@@ -61,6 +69,7 @@ class OccupancyMapper(Operator):
     def _begin(self) -> None:
         settings = GridSettings(
             resolution=self.resolution,
+            layer=self.layer,
             band=(self.lower, self.upper),
             growth=self.floor_growth,
             near=self.near,

@@ -119,6 +119,16 @@ def test_a_moving_sensor_is_deskewed() -> None:
     assert abs(grid.cells.shape[1] * grid.resolution - 4.05) < 0.11
 
 
+def test_a_table_top_that_few_scans_hit_at_its_edge_stays_though_all_pass_below_it() -> None:
+    z = np.linspace(0.55, 0.68, 40) - 0.6  # under the top
+    below = np.stack([np.full(40, 3.0), np.zeros(40), 3.0 * z], axis=1)
+    edge = np.array([[1.0, 0.0, 0.11]])  # of a top at 0.70 to 0.72 m
+    scans = [cloud(np.concatenate([below, edge]) if k % 4 == 0 else below, k + 1) for k in range(12)]
+    poses: list[Pose | Odometry] = [pose(stamp=k + 1) for k in range(12)]
+    assert cell(last_map(mapped(scans, poses)), 1.01, 0.01) > 50
+    assert cell(last_map(mapped(scans, poses, layer=0.2)), 1.01, 0.01) < 50
+
+
 @pytest.mark.parametrize("points", [np.zeros((0, 3)), np.full((5, 3), np.nan), np.zeros((9, 3))])
 def test_a_cloud_that_tells_nothing_is_named_and_survived(points: np.ndarray) -> None:
     played = mapped([cloud(points), cloud(walls(), 2)], [pose(), pose(stamp=2)])
