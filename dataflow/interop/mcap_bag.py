@@ -35,7 +35,7 @@ class McapBag:
         what = " ROS 2" if profiles == {"ros2"} else " ROS 1" if profiles == {"ros1"} else ""
         self.kind = f"MCAP{what}" + (f", {len(files)} files" if len(files) > 1 else "")
         self.notes = tuple(
-            [f"{f.path.name} has no proper end: its writer died" for f in self.files if f.torn]
+            [f"{f.path.name} has no proper end: it is being written, or its writer died" for f in self.files if f.torn]
             + [note for f in self.files for note in f.damage]
         )
 
