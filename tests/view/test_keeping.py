@@ -88,4 +88,9 @@ def test_a_kept_cloud_is_drawn_in_the_root_frame_at_the_stamp_of_its_own_pose(tm
     (drawn_points,) = at(rows(path), "/r/cloud/space/kept", "Points3D:positions")
     assert np.allclose(drawn_points.values, [[5.0, 0.0, 1.0]])
     assert drawn_points.stamp == 10, "the second cloud that saw it"
+    frames = at(rows(path), "/r/cloud/space/kept", "CoordinateFrame:frame")
+    assert frames[-1].values == ["odom"]
+    assert all(frame.stamp is None for frame in frames), (
+        "a viewer that shows later points, too, knows their frame at any time"
+    )
     assert state.viewpoint.knows_more

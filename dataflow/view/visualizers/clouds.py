@@ -52,12 +52,14 @@ def _kept(canvas: Canvas, message: PointCloud) -> None:
     points = message.points[chosen].astype(np.float64)
     scene.viewpoint.saw_points(scene.tree.pose(message.frame), points[::16])
     paint = _paint(canvas, message, chosen)
+    root = scene.tree.root or message.frame
+    if scene.changed(canvas.entity, "frame of what stays", root):  # also before the first points stay, the viewer asks for their frame
+        canvas.log("space/kept", rr.CoordinateFrame(root), static=True)
     for stamp, placed, painted in there.add(canvas.stamp, message.frame, points, paint, scene.tree.pose_at):
         drawn = np.round(placed * 128) / 128  # 8 mm: packs better
         scene.viewpoint.kept_points(placed)
         canvas.recording.set_time(TIMELINE, timestamp=np.datetime64(stamp, "ns"))
-        canvas.draw("space/kept", scene.tree.root or message.frame,
-                    rr.Points3D(drawn, colors=painted, radii=rr.Radius.ui_points(1.5)))  # fmt: skip
+        canvas.log("space/kept", rr.Points3D(drawn, colors=painted, radii=rr.Radius.ui_points(1.5)))
     canvas.recording.set_time(TIMELINE, timestamp=np.datetime64(canvas.stamp, "ns"))
 
 
