@@ -137,7 +137,8 @@ def recover(
                 f"; its last {plural(done.lost_bytes, 'byte')} are an unfinished record: whole messages of it are saved"
             )
             rest = ending if done.lost_bytes else ""
-            say(f"[yellow]torn:[/] {escape(str(recording))} has no proper end: it is being written, or its writer died{rest}")
+            torn = "has no proper end: it is being written, or its writer died"
+            say(f"[yellow]torn:[/] {escape(str(recording))} {torn}{rest}")
         for note in done.damage:
             say(f"[yellow]damaged:[/] {escape(note)}")
         what = f"{plural(done.saved.messages, 'message')}, {size(done.saved.bytes)}"

@@ -119,7 +119,8 @@ def _facts(described: Description) -> Table:
         row("recovered", f"from {made[RECOVERED].get('of', '')}: what could be read of it", "yellow")
     if described.torn:
         lost = f"; {plural(described.lost_bytes, 'byte')} of an unfinished record are left out"
-        row("torn", "no proper end: it is being written, or its writer died" + (lost if described.lost_bytes else ""), "yellow")
+        torn = "no proper end: it is being written, or its writer died"
+        row("torn", torn + (lost if described.lost_bytes else ""), "yellow")
     for note in described.damage:
         row("damaged", note, "yellow")
     if described.start is not None and described.end is not None:

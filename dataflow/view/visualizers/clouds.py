@@ -53,7 +53,7 @@ def _kept(canvas: Canvas, message: PointCloud) -> None:
     scene.viewpoint.saw_points(scene.tree.pose(message.frame), points[::16])
     paint = _paint(canvas, message, chosen)
     root = scene.tree.root or message.frame
-    if scene.changed(canvas.entity, "frame of what stays", root):  # also before the first points stay, the viewer asks for their frame
+    if scene.changed(canvas.entity, "frame of what stays", root):  # asked for from the beginning on
         canvas.log("space/kept", rr.CoordinateFrame(root), static=True)
     for stamp, placed, painted in there.add(canvas.stamp, message.frame, points, paint, scene.tree.pose_at):
         drawn = np.round(placed * 128) / 128  # 8 mm: packs better
