@@ -43,7 +43,9 @@ class Movers:
     def at(self, stamp: int) -> list[tuple[Array, Array, Array]]:
         scene = self.scenes[min(self.scenes, key=lambda other: abs(other - stamp))]
         rows = [row for row, thing in enumerate(scene.ids.tolist()) if thing in self.moving]
-        return [(scene.positions[row], scene.sizes[row], scene.orientations[row]) for row in rows]
+        turned = scene.orientations
+        assert turned is not None
+        return [(scene.positions[row], scene.sizes[row], turned[row]) for row in rows]
 
 
 class LastSeen:
@@ -56,7 +58,7 @@ class LastSeen:
         self._x = truth.position[0] + (columns + 0.5) * truth.resolution
         self._y = truth.position[1] + (rows + 0.5) * truth.resolution
 
-    def add(self, stamp: int, origin: Array, points: NDArray[np.float32], far: float) -> None:
+    def add(self, stamp: int, origin: Array, points: NDArray[np.floating], far: float) -> None:
         """Takes what a sensor at `origin` (3,) saw, points (N, 3), and looks along its rays as far as `far`."""
         seen = self._met(origin, points, far)
         standing: Mask = np.zeros_like(self.held)
@@ -71,8 +73,8 @@ class LastSeen:
             )
         self.held = np.where(seen, standing, self.held)
 
-    def _met(self, origin: Array, points: NDArray[np.float32], far: float) -> Mask:
-        off = points - origin.astype(np.float32)
+    def _met(self, origin: Array, points: NDArray[np.floating], far: float) -> Mask:
+        off = points - origin
         distance = np.linalg.norm(off, axis=1)
         usable = (distance > 2 * STEP) & np.isfinite(distance)
         off, distance = off[usable] / distance[usable, None], np.minimum(distance[usable], far)

@@ -15,7 +15,7 @@ import rerun as rr
 from dataflow.messages import Message, Odometry, Pose, Transforms
 from dataflow.view import colors
 from dataflow.view.frames import FrameCycleError, Rank
-from dataflow.view.scene import VIEWER_LOG, SceneState
+from dataflow.view.scene import TIMELINE, VIEWER_LOG, SceneState
 
 NAMELESS = "(no frame)"
 """Stands for the empty frame name, which Rerun does not take."""
@@ -56,7 +56,17 @@ class Canvas:
             frame = NAMELESS
         if frame != self.plane:
             self.scene.see(self.recording, frame, self.stamp)
+        self._begin(path, frame)
         self.log(path, rr.CoordinateFrame(frame), *archetypes)
+
+    def _begin(self, path: str, frame: str) -> None:
+        """Says from the beginning on in which frame a path is drawn: a viewer asks also where nothing is yet."""
+        begin = self.scene.begin
+        if self.static or begin is None or begin >= self.stamp or not self.scene.changed(self.entity, f"/{path}", True):
+            return
+        self.recording.set_time(TIMELINE, timestamp=np.datetime64(begin, "ns"))
+        self.log(path, rr.CoordinateFrame(frame))
+        self.recording.set_time(TIMELINE, timestamp=np.datetime64(self.stamp, "ns"))
 
     def clear(self, path: str) -> None:
         """Takes away what was drawn at `<entity>/<path>` before, and below."""

@@ -32,6 +32,8 @@ def visualize(
     """
     draw = next(VISUALIZERS[c] for c in type(message).__mro__ if c in VISUALIZERS)
     recording.set_time(TIMELINE, timestamp=np.datetime64(message.stamp, "ns"))
+    if scene.begin is None and stream not in scene.layout.static:
+        scene.begin = message.stamp
     canvas = Canvas(recording, entity, stream or entity.lstrip("/"), message.stamp, scene)
     with catch_and_log_exceptions(strict=True):  # this thread only: Rerun otherwise turns errors into warnings
         if canvas.stream in scene.layout.placing:

@@ -104,6 +104,8 @@ class SceneState:
     remembered: dict[tuple[str, str], Any] = field(default_factory=dict)
     unshown: Unshown = field(default_factory=Unshown)
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
+    begin: int | None = None
+    """The stamp (ns) of the first message that was drawn."""
     _noted: set[tuple[str, str]] = field(default_factory=set)
     _waiting: dict[str, int] = field(default_factory=dict)
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?

@@ -10,25 +10,35 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
+import time
+from collections.abc import Iterable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import numpy.typing as npt
 from PIL import Image
+from rerun.experimental import ViewerClient
 
 from dataflow.graph import load_graph
 from dataflow.recording import Recording
 from dataflow.view import Save, ViewerSink, ViewOptions, from_recording
+from dataflow.view.scene import TIMELINE
 
 Picture = npt.NDArray[np.uint8]
 
 HERE = Path(__file__).resolve().parent
 REPOSITORY = HERE.parent.parent
 DATA = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data")
+PROGRAMS = Path(sys.executable).parent
+SETTLED = 4.0
+"""Seconds that the viewer may take to draw a moment, without a GPU."""
+MOMENTS = (0.0, 0.02, 0.5, 1.0)
+"""Shares of a file's length at which no view may report an error."""
 SIZE = (1200, 750)
 DRAWN = (1600, 1000)  # the window that is made smaller
 BYTES = 150_000
@@ -88,9 +98,9 @@ WIDE, HIGH = 4800, 3000
 
 def rendered(shown: Path) -> Picture:
     """What the viewer shows of a file, a moment after it is opened."""
-    programs, large = Path(sys.executable).parent, shown.with_suffix(".png")
+    large = shown.with_suffix(".png")
     subprocess.run(
-        ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(programs / "rerun"), "--screenshot-to", str(large),
+        ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(PROGRAMS / "rerun"), "--screenshot-to", str(large),
          "--window-size", f"{DRAWN[0]}x{DRAWN[1]}", "--bind", "127.0.0.1", "--new", str(shown)],
         check=True, capture_output=True, timeout=180,
     )  # fmt: skip
@@ -98,6 +108,30 @@ def rendered(shown: Path) -> Picture:
     if pixels is None:
         raise SystemExit(f"the viewer wrote no picture of {shown.name}")
     return np.asarray(cv2.resize(pixels, SIZE, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def complaints(shown: Path, moments: Iterable[float]) -> list[str]:
+    """What views of a file report as errors at these shares of its length, as the viewer itself says it."""
+    found = dict[str, None]()
+    viewer = ViewerClient.spawn(headless=True, port=free_port(), executable_path=str(PROGRAMS / "rerun"))
+    try:
+        viewer.open([str(shown)])
+        (timeline,) = (t for r in viewer.get_state().recordings for t in r.timelines if t.name == TIMELINE)
+        for moment in moments:
+            at = timeline.start + round(moment * (timeline.end - timeline.start))
+            viewer.set_time(TIMELINE, timestamp=np.datetime64(at, "ns"), play_state="paused")
+            time.sleep(SETTLED)
+            for view in viewer.get_state().views:
+                found |= {f"{view.name}: {r.summary}": None for r in view.reports if r.severity == "error"}
+    finally:
+        viewer.quit()
+    return list(found)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
 
 
 def perceived(folder: Path) -> tuple[Path, Path]:
@@ -147,6 +181,8 @@ def picture(name: str, folder: Path) -> Path:
     subprocess.run(command, cwd=REPOSITORY, check=True)
     at(LATER.get(name), REPOSITORY / VIEWS[name][1], recorded, shown)
     recorded.unlink()
+    for complaint in complaints(shown, MOMENTS):
+        print(f"{name}: the viewer reports an error: {complaint}", file=sys.stderr)
     return written(rendered(shown), f"{name}.png")
 
 

@@ -205,6 +205,14 @@ def odometry(t: int, x: float, **fields: object) -> Odometry:
     )
 
 
+def test_what_is_drawn_first_later_has_its_frame_from_the_beginning(tmp_path: Path) -> None:
+    """The viewer reports an error of an entity whose frame it does not know, also while nothing of it is drawn."""
+    told = [("first", cloud_in("odom", 5)), ("later", cloud_in("odom", 30)), ("later", cloud_in("odom", 40))]
+    found = draw(tmp_path, *told)
+    frames = at(found, "/later/space", "CoordinateFrame:frame")
+    assert [(row.stamp, row.values) for row in frames] == [(t, ["odom"]) for t in (5, 30, 40)]
+
+
 def test_a_moving_robot_carries_its_sensors_and_leaves_a_trail(tmp_path: Path) -> None:
     fixed = Transforms(
         stamp=0, frames=["base"], child_frames=["lidar"], translations=[[0, 0, 1]], rotations=[[0, 0, 0, 1]]
