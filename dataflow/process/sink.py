@@ -101,6 +101,8 @@ class SinkProcess:
         """Keys on which an operator's last firing records have not come yet."""
         self._open = set(config.streams)
         """Streams whose end has not come yet."""
+        self._begins: dict[str, int] = {}
+        """The incarnations with which operators go on that were started again: ends of earlier ones end nothing."""
         self._expected = 0
         """Counts how often streams were said to begin anew: the process that makes them was started again."""
         self.sink: StreamSink | None = None
@@ -175,7 +177,7 @@ class SinkProcess:
             self.inlet.refuse(key, f"{len(batch.records)} firing records of {batch.operator!r}")
             return
         self.batches += 1
-        if self._take_records(batch):
+        if self._take_records(batch) and batch.incarnation >= self._begins.get(batch.operator, 0):
             self.firings_open.discard(key)
 
     def _deliver(self, key: str, envelope: Envelope) -> None:
@@ -194,7 +196,9 @@ class SinkProcess:
                 self.frontiers[key] = max(self.frontiers[key], envelope.stamp)
             case Kind.END:
                 self.frontiers[key] = FOREVER
-                self._open.discard(key)
+                made = self.graph.streams[key]
+                if made.static or envelope.incarnation >= self._begins.get(made.node, 0):
+                    self._open.discard(key)
                 self.sink.end(key, None if envelope.stamp == NEVER else envelope.stamp, envelope.reason)
 
     def _take_records(self, batch: Batch) -> bool:
@@ -262,7 +266,7 @@ class SinkProcess:
                     self._take_records(decode_batch(data))
             case "expect":
                 self.inlet.restarted(fields["streams"])
-                self._expect(fields["streams"], fields["times"])
+                self._expect(fields["streams"], fields["times"], fields["begins"])
             case "event":
                 assert self.sink is not None
                 self.sink.event(fields["name"], fields["stamp"], fields["data"])
@@ -283,9 +287,13 @@ class SinkProcess:
                 self._drain()
                 raise ChannelClosed("the supervisor is gone")
 
-    def _expect(self, keys: Sequence[str], times: int) -> None:
-        """Waits for the ends of streams again, and for last firing records. Static streams end once."""
+    def _expect(self, keys: Sequence[str], times: int, begins: Mapping[str, int]) -> None:
+        """Waits for the ends of streams again, and for last firing records. Static streams end once.
+
+        What the process before has said may still be on its way: `begins` holds the incarnations of the next one.
+        """
         self._expected, self._ended = times, False
+        self._begins.update(begins)
         self._told.clear()
         self._open.update(key for key in keys if key in self.frontiers and not self.graph.streams[key].static)
         self.firings_open.update(key for key in keys if key in self._operator_of)

@@ -84,8 +84,12 @@ class StreamOrder:
         if kind is Kind.FRONTIER and envelope.stamp <= self._promised:
             return Verdict(gap=gap, repeats=True)
         if self._end is not None:
-            again = kind is Kind.END and envelope.incarnation > self._end.incarnation
-            return Verdict(self._end if again else None, gap)
+            if envelope.incarnation <= self._end.incarnation:
+                return Verdict(gap=gap)
+            if kind is Kind.FRONTIER:
+                return Verdict(gap=gap, repeats=True)
+            self._end = replace(self._end, incarnation=envelope.incarnation)
+            return Verdict(self._end, gap)
         if kind is Kind.MESSAGE and envelope.stamp <= self._promised:
             why = f"broke its promise with number {envelope.seq}, stamp {envelope.stamp}"
             return Verdict(gap=gap, damaged=why)

@@ -96,4 +96,4 @@ def tell_consumers(run: RunState, process: Supervised, *, absent: bool) -> None:
             run.send(other, "absent", streams=sorted(taken), absent=absent)
         elif not absent:
             other.expect(run.steady)
-            run.send(other, "expect", streams=sorted(taken), times=other.expected)
+            run.send(other, "expect", streams=sorted(taken), times=other.expected, begins=process.begins)

@@ -120,10 +120,12 @@ class LiveRestarts(RestartPolicy):
         process.renew()
         if self.run.release is None:  # nobody has heard of the one before
             self._remains.forget(process.nodes)
+            process.begins = {}
             self.run.spawn(process)
         else:
             restarts = self.run.status.restarts
             resume = {n: self._remains.resumed(n) | {"restarts": restarts.get(n, 0)} for n in process.nodes}
+            process.begins = {name: fields["incarnation"] for name, fields in resume.items()}
             self.run.spawn(process, resume=resume)
 
     # Back

@@ -38,6 +38,8 @@ class Supervised:
     """It gives no sign of life, and the others go on without it."""
     expected: int = 0
     """Counts how often it was told to expect streams anew; an end said before it has heard of that is none."""
+    begins: dict[str, int] = field(default_factory=dict)
+    """The incarnations that its operators began with, where it took another's place."""
     hung_up: float | None = None
     """When it closed its channel."""
 

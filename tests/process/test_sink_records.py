@@ -12,6 +12,7 @@ from dataflow.graph import load_text
 from dataflow.names import firings_key
 from dataflow.process.sink import SinkConfig, SinkProcess
 from dataflow.records.firing import FiringRecord, decode_batch, encode_batch
+from dataflow.transport import Envelope, Kind
 
 GRAPH = """\
 graph: one
@@ -20,7 +21,8 @@ operators:
   camera: {use: "process_operators:Count"}
   last: {use: "process_operators:Twice", inputs: {x: camera/count}}
 """
-KEY = firings_key("test", "last")
+KEY, CAMERA = firings_key("test", "last"), firings_key("test", "camera")
+STREAM = "test/camera/count"
 
 
 class Stored:
@@ -103,10 +105,28 @@ def test_a_recorder_that_has_ended_waits_for_the_end_of_what_begins_anew() -> No
         return [fields["report"] for fields in recorder.channel.of("ended")]
 
     assert [report["expected"] for report in ends(0)] == [0]
-    recorder.process._control("expect", {"streams": [KEY], "times": 1})
+    recorder.process._control("expect", {"streams": [KEY], "times": 1, "begins": {"last": 1}})
     recorder.process._report(0.0)
     assert len(recorder.channel.of("ended")) == 1
     assert [report["expected"] for report in ends(1)] == [0, 1]
+
+
+def test_an_end_that_was_still_on_its_way_from_the_process_before_is_not_that_of_the_successor() -> None:
+    """The recorder was slow: what the killed process had said, up to its end, comes after the word of its successor."""
+    recorder = Recorder()
+    recorder.process._open.add(STREAM)
+    recorder.process.frontiers[STREAM] = 0
+    recorder.stored.end = lambda *_: None  # type: ignore[attr-defined]
+    begins = {"camera": 1, "last": 1}
+    recorder.process._control("expect", {"streams": [STREAM, KEY, CAMERA], "times": 1, "begins": begins})
+    for incarnation in (0, 1):
+        assert recorder.channel.of("ended") == []
+        recorder.process._deliver(STREAM, Envelope(Kind.END, STREAM, incarnation, 0, 7))
+        for name, key in (("camera", CAMERA), ("last", KEY)):
+            records = [FiringRecord(name, incarnation, 0, "finish", 2)]
+            recorder.process._receive(key, encode_batch(records, last=True))
+        recorder.process._report(0.0)
+    assert [fields["report"]["expected"] for fields in recorder.channel.of("ended")] == [1]
 
 
 def test_garbage_and_records_of_another_operator_are_dropped_and_counted(capsys: pytest.CaptureFixture[str]) -> None:

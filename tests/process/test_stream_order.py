@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -99,7 +100,10 @@ def test_a_successor_with_nothing_more_to_say_ends_the_stream_again_as_it_ended(
     *_, over = take_all(order, stream_of(4))[0]
 
     assert order.take(end(4, 9000)) == Verdict()
-    assert [order.take(end(0, NEVER, incarnation)) for incarnation in (1, 2)] == [Verdict(over)] * 2
+    assert order.take(frontier(0, 9000, incarnation=1)) == Verdict(repeats=True)
+    ends = [order.take(end(0, NEVER, incarnation)).taken for incarnation in (1, 2)]
+    assert ends == [replace(over, incarnation=incarnation) for incarnation in (1, 2)]
+    assert order.take(end(0, NEVER, incarnation=1)) == Verdict()
     assert order.take(message(0, 9000, incarnation=2)).taken
     assert order.take(end(1, 9000, incarnation=2)).taken == end(1, 9000, incarnation=2)
 
