@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -148,9 +149,13 @@ class Outlet:
                 self.sent += 1
 
     def push_all(self) -> None:
-        """Waits (bounded) until everything has room: before this process leaves."""
+        """Waits (bounded) until everything has room: before this process leaves. Says what is lost."""
         deadline = time.monotonic() + PUSH_WITHIN
-        while not self._fanout.flush() and time.monotonic() < deadline:
+        while not self._fanout.flush():
+            if time.monotonic() >= deadline:
+                text = f"what this process sent last is lost: another took too little of it for {PUSH_WITHIN:g} s"
+                print(text, file=sys.stderr)
+                return
             time.sleep(0.001)
 
     def consumer_gone(self, number: int, life: int) -> None:

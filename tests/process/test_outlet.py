@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dataflow.messages import FeatureVector
+from dataflow.process import outlet
 from dataflow.process.outlet import Outlet
 from dataflow.sync import Entry
 from dataflow.transport import Fanout, Incoming, Kind, Outgoing, PoolReader, decode, make_board, make_ring
@@ -140,3 +141,18 @@ def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_m
         ("constant", "END", 1),
         ("fast", "MESSAGE", 0),
     ]
+
+
+def test_who_leaves_says_that_something_had_no_room(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(outlet, "PUSH_WITHIN", 0.0)
+    linked = Linked()
+    linked.outlet.release()
+    linked.outlet.push_all()
+    assert capsys.readouterr().err == ""
+    for seq in range(100):  # more than the ring holds, and nobody reads it
+        linked.outlet.message(FAST, entry(FAST, 10 * seq, seq))
+    linked.outlet.flush_all()
+    linked.outlet.push_all()
+    assert "what this process sent last is lost" in capsys.readouterr().err
