@@ -30,8 +30,12 @@ def blueprint_rows(path: Path) -> list[Row]:
 
 
 def at(found: list[Row], entity: str, component: str) -> list[Row]:
-    """The rows of one component of one entity, in file order."""
-    return [row for row in found if row.entity == entity and row.component == component]
+    """The rows of one component of one entity, the static ones first, then by stamp.
+
+    Chunks of an entity that were flushed together lie in a file in any order.
+    """
+    those = (row for row in found if row.entity == entity and row.component == component)
+    return sorted(those, key=lambda row: (row.stamp is not None, row.stamp or 0))
 
 
 def _rows(chunk: Any) -> Iterator[Row]:
