@@ -120,8 +120,9 @@ class Patience:
     cannot be late. A static stream is waited for without a limit, since nothing takes its place.
     """
 
-    def __init__(self, wait: Mapping[str, int | None], clock: Clock, event_clock: EventClock) -> None:
-        self.wait, self.clock, self.event_clock = wait, clock, event_clock
+    def __init__(self, wait: Mapping[str, int | None], clock: Clock, until: Callable[[int], int]) -> None:
+        self.wait, self.clock = wait, clock
+        self._until = until  # event time is a stamp: how long that takes, ns
         self._stamp = NEVER
         self._since = 0.0
 
@@ -142,5 +143,5 @@ class Patience:
 
     def _left(self, stamp: int, budget: int) -> float:
         since_asked = self._since + budget * 1e-9 - self.clock()
-        since_stamp = (stamp + budget - self.event_clock()) * 1e-9
+        since_stamp = self._until(stamp + budget) * 1e-9
         return max(since_asked, since_stamp)

@@ -78,7 +78,7 @@ class LiveRunner(OperatorRunner):
         self.queue = AdmissionQueue(node.live.queue, node.live.size, triggers, self._log)
         clock = clock or time.monotonic
         self._time = EventTime(event_clock)
-        self.patience = Patience(node.live.wait, clock, self._time.now)
+        self.patience = Patience(node.live.wait, clock, self._time.until)
         self.restarts = Restarts(node.live.restart, clock)
         self._timeouts: Counter[str] = Counter()
         self._refused: Counter[str] = Counter()

@@ -52,7 +52,7 @@ def check(scenario: Scenario, folder: Path, *, replay: bool = True) -> Result:
     path = folder / "run.mcap"
     path.unlink(missing_ok=True)
     graph = scenario.load()
-    outcome = simulate(_plan(scenario, graph, path), scenario.machine, scenario.happenings)
+    outcome = simulate(_plan(scenario, graph, path), scenario.machine, scenario.happenings, limit=scenario.limit)
     if outcome.failure is not None and not scenario.may_fail:
         raise Violation(f"the run failed: {outcome.failure}\n{outcome.failure.details}")
     try:
@@ -298,7 +298,7 @@ def _replay(scenario: Scenario, path: Path, number: int) -> RunReport:
     placement: Any = "process_each" if (scenario.placement == "one_process") == (number == 1) else "one_process"
     plan = RunPlan(graph, placement=placement, log=log, window=(scenario.window, 1 << 20), stall_timeout=TIMEOUT)
     machine = replace(Machine(scenario.seed + 7919 * number), preempt=0.05)
-    outcome = simulate(plan, machine, mode="replay")
+    outcome = simulate(plan, machine, mode="replay", limit=scenario.limit)
     if outcome.report is None:
         raise Violation(f"a replay failed: {outcome.failure}\n{outcome.failure and outcome.failure.details}")
     return outcome.report

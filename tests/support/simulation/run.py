@@ -22,7 +22,7 @@ from simulation.processes import SUPERVISOR, Nursery
 from simulation.world import Process, Violation, World
 
 LIMIT = 200.0
-"""Simulated seconds after which a run hangs: far above the sum of all timeouts."""
+"""Simulated seconds after which a run hangs: far above the sum of all timeouts, and of what work takes."""
 MEGABYTES = 50_000_000
 
 
@@ -74,21 +74,30 @@ class Outcome:
     disk_full: bool = False
 
 
-def simulate(plan: RunPlan, machine_: Machine, happenings: Sequence[Happening] = (), *, mode: str = "run") -> Outcome:
-    """Runs a plan to its end. Raises `Violation` when it never comes to one."""
-    return Simulation(plan, machine_, happenings, mode).run()
+def simulate(
+    plan: RunPlan,
+    machine_: Machine,
+    happenings: Sequence[Happening] = (),
+    *,
+    mode: str = "run",
+    limit: float = LIMIT,
+) -> Outcome:
+    """Runs a plan to its end. Raises `Violation` when it comes to none within `limit` s."""
+    return Simulation(plan, machine_, happenings, mode, limit).run()
 
 
 class Simulation:
     """A world with one run in it."""
 
-    def __init__(self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str) -> None:
+    def __init__(
+        self, plan: RunPlan, machine_: Machine, happenings: Sequence[Happening], mode: str, limit: float
+    ) -> None:
         self.world = World(machine_.seed, pace=machine_.pace, preempt=machine_.preempt)
         self.system = machine.System(self.world, socket_room=machine_.socket_room)
         self._ring_bytes = machine_.ring_bytes
         self.disk = Disk(self.world, room=machine_.room, slow=machine_.slow_disk)
         self.outcome = Outcome()
-        self._plan, self._happenings, self._mode = plan, happenings, mode
+        self._plan, self._happenings, self._mode, self._limit = plan, happenings, mode, limit
         self._supervisor: Supervisor | None = None
         self._lives: dict[str, int] = {}
 
@@ -118,7 +127,7 @@ class Simulation:
         process.on_line = lambda line: self.outcome.words.append(line)
         ended: list[bool] = []
         self.world.start("main", process, lambda: self._supervise(ended))
-        self.world.run(lambda: bool(ended), LIMIT)
+        self.world.run(lambda: bool(ended), self._limit)
 
     def _released(self, *_: Any, **__: Any) -> Any:
         """The graph is announced: its sources are released."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from dataflow.chaos.plan import Fault
 from dataflow.graph import Graph, load_text
 from dataflow.graph.model import Placement
-from simulation.run import Happening, Machine
+from simulation.run import LIMIT, Happening, Machine
 
 _USE = "use: simulation.operators"
 _SOURCE = f"{_USE}:Counter, params: {{count: COUNT, period: PERIOD, work: READING}}"
@@ -48,6 +48,8 @@ TICKS = f"""
 """A graph of which every step makes many messages, more than what keeps its source from running ahead knows of: those
 between two processes can become too many."""
 TICKING = "ticks"
+TICK = 250e-6
+"""Its timer's period, s."""
 _RESTART = "restart: {max: 5, backoff: 10ms}"
 POLICIES = (
     "",
@@ -103,6 +105,12 @@ class Scenario:
         ends = any(h.kind.startswith("kill") or h.fields.get("span", 0) > PATIENCE for h in self.happenings)
         ends = ends or kinds.count("stop") > 1 or ("deadline" in self.policy and {"freeze", "stop"} <= set(kinds))
         return ends or self.machine.room is not None or any(f.kind in ("raise", "hang") for f in self.faults)
+
+    @property
+    def limit(self) -> float:
+        """Simulated seconds after which the run hangs: ticks that came due during a freeze are all made up for."""
+        spans = sum(min(h.fields["span"], TIMEOUT) for h in self.happenings if h.kind == "freeze")
+        return LIMIT + (spans / TICK * self.work if self.graph == TICKING else 0.0)
 
     def describe(self) -> str:
         """Tells what is run, and what happens, one line each."""
