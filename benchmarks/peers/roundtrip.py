@@ -47,7 +47,11 @@ def dora(peers: Path) -> Callable[[int, int], list[float]]:
     def run(size: int, count: int) -> list[float]:
         path = f"{peers / 'bin'}{os.pathsep}{os.environ['PATH']}"
         output = finished(
-            [str(peers / "bin" / "dora"), "run", str(HERE / "dora.yaml")], PATH=path, BYTES=str(size), COUNT=str(count)
+            [str(peers / "bin" / "dora"), "run", str(HERE / "dora.yaml")],
+            PATH=path,
+            VIRTUAL_ENV=str(peers),  # or dora starts its nodes by the `.venv` of this checkout, if there is one
+            BYTES=str(size),
+            COUNT=str(count),
         )
         return parsed(output.split("TOOK ", 1)[-1].splitlines()[0])
 
