@@ -110,6 +110,8 @@ def test_looking_at_a_recording_imports_none_of_its_modules(made: tuple[Path, Pa
         ["info", recording],
         ["diff", recording, recording],
         ["latency", recording],
+        ["lint", recording],
+        ["convert", recording, tmp_path / "again.mcap", "--to", "mcap"],
         ["view", recording, "--to", saved],
     ):
         told = run(tmp_path, *words)
