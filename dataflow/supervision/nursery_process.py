@@ -35,7 +35,7 @@ MOST_DESCRIPTORS = 253
 MORE, SPAWN, ENVIRONMENT = b"+", b"s", b"e"
 """A request: descriptors, of which more follow; the last ones for a process that is to be started; a file with the
 environment of the processes to come."""
-PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main", "speech"))
+PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "live_sink", "recorder", "main", "speech"))
 
 _PR_SET_CHILD_SUBREAPER = 36
 
