@@ -25,6 +25,7 @@ from typing import Any
 import msgpack
 import psutil
 
+from dataflow.firing.threads import take_over
 from dataflow.process.polling import readable
 
 LEAVE_WITHIN = 12.0
@@ -104,11 +105,7 @@ def _take_environment(descriptor: int) -> None:
     """Takes over the environment in a file, as if this process had been started with it: PYTHONPATH, too."""
     with open(descriptor, "rb") as file:
         file.seek(0)
-        environment = msgpack.unpackb(file.read(), raw=True)
-    os.environb.clear()
-    os.environb.update(environment)
-    first = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    sys.path[:] = [*first, *(path for path in sys.path if path not in first)]
+        take_over(msgpack.unpackb(file.read(), raw=True))
 
 
 def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: int) -> None:
