@@ -30,7 +30,7 @@ PRELOAD = "dataflow.verification.part"
 _PR_SET_PDEATHSIG = 1
 
 Slot = tuple[int, ...]
-"""What a parent hands down for one worker: the descriptors of its channel, of the letter, the board, and its output."""
+"""Descriptors that a parent hands down for one worker: its channel, the letter, the board, its output."""
 
 
 def main(slots: Sequence[Slot]) -> int:
