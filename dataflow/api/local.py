@@ -173,7 +173,7 @@ class LocalRun:
                 make_here(node, self.graph, self._config, self._emitter, self._runners)
         log = make_log(self.graph, self._config, self._emitter)
         if log is not None:
-            self._feeding.feeds.append(log)
+            self._feeding.play_back(log)
 
     def _work(self, watch: Watch | None) -> None:
         """Runs what is decided, then reads the next step of the feeds, until nothing is left of either."""
@@ -199,7 +199,7 @@ class LocalRun:
 
     def _close(self) -> None:
         """Closes every operator; the first error is raised when all are closed."""
-        failures = self._runners.close(but=(), live=False)
+        failures = self._runners.close(but=())
         for log in self._feeding.logs:
             log.close()
         if failures:

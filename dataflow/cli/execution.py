@@ -16,8 +16,7 @@ from dataflow.cli.output import INTERRUPTED, err, fail, out, print_json, say, si
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
-    from dataflow.supervision.report import RunReport
-    from dataflow.supervision.run import Watch
+    from dataflow.supervision.report import RunReport, Watch
 
 
 @dataclass(frozen=True, slots=True)

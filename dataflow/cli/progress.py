@@ -14,8 +14,7 @@ from rich.text import Text
 
 from dataflow.cli.output import count, seconds
 from dataflow.cli.quantities import speed_text
-from dataflow.supervision.report import OperatorCounts, Status
-from dataflow.supervision.run import Watch
+from dataflow.supervision.report import OperatorCounts, Status, Watch
 from dataflow.sync import FOREVER, NEVER
 
 NAMED = 3

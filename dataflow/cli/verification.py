@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -144,8 +145,7 @@ def verify(
       dataflow verify runs/ --junit verify.xml
       dataflow verify runs/ --baseline runs/accepted.json --accept
     """
-    from dataflow.graph import load_graph
-    from dataflow.verification.gate import Baseline, BaselineError, recordings_in
+    from dataflow.verification.started import early_workers
 
     with friendly_errors():
         if one_process and process_each:
@@ -176,25 +176,30 @@ def verify(
             output_file(junit, ".xml", overwrite=True, option="--junit")
         if baseline is not None:
             output_file(baseline, ".json", overwrite=True, option="--baseline")
-        try:
-            known = None if baseline is None else Baseline.load(baseline)
-        except BaselineError as error:
-            raise fail(str(error)) from None
-        find_modules_in(path)
-        loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
-        options: dict[str, Any] = {
-            "graph": loaded,
-            "first": first,
-            "only": only,
-            "tolerance": tolerance,
-            "start": start,
-            "jobs": 1 if one_process else jobs,
-        }
-        single = len(recordings) == 1 and not recordings[0].is_dir()
-        checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)
-        _report(checked, single=single, json=json, junit=junit)
-        if known is not None:
-            _mind_baseline(known, checked, accept=accept, whole=not single)
+        with early_workers(1 if one_process else jobs) as early:  # while this process imports what it needs itself
+            from dataflow.graph import load_graph
+            from dataflow.verification.gate import Baseline, BaselineError, recordings_in
+
+            try:
+                known = None if baseline is None else Baseline.load(baseline)
+            except BaselineError as error:
+                raise fail(str(error)) from None
+            find_modules_in(path)
+            loaded = None if graph is None else load_graph(graph_file(graph), settings=settings or ())
+            options: dict[str, Any] = {
+                "early": early,
+                "graph": loaded,
+                "first": first,
+                "only": only,
+                "tolerance": tolerance,
+                "start": start,
+                "jobs": 1 if one_process else jobs,
+            }
+            single = len(recordings) == 1 and not recordings[0].is_dir()
+            checked = _check(recordings_in(recordings), known, options, quiet=quiet, single=single)
+            _report(checked, single=single, json=json, junit=junit)
+            if known is not None:
+                _mind_baseline(known, checked, accept=accept, whole=not single)
     raise typer.Exit(_exit_code(checked, known if accept else None))
 
 
@@ -217,8 +222,11 @@ def _check(
 
 
 def _verifier(options: dict[str, Any], *, quiet: bool) -> Callable[[Path], VerifyReport]:
-    from dataflow.cli.progress import RunDisplay, shown
     from dataflow.verification.verify import verify as verify_recording
+
+    if quiet:  # nothing is shown: what would show it is not imported
+        return partial(verify_recording, **options)
+    from dataflow.cli.progress import RunDisplay, shown
 
     def verifier(path: Path) -> VerifyReport:
         with shown(err, RunDisplay(err), quiet=quiet) as watch:

@@ -85,6 +85,10 @@ class Runner:
         """
         raise ParameterError(f"the parameters of {self.node.name!r} cannot change here")
 
+    def close(self) -> None:
+        """Closes the operator. Raises what that raises."""
+        self.operator.close()
+
     def resume(self, incarnation: int, last: Mapping[str, int], changed: Mapping[str, Any]) -> None:
         """Takes the place of an operator whose process died; to be called before `setup()`."""
         raise NotImplementedError

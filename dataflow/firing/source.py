@@ -251,6 +251,13 @@ class SourceRunner:
             self.records.add("finish", self.last, time.time_ns(), outputs=none, detail=self._take_refused())
             self.ports.end(None if self.last == NEVER else self.last, reason)
 
+    def close(self) -> None:
+        """Closes the source, and before that a stream that was not read to its end; one that is read by a thread of
+        its own is that thread's to end. Raises what that raises."""
+        if not self._live:
+            self.close_stream()
+        self.operator.close()
+
     def close_stream(self) -> None:
         """Ends `stream()` where it stands, so that its `finally` runs; on the thread that reads it."""
         close = getattr(self._steps, "close", None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
@@ -34,6 +34,15 @@ def environment(threads: int) -> dict[str, str]:
         "PYTHONHASHSEED": "0",
         "DATAFLOW_THREADS": str(threads),
     }
+
+
+def take_over(environment: Mapping[bytes, bytes]) -> None:
+    """Takes an environment as if this process had been started with it, the path of modules included; what was read of
+    the old one stays as it is."""
+    os.environb.clear()
+    os.environb.update(environment)
+    first = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    sys.path[:] = [*first, *(path for path in sys.path if path not in first)]
 
 
 _limit: int | None = None

@@ -17,6 +17,8 @@ class Feeding:
 
     def __init__(self, window: Window, pace: Pace, *, paused: bool = False, speed: float | None = None) -> None:
         self.feeds: list[Feed] = []
+        self.logs: list[LogFeed] = []
+        """The recordings among the feeds."""
         self.playback = Playback(paused=paused, speed=speed)
         self._window, self._pace = window, pace
         self._since_promise = 0
@@ -30,10 +32,10 @@ class Feeding:
         """Tells whether a step waits for room in the window."""
         return self._window.full and not self.ended
 
-    @property
-    def logs(self) -> list[LogFeed]:
-        """The recordings among the feeds."""
-        return [feed for feed in self.feeds if isinstance(feed, LogFeed)]
+    def play_back(self, log: LogFeed) -> None:
+        """Takes a recording among the feeds."""
+        self.feeds.append(log)
+        self.logs.append(log)
 
     def first_stamps(self) -> list[int]:
         """The stamps that the feeds begin with."""

@@ -11,6 +11,7 @@ from typing import Any
 
 from dataflow.process.channel import Channel
 from dataflow.process.complaints import Complaints
+from dataflow.process.losses import NoLoss
 from dataflow.process.stream_order import StreamOrder
 from dataflow.transport import DecodeError, Envelope, Kind, decode
 
@@ -18,26 +19,21 @@ Deliver = Callable[[str, Envelope], None]
 """Takes the next envelope of a stream."""
 
 
-class StreamDamaged(RuntimeError):
-    """Messages of a stream were lost where none may be."""
-
-
 class Inlet:
     """Takes payloads by stream, and delivers the envelopes that count, in order."""
 
     def __init__(
         self,
-        label: str,
         channel: Channel,
         deliver: Deliver,
         *,
         static: Collection[str],
-        live: bool,
+        losses: NoLoss,
         from_start: bool = False,
         complaints: Complaints | None = None,
     ) -> None:
         """`from_start`: this process takes its streams from their first message on, so one that is missing was lost."""
-        self.label, self.live = label, live
+        self._losses = losses
         self._first = (0, 0) if from_start else None
         self.received = 0
         """Envelopes that counted, for the proof of quiescence."""
@@ -49,7 +45,7 @@ class Inlet:
         self._probed: set[str] = set()
 
     def take(self, stream: str, payload: Any) -> None:
-        """Takes what arrived on a stream's key. Raises `StreamDamaged` for a gap, unless the run is live."""
+        """Takes what arrived on a stream's key. Raises `StreamDamaged` for a gap, where nothing may be lost."""
         try:
             envelope = decode(payload)
         except DecodeError as error:  # from outside: of our own, the next number would show the gap
@@ -111,10 +107,10 @@ class Inlet:
     def _take_in_order(self, stream: str, envelope: Envelope) -> None:
         order = self._orders.get(stream) or self._orders.setdefault(stream, StreamOrder(self._first))
         verdict = order.take(envelope)
-        if verdict.damaged and not self.live:
-            raise StreamDamaged(f"stream {stream!r} on its way to process {self.label!r} {verdict.damaged}")
+        if verdict.damaged:
+            self._losses.damaged(stream, verdict.damaged)
         if verdict.gap is not None:
-            self._lost(stream, *verdict.gap)
+            self._losses.lost(stream, *verdict.gap)
         if verdict.repeats:
             self.received += 1
         elif verdict.taken is None:
@@ -122,15 +118,6 @@ class Inlet:
         else:
             self.received += 1
             self._deliver(stream, verdict.taken)
-
-    def _lost(self, stream: str, first: int, following: int) -> None:
-        """Messages were lost: to a link that broke, or before this process was there."""
-        if not self.live:
-            raise StreamDamaged(
-                f"stream {stream!r} lost messages on its way to process {self.label!r}: "
-                f"number {first} was due, {following} came"
-            )
-        self._channel.send("gap", stream=stream, first=first, following=following)
 
 
 def _described(envelope: Envelope) -> str:

@@ -51,10 +51,12 @@ def _make(
 ) -> Any:
     """Makes the process that the supervisor asks for: "operators" runs operators, "sink" takes whole streams."""
     if kind == "sink":
+        from dataflow.process.live_sink import LiveSinkProcess
         from dataflow.process.sink import SinkConfig, SinkProcess
 
         sink = SinkConfig(**config)
-        return SinkProcess(sink, channel, inbox, _recorder if sink.kind == "record" else _viewer_file)
+        make_sink = _recorder if sink.kind == "record" else _viewer_file
+        return (LiveSinkProcess if sink.live else SinkProcess)(sink, channel, inbox, make_sink)
     from dataflow.process.config import ProcessConfig
     from dataflow.process.operator_process import OperatorProcess
 

@@ -43,7 +43,7 @@ class Making:
                 raise OperatorFailure(name, "construction", error) from error
         log = make_log(self._graph, self._config, self._outlet)
         if log is not None:
-            self._feeding.feeds.append(log)
+            self._feeding.play_back(log)
 
     def _make(self, node: Node) -> None:
         if node.source:

@@ -8,6 +8,7 @@ of a live source may emit a step itself, so that the main thread need not be wok
 from __future__ import annotations
 
 import gc
+import math
 import queue
 import sys
 import time
@@ -22,8 +23,9 @@ from dataflow.process.config import ProcessConfig
 from dataflow.process.feeding import Feeding
 from dataflow.process.handed import BACKLOG
 from dataflow.process.inbox import Inbox
-from dataflow.process.inlet import Inlet, StreamDamaged
+from dataflow.process.inlet import Inlet
 from dataflow.process.live_sources import LiveSources, Step
+from dataflow.process.losses import StreamDamaged, losses_of
 from dataflow.process.making import Making
 from dataflow.process.network import network_config
 from dataflow.process.orders import Orders
@@ -34,7 +36,7 @@ from dataflow.process.requests import Requests
 from dataflow.process.runners import Runners, give, open_box, statics_of
 from dataflow.process.standing import Standing
 from dataflow.process.watchdog import Watchdog
-from dataflow.sync import FOREVER, StreamOrderError
+from dataflow.sync import StreamOrderError
 from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
 from dataflow.transport.fanout import POOL_BYTES
 
@@ -77,12 +79,12 @@ class OperatorProcess:
             resumed=config.resume is not None,
             in_its_place=self._in_place_of_main,
         )
+        self._losses = losses_of(config.label, channel, live=config.live)
         self.inlet = Inlet(
-            config.label,
             channel,
             self._deliver,
             static=self.static,
-            live=config.live,
+            losses=self._losses,
             from_start=config.live and config.resume is None,
         )
         before = {name: config.resumed(name) for name in config.resume or ()}
@@ -94,7 +96,6 @@ class OperatorProcess:
             fanout=Fanout(outgoing, pool_bytes=pool_bytes, gives_way=config.live),
             namespace=self.graph.namespace,
             static=self.static,
-            live=config.live,
             box=None if box is None else open_box(box, config, self.graph),
             firings=config.firings,
             incarnations=incarnations_of(before, outputs),
@@ -133,6 +134,7 @@ class OperatorProcess:
             self.progress,
             lambda: self.bus.counters(),  # it is opened later
         )
+        self._take_within = math.inf if config.live else TAKE_WITHIN
         self._watch: Watchdog | None = None
         self._running = False
 
@@ -246,7 +248,7 @@ class OperatorProcess:
         if self._watch is not None:
             self._watch.stop()
         reading, failures = self.live.await_readers()
-        failures += self.runners.close(but=reading, live=self.config.live)
+        failures += self.runners.close(but=reading)
         for log in self.feeding.logs:
             log.close()
         self.taps.close()
@@ -286,8 +288,8 @@ class OperatorProcess:
         self._handle(item)
         if not more:
             return
-        until = FOREVER if self.config.live else time.monotonic() + TAKE_WITHIN
-        while more and (until == FOREVER or time.monotonic() < until):
+        until = time.monotonic() + self._take_within
+        while more and time.monotonic() < until:
             self._handle(inbox.get_nowait())
             more -= 1
 
@@ -307,14 +309,12 @@ class OperatorProcess:
             self.requests.answer_playback(item[2])
 
     def _deliver(self, stream: str, envelope: Envelope) -> None:
-        """Gives an envelope to the operators that take its stream. What contradicts what they have seen is refused, in
-        a live run."""
+        """Gives an envelope to the operators that take its stream; what contradicts what they have seen is refused."""
         for runner in self.runners.consumers.get(stream, ()):
             try:
                 give(runner, stream, envelope)
             except StreamOrderError as error:
-                if not self.config.live:
-                    raise
+                self._losses.contradicted(error)
                 self.inlet.refuse(stream, str(error))
 
     # Work
@@ -341,7 +341,7 @@ class OperatorProcess:
 
     def _step_all(self) -> bool:
         """One step of every operator that has something to do."""
-        if self.config.live and not self.orders.released:
+        if not self.orders.released:
             return False  # a restarted process is sent messages before it is told what time it is
         return self.runners.ready.step()
 

@@ -67,10 +67,10 @@ class Outlet:
     """The emitter of all operators of a process: to local aligners by reference, to other processes and taps as
     envelopes.
 
-    `fanout`: the links to the others. `live`: the supervisor is told that a stream has ended. `box`: what keeps the
-    latest firing records should this process die. `firings`: whether a recorder takes the firing records.
-    `incarnations`: by stream, the ones that begin above 0. `left`: by stream, the place of the message that the process
-    before this one would have made next: who lacks messages before it has lost them.
+    `fanout`: the links to the others. `box`: what keeps the latest firing records should this process die. `firings`:
+    whether a recorder takes the firing records. `incarnations`: by stream, the ones that begin above 0. `left`: by
+    stream, the place of the message that the process before this one would have made next: who lacks messages before
+    it has lost them.
     """
 
     def __init__(
@@ -81,7 +81,6 @@ class Outlet:
         fanout: Fanout,
         namespace: str,
         static: frozenset[str],
-        live: bool,
         box: BlackBox | None,
         firings: bool,
         incarnations: Mapping[str, int],
@@ -90,7 +89,7 @@ class Outlet:
         self.sent = 0
         self.recent = RecentFirings()
         self._channel, self._consumers, self._namespace, self._static = channel, consumers, namespace, static
-        self._live, self._box, self._firings = live, box, firings
+        self._box, self._firings = box, firings
         self._network: Network | None = None
         self._fanout = fanout
         self._once: dict[str, list[Envelope]] = {}
@@ -251,8 +250,7 @@ class Outlet:
             self._once.setdefault(stream, []).append(over)
             self._send(stream, over, droppable=False)
             return
-        if self._live:
-            self._channel.send("stream_ended", stream=stream, reason=reason)
+        self._channel.send("stream_ended", stream=stream, reason=reason)
         over = self._envelope(Kind.END, stream, NEVER if final_stamp is None else final_stamp, reason)
         self._send(stream, over, droppable=False)
 

@@ -53,8 +53,9 @@ class Requests:
         """Declares what is answered."""
         for name in self._config.nodes:
             bus.serve(runtime_key(namespace, "param", name), _to_inbox(inbox, name))
-            if isinstance(maker := self._runners[name], SourceRunner) and isinstance(maker.source, Remote):
-                bus.serve(runtime_key(namespace, "pub", name), partial(self.answer_publication, maker))
+        for maker in self._runners.sources:
+            if isinstance(maker.source, Remote):
+                bus.serve(runtime_key(namespace, "pub", maker.node.name), partial(self.answer_publication, maker))
         bus.serve(runtime_key(namespace, "status", self._config.label), self._answer_status)
         bus.serve(runtime_key(namespace, "trigger", self._config.label), self._answer_trigger)
         if self._feeding.feeds or self._runners.sources:
@@ -89,7 +90,7 @@ class Requests:
             feeding = self._feeding
             try:
                 asked = msgpack.unpackb(query.payload.to_bytes(), raw=False) if query.payload is not None else {}
-                if self._config.live:
+                if not feeding.feeds:
                     raise ValueError(LIVE)
                 if "action" in asked:
                     speed = asked.get("speed")
@@ -163,7 +164,7 @@ class Requests:
                 "counts": self._progress.counted,
                 "waits": self._progress.waited,
                 "behind": self._progress.behind,
-                "restarts": {maker.node.name: self._restarts_of(maker) for maker in self._runners.all},
+                "restarts": self._restarts(),
                 "ended": [maker.node.name for maker in self._runners.all if maker.ended],
             }
             if _asks_for_firings(query):
@@ -181,10 +182,11 @@ class Requests:
                 answer = {"ok": False, "error": str(error)}
             query.reply(query.key_expr, msgpack.packb(answer))
 
-    def _restarts_of(self, maker: Maker) -> int:
-        """Tells how often an operator was restarted, by this process and in the processes before it."""
-        here = self._live.restarts_of(maker.node.name) if isinstance(maker, SourceRunner) else maker.restarted
-        return self._config.resumed(maker.node.name).restarts + here
+    def _restarts(self) -> dict[str, int]:
+        """Tells how often each operator was restarted, by this process and in the processes before it."""
+        here = {maker.node.name: self._live.restarts_of(maker.node.name) for maker in self._runners.sources}
+        here |= {runner.node.name: runner.restarted for runner in self._runners.operators}
+        return {name: self._config.resumed(name).restarts + times for name, times in here.items()}
 
 
 def _asks_for_firings(query: Any) -> bool:

@@ -54,17 +54,14 @@ class Runners:
         for stream in {s for streams in runner.node.inputs.values() for s in streams}:
             self.consumers.setdefault(stream, []).append(runner)
 
-    def close(self, *, but: Container[str], live: bool) -> list[OperatorFailure]:
-        """Closes every operator but those named; returns what went wrong. A stream that was not read to its end is
-        closed first, in a run that is not live."""
+    def close(self, *, but: Container[str]) -> list[OperatorFailure]:
+        """Closes every operator but those named; returns what went wrong."""
         failures = []
         for maker in self.all:
             if maker.node.name in but:
                 continue
             try:
-                if isinstance(maker, SourceRunner) and not live:
-                    maker.close_stream()
-                maker.operator.close()
+                maker.close()
             except OperatorFailure as failure:
                 failures.append(failure)
             except Exception as error:

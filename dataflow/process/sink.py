@@ -22,7 +22,7 @@ from dataflow.names import firings_key
 from dataflow.process.channel import Channel, ChannelClosed
 from dataflow.process.inbox import Inbox
 from dataflow.process.inlet import Inlet
-from dataflow.process.priority import let_others_begin
+from dataflow.process.losses import losses_of
 from dataflow.recording import LogLine
 from dataflow.records.firing import Batch, FiringRecordError, consecutive, decode_batch, encode_batch
 from dataflow.sync import FOREVER, NEVER
@@ -107,9 +107,8 @@ class SinkProcess:
         """Counts how often streams were said to begin anew: the process that makes them was started again."""
         self.sink: StreamSink | None = None
         static = [s for s in config.streams if self.graph.streams[s].static]
-        self.inlet = Inlet(
-            config.label, channel, self._deliver, static=static, live=config.live, from_start=config.live
-        )
+        losses = losses_of(config.label, channel, live=config.live)
+        self.inlet = Inlet(channel, self._deliver, static=static, losses=losses, from_start=config.live)
         self.batches = 0
         """Batches of firing records that were taken."""
         self.written = 0
@@ -129,8 +128,6 @@ class SinkProcess:
     def open(self) -> None:
         self.channel.send("joined")
         self.sink = self.make_sink(self.config, self.graph)
-        if self.config.live:
-            let_others_begin()
         self.channel.send("ready", first=None, steps=None)
 
     def run(self) -> None:
@@ -231,10 +228,10 @@ class SinkProcess:
             self._taken[operator] = stamp
 
     def _report(self, now: float) -> None:
-        """Tells how far it is: up to which stamp in all streams, or, in a live run, of each source it takes from."""
+        """Tells how far it is."""
         dynamic = [f for s, f in self.frontiers.items() if not self.graph.streams[s].static]
         self._done = min(dynamic, default=FOREVER)
-        done = dict(self._taken) if self.config.live else {self.config.label: self._done}
+        done = self._reached()
         self._report_due = now + REPORT_EVERY
         if done != self._told:
             self._told = done
@@ -243,6 +240,10 @@ class SinkProcess:
             self._ended = True
             report = {"counts": self._counts(), "transport": self.inbox.counters(), "expected": self._expected}
             self.channel.send("ended", report=report)
+
+    def _reached(self) -> dict[str, int]:
+        """The stamp up to which all streams were taken, under its own name."""
+        return {self.config.label: self._done}
 
     def _counts(self) -> dict[str, list[int]]:
         return {self.config.label: [0, self.written, 0, self._work.cpu_ns, self._done, self._work.wall_ns]}

@@ -25,6 +25,6 @@ class DamagedError(RecordingError):
 
     @classmethod
     def of(cls, path: Path, what: str) -> DamagedError:
-        error = cls(f"{path} is damaged: {what}; `mcap recover` may save what is left")
+        error = cls(f"{path} is damaged: {what}; `dataflow recover` may save what is left")
         error.what = visible(what)
         return error

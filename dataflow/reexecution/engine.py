@@ -190,7 +190,7 @@ class Recomputation:
         for name, runner in self.runners.items():
             if name != besides:
                 self._watcher.begins("close", name)
-                runner.operator.close()
+                runner.close()
 
     @property
     def reading_cpu_ns(self) -> int:

@@ -9,7 +9,6 @@ from typing import Any
 
 from dataflow.feeds.playable import PlayableStreams
 from dataflow.firing.seeding import version_of
-from dataflow.graph import load_bundle
 from dataflow.graph.model import Graph
 from dataflow.graph.sections import Network
 from dataflow.messages.base import message_type
@@ -45,6 +44,8 @@ def isolated(graph: Graph) -> Graph:
 
 def graph_as_recorded(recording: PlayableStreams) -> Graph:
     """Returns the graph that made a recording, as it is; its operators are imported. Raises as `recorded_graph`."""
+    from dataflow.graph import load_bundle  # workers are given a graph that is loaded already, and load none
+
     bundle = recording.metadata.get(GRAPH, {}).get("bundle")
     if bundle is None:
         raise ReplayError(f"{recording.path} does not hold the graph that made it: name one with --graph")

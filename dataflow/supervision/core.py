@@ -78,7 +78,7 @@ class Core:
             case StopAsked():
                 self._stop()
             case PlaybackAsked(action, steps, speed):
-                if self._closing is None and self.run.phase is not Phase.STARTING and not self.run.plan.live:
+                if self._closing is None and self.run.phase is not Phase.STARTING:
                     self.run.send_all("playback", action=action, steps=steps, speed=speed)
             case TriggerAsked(text):
                 if self._closing is None and self.run.phase is not Phase.STARTING:

@@ -25,6 +25,7 @@ from typing import Any
 import msgpack
 import psutil
 
+from dataflow.firing.threads import take_over
 from dataflow.process.polling import readable
 
 LEAVE_WITHIN = 12.0
@@ -35,7 +36,7 @@ MOST_DESCRIPTORS = 253
 MORE, SPAWN, ENVIRONMENT = b"+", b"s", b"e"
 """A request: descriptors, of which more follow; the last ones for a process that is to be started; a file with the
 environment of the processes to come."""
-PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "sink", "recorder", "main", "speech"))
+PRELOAD = tuple(f"dataflow.process.{name}" for name in ("operator_process", "live_sink", "recorder", "main", "speech"))
 
 _PR_SET_CHILD_SUBREAPER = 36
 
@@ -104,11 +105,7 @@ def _take_environment(descriptor: int) -> None:
     """Takes over the environment in a file, as if this process had been started with it: PYTHONPATH, too."""
     with open(descriptor, "rb") as file:
         file.seek(0)
-        environment = msgpack.unpackb(file.read(), raw=True)
-    os.environb.clear()
-    os.environb.update(environment)
-    first = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    sys.path[:] = [*first, *(path for path in sys.path if path not in first)]
+        take_over(msgpack.unpackb(file.read(), raw=True))
 
 
 def _ended(connection: socket.socket | None, children: dict[int, int], pidfd: int) -> None:

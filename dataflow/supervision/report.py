@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -66,6 +66,10 @@ class Status:
     @property
     def covered(self) -> int:
         return min((c.done for c in self.operators.values()), default=NEVER)
+
+
+Watch = Callable[[Status], None]
+"""Is shown how a run fares, a few times a second."""
 
 
 @dataclass(frozen=True, slots=True)

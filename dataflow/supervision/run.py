@@ -21,10 +21,9 @@ from dataflow.supervision.early import EarlyNursery
 from dataflow.supervision.interrupts import interrupts
 from dataflow.supervision.plan import RunPlan
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.report import RunReport, Status
+from dataflow.supervision.report import RunReport, Watch
 from dataflow.supervision.supervisor import Supervisor
 
-Watch = Callable[[Status], None]
 Controls = Callable[[Supervisor], AbstractContextManager[None]]
 """Steers a run while it lasts."""
 

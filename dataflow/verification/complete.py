@@ -26,7 +26,7 @@ from dataflow.records.reading import FiringLog
 from dataflow.reexecution.engine import Feeding, Recomputation
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
 from dataflow.supervision.replay import plan_replay
-from dataflow.supervision.run import Watch
+from dataflow.supervision.report import Watch
 from dataflow.sync import Entry
 from dataflow.verification.board import Board
 from dataflow.verification.choice import require_records

@@ -28,13 +28,15 @@ def read_letter(descriptor: int) -> dict[str, Any]:
     return values
 
 
+Records = str
+"""The path of the file with the firing records, for processes of this user."""
 Batches = Mapping[str, list[tuple[int, int]]]
 """Operator → (offset, length) of its batches in the file."""
 
 
 @contextmanager
-def shared_records(log: FiringLog) -> Iterator[tuple[int, Batches]]:
-    """An anonymous file with the firing records of a recording, for workers to inherit: (descriptor, what is where)."""
+def shared_records(log: FiringLog) -> Iterator[tuple[Records, Batches]]:
+    """An anonymous file with the firing records of a recording, which workers open: (its path, what is where)."""
     descriptor = os.memfd_create("firing records")
     try:
         batches: dict[str, list[tuple[int, int]]] = {}
@@ -44,14 +46,18 @@ def shared_records(log: FiringLog) -> Iterator[tuple[int, Batches]]:
                 _write(descriptor, memoryview(payload), end)
                 batches.setdefault(operator, []).append((end, len(payload)))
                 end += len(payload)
-        yield descriptor, batches
+        yield f"/proc/{os.getpid()}/fd/{descriptor}", batches
     finally:
         os.close(descriptor)
 
 
-def inherited_records(descriptor: int, batches: Batches, operators: Collection[str], origin: str) -> FiringLog:
+def records_of(records: Records, batches: Batches, operators: Collection[str], origin: str) -> FiringLog:
     """The firing records of some operators, out of the file that `shared_records` made. `origin`: the recording."""
-    found = {name: [_read(descriptor, at, size) for at, size in batches.get(name, ())] for name in operators}
+    descriptor = os.open(records, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        found = {name: [_read(descriptor, at, size) for at, size in batches.get(name, ())] for name in operators}
+    finally:
+        os.close(descriptor)
     return FiringLog(found, origin)
 
 

@@ -14,7 +14,7 @@ from dataflow.reexecution.engine import Feeding, Recomputation, plan_feeding
 from dataflow.sync import Entry
 from dataflow.verification.board import Board
 from dataflow.verification.compare import Comparer
-from dataflow.verification.letters import inherited_records
+from dataflow.verification.letters import records_of
 from dataflow.verification.stored import StoredCheck
 
 
@@ -96,7 +96,7 @@ def _records(request: Mapping[str, Any], graph: Graph, feeding: Feeding) -> Firi
     """The firing records of the operators, and of those that made what they take."""
     taken = {s for name in feeding.operators for given in graph.nodes[name].inputs.values() for s in given}
     makers = {graph.streams[stream].node for stream in taken.union(feeding.streams, feeding.besides)}
-    return inherited_records(request["records"], request["batches"], makers.union(feeding.operators), request["path"])
+    return records_of(request["records"], request["batches"], makers.union(feeding.operators), request["path"])
 
 
 def _checks(recording: Recording, graph: Graph, log: FiringLog, request: Mapping[str, Any]) -> dict[str, StoredCheck]:

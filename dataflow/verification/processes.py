@@ -8,28 +8,24 @@ from __future__ import annotations
 
 import os
 import signal
-import subprocess
-import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import Any, Self
 
 from dataflow.firing.threads import environment
-from dataflow.process.channel import Channel, ChannelClosed, ready
+from dataflow.process.channel import ChannelClosed, ready
 from dataflow.supervision.interrupts import interrupts
-from dataflow.supervision.report import OperatorCounts, RunFailed, Status
-from dataflow.supervision.run import Watch
+from dataflow.supervision.report import OperatorCounts, RunFailed, Status, Watch
 from dataflow.verification.board import Board
 from dataflow.verification.letters import read_letter, write_letter
+from dataflow.verification.started import LEAVE_WITHIN, EarlyWorkers, Started, as_bytes
 
 LOOK_EVERY = 0.1
 SHOW_EVERY = 0.2
-LEAVE_WITHIN = 10.0
 LAST_WORDS = 4000
 
 
@@ -52,14 +48,14 @@ def call_workers(
     calls: Sequence[Call],
     *,
     threads: int,
-    descriptors: Sequence[int] = (),
+    early: EarlyWorkers | None = None,
     stall_timeout: float = 120.0,
     locate: Locate = lambda call, operator, repeated: "a firing",
     watch: Watch | None = None,
 ) -> list[Any]:
     """The answers to `calls`, each from a process of its own.
 
-    `threads`: of numerical libraries, as in a run. `descriptors`: files that the workers inherit under the same number.
+    `threads`: of numerical libraries, as in a run. `early`: workers that were started before, to be taken first.
     `stall_timeout`: seconds allowed without a step of a worker. `watch` is given the status a few times a second.
     Raises `RunFailed` with the first that raises, dies or stalls; the others are then ended. Ctrl-C and SIGTERM end all
     of them, and raise a `RunFailed` that is `interrupted`.
@@ -70,8 +66,8 @@ def call_workers(
         stack.enter_context(interrupts(interrupted.set))
         workers: list[_Worker] = []
         for number, call in enumerate(calls, start=1):
-            words = stack.enter_context(tempfile.TemporaryFile())
-            workers.append(stack.enter_context(_Worker(number, call, threads, descriptors, locate, words)))
+            started = None if early is None else early.take(threads)
+            workers.append(stack.enter_context(_Worker(number, call, started, threads, locate)))
         shown = 0.0
         while left := [worker for worker in workers if not worker.answered]:
             for channel in ready([worker.channel for worker in left], LOOK_EVERY):
@@ -110,38 +106,26 @@ def _updated(status: Status, workers: Sequence[_Worker]) -> Status:
 class _Worker:
     """One worker process, as its parent sees it."""
 
-    def __init__(
-        self,
-        number: int,
-        call: Call,
-        threads: int,
-        descriptors: Sequence[int],
-        locate: Locate,
-        words: IO[bytes],
-    ) -> None:
-        self.number, self.call, self._locate, self._words = number, call, locate, words
+    def __init__(self, number: int, call: Call, started: Started | None, threads: int, locate: Locate) -> None:
+        """`started`: a process that waits already."""
+        if started is None:
+            started = Started()
+            started.spawn(threads)
+        self.number, self.call, self._locate, self._started = number, call, locate, started
         self.answered, self.answer = False, None
-        self._letter = os.memfd_create("call")
+        self._letter, self.channel, self._words = started.letter, started.channel, started.words
+        self.board = Board(started.board, call.operators)
         write_letter(
             self._letter,
-            {"function": call.function, "request": dict(call.request), "operators": list(call.operators)},
+            {
+                "function": call.function,
+                "request": dict(call.request),
+                "operators": list(call.operators),
+                "environment": as_bytes(environment(threads)),
+            },
         )
-        self.channel, theirs = Channel.pair()
-        shared = os.memfd_create("board")
-        try:
-            self.board = Board(shared, call.operators)
-            self._process = subprocess.Popen(
-                [sys.executable, "-P", "-m", "dataflow.verification.worker", *map(str, (theirs, self._letter, shared))],
-                pass_fds=(theirs, self._letter, shared, *descriptors),
-                env=environment(threads),
-                stdin=subprocess.DEVNULL,
-                stdout=words,
-                stderr=subprocess.STDOUT,
-                process_group=0,
-            )
-        finally:
-            os.close(theirs)  # the worker has its own; with ours open its death would go unseen
-            os.close(shared)
+        with suppress(ChannelClosed):  # it has died: its end is read, with its words
+            self.channel.send("go")
         self._steps, self._since = 0, time.monotonic()
 
     def hear(self) -> None:
@@ -150,6 +134,8 @@ class _Worker:
             kind, _ = self.channel.receive()
         except ChannelClosed:
             raise self._failed(self._end()) from None
+        if kind == "waiting":
+            return
         answer = read_letter(self._letter)
         if kind == "failed":
             raise RunFailed(answer["summary"], answer["traceback"], answer["operator"])
@@ -159,7 +145,7 @@ class _Worker:
         """The way in which the process ended, in words. It is not waited for yet: so its group keeps its number."""
         deadline = time.monotonic() + LEAVE_WITHIN
         while time.monotonic() < deadline:
-            found = os.waitid(os.P_PID, self._process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
+            found = os.waitid(os.P_PID, self._started.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG)
             if found is not None and found.si_code == os.CLD_EXITED:
                 return f"ended its process with code {found.si_status}"
             if found is not None:
@@ -196,10 +182,5 @@ class _Worker:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Ends the process, if it still runs, with everything that its operators have started."""
-        with suppress(ProcessLookupError, PermissionError):  # not waited for yet: nobody else can have its number
-            os.killpg(self._process.pid, signal.SIGKILL)
-        self._process.wait(timeout=LEAVE_WITHIN)
-        os.close(self._letter)
-        self.channel.close()
         self.board.close()
+        self._started.end()

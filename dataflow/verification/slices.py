@@ -51,21 +51,24 @@ def _only_calls(records: Sequence[FiringRecord]) -> bool:
 def shares(loads: Sequence[int], makers: Mapping[str, int], work: Mapping[str, int]) -> Mapping[str, list[Share]]:
     """Pours the `work` of divisible operators into parts that have `loads` already, so that they come out even.
 
-    `makers` is the work that comes with each slice of an operator: what makes its inputs.
+    `makers` is the work that comes with each slice of an operator: what makes its inputs. A part has one slice of an
+    operator at most.
     """
     filled = list(loads)
     level = (sum(loads) + sum(work.values()) + sum(makers[name] for name in work)) // len(loads)
     poured: dict[str, list[Share]] = {}
     for name, ns in work.items():
-        left = ns
+        left, given = ns, dict[int, int]()
         while left:
             part = filled.index(min(filled))
-            taken = min(left, max(LEAST_NS, level - filled[part] - makers[name]))
+            besides = 0 if part in given else makers[name]
+            taken = min(left, max(LEAST_NS, level - filled[part] - besides))
             if left - taken < LEAST_NS:
                 taken = left
-            poured.setdefault(name, []).append((part, taken))
-            filled[part] += taken + makers[name]
+            given[part] = given.get(part, 0) + taken
+            filled[part] += taken + besides
             left -= taken
+        poured[name] = list(given.items())
     return poured
 
 

@@ -21,8 +21,7 @@ from dataflow.records.firing import CALLS
 from dataflow.records.reading import FiringLog, beginning, whole
 from dataflow.reexecution.engine import plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError, recorded_graph
-from dataflow.supervision.report import OperatorCounts
-from dataflow.supervision.run import Watch
+from dataflow.supervision.report import OperatorCounts, Watch
 from dataflow.verification import part, partition, slices
 from dataflow.verification.choice import (
     accountable,
@@ -38,6 +37,7 @@ from dataflow.verification.ledger import Ledger, incomplete_streams, read_ledger
 from dataflow.verification.letters import shared_records
 from dataflow.verification.processes import Call, Locate, Workers, call_workers
 from dataflow.verification.report import StandIn, VerifyReport
+from dataflow.verification.started import EarlyWorkers
 from dataflow.verification.stored import StoredStream
 
 
@@ -78,6 +78,7 @@ def verify(
     stall_timeout: float = 120.0,
     watch: Watch | None = None,
     workers: Workers | None = None,
+    early: EarlyWorkers | None = None,
 ) -> VerifyReport:
     """Re-executes a recording by its firing records and compares.
 
@@ -89,7 +90,8 @@ def verify(
     `start` (seconds from the first message) begins in the middle: an operator takes up its last recorded state at or
     before that moment, one without state begins there, any other is repeated from its beginning.
     `jobs`: worker processes; by default one for each core that may be used, fewer where there is little to do.
-    `stall_timeout`: seconds allowed without progress. `workers`: what makes the calls, instead of processes.
+    `stall_timeout`: seconds allowed without progress. `workers`: what makes the calls, instead of processes;
+    `early`: processes that wait for calls already.
     Raises `ReplayError` when the recording does not hold what is needed, `RunFailed` when an operator cannot run.
     """
     began = time.monotonic()
@@ -98,14 +100,14 @@ def verify(
     if jobs is not None and jobs < 1:
         raise ReplayError(f"{jobs} jobs: expected 1 or more")
     workers = workers or call_workers
-    task = _prepare(path, graph, first, only, start, jobs)
+    task = _prepare(path, graph, first, only, start, jobs, early)
     options: dict[str, Any] = {"threads": task.graph.threads, "stall_timeout": stall_timeout, "watch": watch}
-    with shared_records(task.log) as (descriptor, batches):
-        options |= {"descriptors": (descriptor,), "locate": _locate(task)}
+    with shared_records(task.log) as (records, batches):
+        options |= {"early": early, "locate": _locate(task)}
         request = {
             "path": str(path),
             "graph": task.graph.to_json(),
-            "records": descriptor,
+            "records": records,
             "batches": batches,
             "begin": task.begin,
             "incomplete": sorted(task.incomplete),
@@ -141,9 +143,13 @@ def _prepare(
     only: Collection[str] | None,
     start: float | None,
     jobs: int | None,
+    early: EarlyWorkers | None,
 ) -> _Task:
     with Recording(path) as recording:
         played = graph or recorded_graph(recording)
+        if early is not None:
+            wanted = with_makers(recording.streams.keys(), played, chosen_operators(played, first, only))
+            early.foresee({played.nodes[name].use.partition(":")[0] for name in wanted})
         log = FiringLog.read(recording)
         told = [n for n in played.nodes if accountable(recording, played, log, n)]
         incomplete = incomplete_streams(recording, played, log, told)

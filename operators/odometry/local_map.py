@@ -36,9 +36,13 @@ class LocalMap:
         return [k for k in self.keyframes if k.segment != self.newest.segment]
 
     def add(self, keyframe: Keyframe) -> None:
+        """Remembers a keyframe. Older ones keep their grids alone: the planes that frames are compared with take five
+        times their memory, and are made anew of those few keyframes that are near again."""
         self.keyframes.append(keyframe)
         if len(self.keyframes) > self.capacity:
             del self.keyframes[self._redundant()]
+        for older in self.keyframes[:-RECENT]:
+            older.surface.let_go()
 
     def drop_newest_segment(self) -> None:
         """Forgets a segment that never found its place."""

@@ -117,6 +117,11 @@ class Surface:
         """The inverse depth (h + 2, w + 2) with a border of no patches."""
         return np.pad(self.inverse_depth, 1)
 
+    def let_go(self) -> None:
+        """Forgets what was made to compare with it; it is made anew when it is asked for."""
+        for name in ("bordered_planes", "bordered"):
+            self.__dict__.pop(name, None)
+
     @property
     def depth(self) -> Array32:
         """Depth of the patches (h, w), metres; 0 where there is none."""

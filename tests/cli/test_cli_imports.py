@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +46,11 @@ operators:
 """
 
 
-def run(folder: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    """The command as the console script runs it, in `folder`."""
+def run(folder: Path, *words: object, safe: Sequence[str] = ("-P",)) -> subprocess.CompletedProcess[str]:
+    """The command as the console script runs it, in `folder`; `safe`: what keeps Python from looking there first."""
     package = Path(__file__).resolve().parents[2]
     environment = {**os.environ, "PYTHONPATH": str(package)}
-    command = [sys.executable, "-P", "-m", "dataflow.cli.main", *map(str, words)]
+    command = [sys.executable, *safe, "-m", "dataflow.cli.main", *map(str, words)]
     return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=60)
 
 
@@ -69,8 +70,9 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def hijacking(folder: Path) -> Path:
-    """A folder with a file that bears the name of a standard module which everybody imports."""
-    (folder / "secrets.py").write_text("print('hijacked')\nraise RuntimeError('hijacked')\n")
+    """A folder with files that bear the names of modules which every command imports, at once and later."""
+    for name in ("typer", "secrets"):
+        (folder / f"{name}.py").write_text("print('hijacked')\nraise RuntimeError('hijacked')\n")
     return folder
 
 
@@ -84,6 +86,14 @@ def test_a_file_where_one_stands_replaces_no_module(made: tuple[Path, Path], tmp
         "list": [],
     }
     told = run(hijacking(tmp_path), command, *words.get(command, [graph]))
+
+    assert told.returncode == 0, told.stderr
+    assert "hijacked" not in told.stdout + told.stderr
+
+
+def test_nor_where_the_command_is_called_as_a_module(made: tuple[Path, Path], tmp_path: Path) -> None:
+    """Python puts the current folder first on the path then."""
+    told = run(hijacking(tmp_path), "info", made[1], safe=())
 
     assert told.returncode == 0, told.stderr
     assert "hijacked" not in told.stdout + told.stderr
@@ -110,6 +120,8 @@ def test_looking_at_a_recording_imports_none_of_its_modules(made: tuple[Path, Pa
         ["info", recording],
         ["diff", recording, recording],
         ["latency", recording],
+        ["lint", recording],
+        ["convert", recording, tmp_path / "again.mcap", "--to", "mcap"],
         ["view", recording, "--to", saved],
     ):
         told = run(tmp_path, *words)

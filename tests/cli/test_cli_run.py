@@ -176,7 +176,7 @@ def test_a_damaged_recording_is_named_in_a_line_and_the_traceback_comes_when_ask
 
     assert told.exit_code == 1
     assert "damaged.mcap is damaged: chunk" in told.stderr
-    assert "`mcap recover` may save what is left" in told.stderr
+    assert "`dataflow recover` may save what is left" in told.stderr
     assert ("Traceback" in told.stderr) == (asked == "1")
     assert asked == "1" or told.stderr.splitlines()[1:] == ["where in the code: run it again with DATAFLOW_TRACEBACK=1"]
 

@@ -8,7 +8,8 @@ import pytest
 from process_doubles import STREAM, RecordedChannel, end, frontier, message
 
 from dataflow.process.complaints import Complaints
-from dataflow.process.inlet import Inlet, StreamDamaged
+from dataflow.process.inlet import Inlet
+from dataflow.process.losses import StreamDamaged, losses_of
 from dataflow.sync import FOREVER
 from dataflow.transport import Envelope, Kind, encode
 
@@ -22,11 +23,10 @@ class Inflow:
         self.channel = RecordedChannel()
         self.now = 0.0
         self.inlet = Inlet(
-            "taker",
             self.channel,  # type: ignore[arg-type]
             lambda stream, envelope: self.delivered.append((envelope.kind, envelope.seq)),
             static=static,
-            live=live,
+            losses=losses_of("taker", self.channel, live=live),  # type: ignore[arg-type]
             from_start=from_start,
             complaints=Complaints(lambda: self.now, lambda line: self.printed.append(line) is None),
         )

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
+from process_doubles import RecordedChannel
 
 from dataflow.messages import FeatureVector
 from dataflow.process import outlet
@@ -29,12 +30,11 @@ class Linked:
         self.descriptors = make_ring(4096), os.eventfd(0, os.EFD_NONBLOCK), make_board()
         link = Outgoing(*self.descriptors, most)
         self.outlet = Outlet(
-            None,  # type: ignore[arg-type]
+            RecordedChannel(),  # type: ignore[arg-type]
             lambda stream: (),
             fanout=Fanout([([INFO, FAST], link)]),
             namespace="test",
             static=frozenset([INFO]),
-            live=False,
             box=None,
             firings=False,
             incarnations={},
@@ -120,12 +120,11 @@ def test_what_was_dropped_last_of_an_incarnation_that_is_over_is_missed(linked: 
 
 def test_a_process_that_was_restarted_says_on_a_static_stream_no_more_than_its_message_and_end(linked: Linked) -> None:
     linked.outlet = Outlet(
-        None,  # type: ignore[arg-type]
+        RecordedChannel(),  # type: ignore[arg-type]
         lambda stream: (),
         fanout=Fanout([([INFO, FAST], Outgoing(*linked.descriptors, None))]),
         namespace="test",
         static=frozenset([INFO]),
-        live=False,
         box=None,
         firings=False,
         incarnations={INFO: 2, FAST: 2},

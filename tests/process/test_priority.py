@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 import platform
 import threading
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from dataflow.graph import load_graph
-from dataflow.process import priority, sink
-from dataflow.process.sink import SinkConfig, SinkProcess
+from dataflow.process import live_sink, main, priority
+from dataflow.process.sink import SinkConfig
 
 GRAPH = Path(__file__).resolve().parents[2] / "graphs" / "synthetic_rgbd.yaml"
 
@@ -46,11 +48,11 @@ def test_on_an_unknown_machine_nothing_changes(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize("live", [True, False])
 def test_sinks_of_live_runs_let_others_begin(monkeypatch: pytest.MonkeyPatch, live: bool) -> None:
     asked: list[bool] = []
-    monkeypatch.setattr(sink, "let_others_begin", lambda: asked.append(True))
-    graph = load_graph(GRAPH)
-    config = SinkConfig("@recorder", "record", graph.to_json(), [], [], {}, live=live)
-    channel = SimpleNamespace(send=lambda *_, **__: None)
+    monkeypatch.setattr(live_sink, "let_others_begin", lambda: asked.append(True))
+    monkeypatch.setattr(main, "_recorder", lambda *_: SimpleNamespace())
+    config = SinkConfig("@recorder", "record", load_graph(GRAPH).to_json(), [], [], {}, live=live)
+    channel: Any = SimpleNamespace(send=lambda *_, **__: None)
 
-    SinkProcess(config, channel, SimpleNamespace(), lambda *_: SimpleNamespace()).open()  # type: ignore[arg-type, return-value]
+    main._make("sink", asdict(config), channel, SimpleNamespace(), None).open()  # type: ignore[arg-type]
 
     assert asked == [True] * live

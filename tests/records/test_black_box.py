@@ -73,6 +73,16 @@ def test_a_record_larger_than_a_segment_is_kept_and_its_memory_given_back(memory
     assert held < 5 * 3 * module.SEGMENT  # two segments of two records each; six were written
 
 
+def test_records_that_grow_take_no_more_memory_than_the_latest_ones(memory: int) -> None:
+    """As snapshots of a map that grows do: what a segment took before it was enlarged is given back."""
+    sizes = [module.SEGMENT * 2**k for k in range(7)]
+    box = BlackBox(memory, PORTS)
+    for index, size in enumerate(sizes):
+        box.add(record(index, size=size))
+    assert kept(memory, "camera")[-1] == 6
+    assert os.fstat(memory).st_blocks * 512 < 1.1 * sum(sizes[-2:])
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.integers(0, 3000), min_size=1, max_size=60))
 def test_whatever_the_sizes_what_remains_is_the_end_without_gaps(sizes: list[int]) -> None:

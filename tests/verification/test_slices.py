@@ -65,6 +65,7 @@ def test_all_work_is_given_out_and_no_slice_is_small(loads: list[int], divisible
 
     assert {name: sum(ns for _, ns in of) for name, of in poured.items()} == work
     assert all(ns >= min(LEAST_NS, work[name]) for name, of in poured.items() for _, ns in of)
+    assert all(len({part for part, _ in of}) == len(of) for of in poured.values())
     filled = list(loads)
     for name, of in poured.items():
         for part, ns in of:

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 from tampering import Kept, as_it_is, duplicated, ended, tampered
 
+from dataflow.graph import load_text
 from dataflow.messages import FeatureVector, Imu, Message
 from dataflow.recording import Recorded, Recording
 from dataflow.records.firing import FiringRecord
 from dataflow.reexecution.recorded_run import recorded_graph
+from dataflow.supervision.run import run
 from dataflow.verification.gate import Checked, check
 from dataflow.verification.verify import verify
 
@@ -137,6 +139,22 @@ def test_firing_records_that_are_lost_are_noticed_of_sources_as_of_operators(
     assert one.passed is (first < 0)
     if first >= 0 and one.report is not None:
         assert verdicts(one)[operator] == "unverifiable"
+
+
+@pytest.mark.parametrize("last", [3, -1], ids=["first", "none"])
+def test_records_of_a_source_that_nobody_takes_are_missed_too(tmp_path: Path, last: int) -> None:
+    text = """\
+graph: two
+namespace: test
+operators:
+  left: {use: runtime_operators:Counter, params: {count: 20}}
+  sum: {use: runtime_operators:Sum, inputs: {x: left/fast}}
+  lonely: {use: runtime_operators:Counter, params: {count: 20}}
+"""
+    run(load_text(text), record=tmp_path / "run.mcap", placement="one_process")
+    one = checked(tampered(tmp_path / "run.mcap", tmp_path / "t.mcap", records=without("lonely", 0, last)))
+
+    assert one.passed is (last < 0)
 
 
 def test_what_lies_after_a_cut_of_a_source_is_no_loss(kept: Path, tmp_path: Path) -> None:

@@ -1,0 +1,83 @@
+"""Workers that were started before it was known what they would do."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from dataflow.supervision.report import RunFailed
+from dataflow.verification.processes import Call, call_workers
+from dataflow.verification.started import EarlyWorkers, Started, early_workers
+
+
+@pytest.fixture
+def early() -> Iterator[EarlyWorkers]:
+    with early_workers(2) as workers:
+        yield workers
+
+
+def children() -> set[int]:
+    return {process.pid for process in psutil.Process().children()}
+
+
+def calls(*names: str, **request: object) -> list[Call]:
+    return [Call(f"worker_functions:{name}", request, ("mix", "smooth")) for name in names]
+
+
+def test_they_answer_as_others_do_and_become_this_processs_own(early: EarlyWorkers) -> None:
+    answers = call_workers(calls("describe", "describe", "describe", word="w"), threads=1, early=early)
+
+    assert answers == [{"word": "w", "OMP_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}] * 3
+
+
+def test_they_find_modules_of_folders_that_were_named_later(
+    early: EarlyWorkers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "found_later.py").write_text("def found(request, board):\n    return request['x'] + 1\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    early.foresee(["found_later", "never_there"])
+
+    assert call_workers([Call("found_later:found", {"x": 1})], threads=1, early=early) == [2]
+
+
+def test_their_deaths_are_told_as_those_of_others(early: EarlyWorkers) -> None:
+    with pytest.raises(RunFailed, match=r"operator 'smooth' ended its process with code 7 in close\(\)"):
+        call_workers(calls("die", code=7, phase="close"), threads=1, early=early)
+    with pytest.raises(RunFailed, match=r"operator 'smooth' was killed by SIGKILL"):
+        call_workers(calls("die", code=-9, phase="setup"), threads=1, early=early)
+
+
+def test_those_that_nobody_takes_are_ended() -> None:
+    before = children()
+    for wait in (False, True):
+        workers = EarlyWorkers(2)
+        if wait:
+            taken = workers.take(1)
+            assert isinstance(taken, Started)
+            assert taken.pid in children()
+            taken.end()
+        workers.close()
+        assert children() == before
+
+
+def test_a_graph_with_other_threads_gets_workers_of_its_own(early: EarlyWorkers) -> None:
+    assert early.take(3) is None
+    (answer,) = call_workers(calls("describe", word="w"), threads=3, early=early)
+
+    assert answer["OMP_NUM_THREADS"] == "3"
+
+
+def test_those_that_could_not_be_made_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+    before = children()
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "executable", "/bin/false")
+        workers = EarlyWorkers(2)
+    try:
+        assert call_workers(calls("describe", word="w"), threads=1, early=workers)[0]["word"] == "w"
+    finally:
+        workers.close()
+    assert children() == before
