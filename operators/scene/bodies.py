@@ -80,7 +80,7 @@ class BodyMemory:
     def update(
         self, ids: Sequence[int], labels: Sequence[str], centers: Array, sizes: Array, yaws: Array
     ) -> list[Body]:
-        """Returns the bodies of one time, of centres (N, 3), full sizes (N, 3) and headings (N,); others are forgotten."""
+        """Returns the bodies of one time: centres (N, 3), full sizes (N, 3), headings (N,); others are forgotten."""
         before, self._known = self._known, {}
         rows = np.column_stack([centers, sizes, yaws])
         for k, (id, label) in enumerate(zip(ids, labels, strict=True)):
