@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from operators.fusion.error_state import exp_rotation, log_rotation
+from operators.fusion.gate import threshold
 
 Array = NDArray[np.float64]
 _ITERATIONS, _CONVERGED = 20, 1e-9
@@ -195,4 +195,4 @@ def pose_consistency(seen: Sequence[RigidPose]) -> tuple[float, int]:
 def contradicts(consistency: tuple[float, int], share: float) -> bool:
     """Says whether residuals are larger than chance makes them in the given share of cases."""
     total, freedom = consistency
-    return freedom > 0 and total > float(chi2.ppf(share, freedom))
+    return freedom > 0 and total > threshold(share, freedom)

@@ -39,6 +39,7 @@ from operators.fusion.sensors import Surroundings, measurements, turning
 from operators.fusion.silence import Silence
 
 Array = NDArray[np.float64]
+_DEFAULT = SensorSettings()
 
 
 class EkfFusion(Operator):
@@ -221,7 +222,7 @@ class EkfFusion(Operator):
         return {name: (self._settings(name).offset + at, sigma) for name, (at, sigma) in found.items()}
 
     def _settings(self, name: str) -> SensorSettings:
-        return self.sensors.get(name) or SensorSettings()
+        return self.sensors.get(name, _DEFAULT)
 
     def _config(self) -> FilterConfig:
         inertial = self.motion == "inertial"

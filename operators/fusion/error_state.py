@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,7 +107,7 @@ def propagated(
     step = exp_rotation(turn)
     F = _I15.copy()
     lever = R @ skew(middle @ force)
-    F[POSITION, VELOCITY] = _I3 * dt
+    _diagonal(F, 3)[:3] = dt  # of the position by the velocity
     F[POSITION, ROTATION] = lever * (-0.5 * dt * dt)
     F[POSITION, ACCEL_BIAS] = half * (-0.5 * dt * dt)
     F[VELOCITY, ROTATION] = lever * -dt
@@ -116,17 +117,13 @@ def propagated(
     F[ROTATION, GYRO_BIAS] = middle.T * -dt
     left = 1.0 - wander.decay * dt
     P = _carried(F, left, state.covariance)
-    a, g = noise.accel**2, noise.gyro**2
-    d = P.reshape(-1)[:: len(P) + 1]  # the diagonal, as a view
-    d[POSITION] += a * dt**3 / 3
-    d[VELOCITY] += a * dt
-    d[ROTATION] += g * dt
-    d[GYRO_BIAS] += noise.gyro_walk**2 * dt
-    d[ACCEL_BIAS] += noise.accel_walk**2 * dt
-    d[SIZE:] += wander.noise**2 * dt
-    index = np.arange(3)
-    P[index, index + 3] += a * dt * dt / 2
-    P[index + 3, index] += a * dt * dt / 2
+    own, shared = _spread(noise, dt)
+    diagonal = _diagonal(P, 0)
+    diagonal[:SIZE] += own
+    if len(P) > SIZE:
+        diagonal[SIZE:] += wander.noise**2 * dt
+    _diagonal(P, 3)[:3] += shared
+    _diagonal(P, -3)[:3] += shared
     return State(
         position=state.position + state.velocity * dt + 0.5 * acceleration * dt * dt,
         velocity=state.velocity + acceleration * dt,
@@ -136,6 +133,23 @@ def propagated(
         covariance=P,
         errors=left * state.errors,
     )
+
+
+@lru_cache(maxsize=64)
+def _spread(noise: Noise, seconds: float) -> tuple[Array, float]:
+    """Returns the variances (15,) that noise adds in a short time, and the covariance of position and velocity."""
+    a, g = noise.accel**2, noise.gyro**2
+    of_block = [a * seconds**3 / 3, a * seconds, g * seconds]
+    of_block += [noise.gyro_walk**2 * seconds, noise.accel_walk**2 * seconds]
+    variances = np.repeat(of_block, 3)
+    variances.flags.writeable = False  # it is kept
+    return variances, a * seconds * seconds / 2
+
+
+def _diagonal(square: Array, beside: int) -> Array:
+    """Returns a diagonal of a matrix, `beside` columns to the right of the main one, as a view."""
+    side = len(square)
+    return square.reshape(-1)[beside if beside >= 0 else -beside * side :: side + 1]
 
 
 def _carried(F: Array, left: Array, covariance: Array) -> Array:
@@ -157,15 +171,15 @@ def shifted(state: State, rate: Array, acceleration: Array, seconds: float) -> S
     )
 
 
-def moved(state: State, error: Array) -> State:
-    """Adds an error (15 + K,) to the state; the covariance stays."""
+def moved(state: State, error: Array, covariance: Array | None = None) -> State:
+    """Adds an error (15 + K,) to the state; the covariance stays unless another is given."""
     return State(
         position=state.position + error[POSITION],
         velocity=state.velocity + error[VELOCITY],
         rotation=_orthonormal(state.rotation @ exp_rotation(error[ROTATION])),
         gyro_bias=state.gyro_bias + error[GYRO_BIAS],
         accel_bias=state.accel_bias + error[ACCEL_BIAS],
-        covariance=state.covariance,
+        covariance=state.covariance if covariance is None else covariance,
         errors=state.errors + error[SIZE:],
     )
 
@@ -190,12 +204,13 @@ def updated(state: State, residual: Array, H: Array, R: Array) -> State:
     PH = P @ H.T
     K = np.linalg.solve(H @ PH + R, PH.T).T
     error = K @ residual
-    A = np.eye(len(P)) - K @ H
+    unit = _I15 if len(P) == SIZE else np.eye(len(P))
+    A = unit - K @ H
     P = A @ P @ A.T + K @ R @ K.T
-    reset = np.eye(len(P))  # the error is from now on one of the corrected rotation
+    reset = unit.copy()  # the error is from now on one of the corrected rotation
     reset[ROTATION, ROTATION] -= 0.5 * skew(error[ROTATION])
     P = reset @ P @ reset.T
-    return replace(moved(state, error), covariance=0.5 * (P + P.T))
+    return moved(state, error, 0.5 * (P + P.T))
 
 
 def mahalanobis(state: State, residual: Array, H: Array, R: Array) -> tuple[float, float]:
@@ -203,7 +218,7 @@ def mahalanobis(state: State, residual: Array, H: Array, R: Array) -> tuple[floa
     S = H @ state.covariance @ H.T + R
     L = np.linalg.cholesky(S)
     white = np.linalg.solve(L, residual)
-    return float(white @ white), 2.0 * float(np.log(np.diag(L)).sum())
+    return float(white @ white), 2.0 * float(np.log(L.diagonal()).sum())
 
 
 def _orthonormal(R: Array) -> Array:

@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import gammaincinv
 
 from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY, State
 
@@ -68,21 +68,21 @@ class Health:
     def after(self, verdict: Verdict, time: int, nis: float, doubt: Doubt, config: GateConfig) -> Health:
         """Returns the health after a verdict on a measurement with a normalised innovation squared."""
         freedom = len(doubt.residual)
+        if verdict == "used":
+            smooth = 0.98 * self.nis + 0.02 * nis / freedom
+            sums = self.nis_sum + nis, self.freedom + freedom
+            return Health(self.used + 1, self.widened, self.refused, self.unconfirmed, time, smooth, (), *sums)
         counted = replace(self, **{verdict: getattr(self, verdict) + 1})
-        if verdict in ("used", "widened"):
-            counted = replace(counted, last_used=time, doubts=())
-            if verdict == "widened":
-                return counted
-            smooth = 0.98 * counted.nis + 0.02 * nis / freedom
-            return replace(counted, nis=smooth, nis_sum=self.nis_sum + nis, freedom=self.freedom + freedom)
+        if verdict == "widened":
+            return replace(counted, last_used=time, doubts=())
         kept = [d for d in self.doubts if time - d.time <= config.memory * 1e9][-16:]
         return replace(counted, doubts=(*kept, doubt))
 
 
 @lru_cache(maxsize=64)
 def threshold(share: float, freedom: int) -> float:
-    """Returns the quantile of chi-square."""
-    return float(chi2.ppf(share, freedom))
+    """Returns the quantile of chi-square, as `scipy.stats.chi2.ppf`, which takes a second to import."""
+    return float(2 * gammaincinv(freedom / 2, share))
 
 
 def judge(
@@ -91,7 +91,7 @@ def judge(
     """Decides about a measurement: `doubt` is what it would be if not believed, `normalised` its NIS."""
     fits = normalised <= threshold(config.share, len(doubt.residual))
     known = np.einsum("ij,jk,ik->i", H, state.covariance, H)
-    if fits and not (known > config.surplus * np.diag(doubt.noise)).any():
+    if fits and not (known > config.surplus * doubt.noise.diagonal()).any():
         return "used"
     needed = 1 if fits else config.agreeing - 1
     if sum(_agree(config, d, doubt, state, H) for d in doubts) >= needed:

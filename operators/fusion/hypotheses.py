@@ -42,7 +42,7 @@ def combined(hypotheses: Sequence[Hypothesis]) -> State:
 def reduced(hypotheses: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
     """Drops hypotheses that have become unlikely, and unites those that have become alike."""
     if len(hypotheses) == 1:
-        return (replace(hypotheses[0], weight=0.0),)
+        return (Hypothesis(0.0, hypotheses[0].state),)
     ordered = sorted(hypotheses, key=lambda h: -h.weight)
     kept: list[Hypothesis] = []
     for h in ordered:

@@ -86,7 +86,7 @@ class InertialSensor:
             (self._config.gyro_noise, imu.angular_velocity_covariance, "gyro", "gyro_noise"),
             (self._config.accel_noise, imu.linear_acceleration_covariance, "accel", "accel_noise"),
         ):
-            variance = math.nan if covariance is None else float(np.diag(covariance).max())
+            variance = math.nan if covariance is None else float(covariance.diagonal().max())
             if given is not None:
                 found.append(given)
             elif math.isfinite(variance) and variance > 0:

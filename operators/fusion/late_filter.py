@@ -241,7 +241,9 @@ class LateFilter:
         if inertial and seconds <= self._config.max_gap:
             mean_gyro, mean_accel = 0.5 * (node.gyro + gyro), 0.5 * (node.accel + accel)
             hypotheses = tuple(
-                replace(h, state=propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down, self._wander))
+                Hypothesis(
+                    h.weight, propagated(h.state, mean_gyro, mean_accel, seconds, noise, self._down, self._wander)
+                )
                 for h in node.hypotheses
             )
         else:

@@ -15,6 +15,7 @@ from operators.geometry.se3 import skew
 from operators.status import Row, status_of_rows
 
 Array = NDArray[np.float64]
+_I3 = np.eye(3)
 
 
 def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame: str, child_frame: str) -> Odometry:
@@ -23,11 +24,12 @@ def odometry_of(state: State, rate: Array, T_body_base: Array, stamp: int, frame
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R @ turn, state.position + R @ lever
     pose = np.zeros((6, SIZE))
-    pose[:3, POSITION], pose[:3, ROTATION], pose[3:, ROTATION] = np.eye(3), -R @ skew(lever), R
+    at_lever = skew(lever)
+    pose[:3, POSITION], pose[:3, ROTATION], pose[3:, ROTATION] = _I3, -R @ at_lever, R
     own, angular = R.T @ state.velocity, rate - state.gyro_bias
     twist = np.zeros((6, SIZE))
     twist[:3, VELOCITY], twist[:3, ROTATION] = turn.T @ R.T, turn.T @ skew(own)
-    twist[:3, GYRO_BIAS], twist[3:, GYRO_BIAS] = turn.T @ skew(lever), -turn.T
+    twist[:3, GYRO_BIAS], twist[3:, GYRO_BIAS] = turn.T @ at_lever, -turn.T
     P = state.covariance[:SIZE, :SIZE]
     return Odometry.from_matrix(
         T,

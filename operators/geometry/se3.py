@@ -3,24 +3,28 @@
 A twist is (6,): translation v in metres, then rotation w in radians. Solà et al., "A micro Lie theory", 2018.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
 Vector = NDArray[np.float64]
+_I3 = np.eye(3)
 
 
 def skew(v: Vector) -> Matrix:
     """Returns the (3, 3) matrix of the cross product v ×."""
-    x, y, z = v
+    x, y, z = v.tolist()  # numbers are faster than arrays of three
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def exp(twist: Vector) -> Matrix:
     """Returns the motion (4, 4) of a twist (6,)."""
     v, w = twist[:3], twist[3:]
-    angle = float(np.linalg.norm(w))
+    angle = math.sqrt(w.dot(w))
     W = skew(w)
+    WW = W @ W
     if angle < 1e-6:
         a, b, c = 1.0 - angle**2 / 6.0, 0.5 - angle**2 / 24.0, 1.0 / 6.0 - angle**2 / 120.0
     else:
@@ -28,16 +32,17 @@ def exp(twist: Vector) -> Matrix:
         b = (1.0 - np.cos(angle)) / angle**2
         c = (1.0 - a) / angle**2
     T = np.eye(4)
-    T[:3, :3] += a * W + b * (W @ W)
-    T[:3, 3] = (np.eye(3) + b * W + c * (W @ W)) @ v
+    T[:3, :3] += a * W + b * WW
+    T[:3, 3] = (_I3 + b * W + c * WW) @ v
     return T
 
 
 def log(T: Matrix) -> Vector:
     """Returns the twist (6,) of a motion (4, 4); |rotation| ≤ pi, at pi with either sign of the axis."""
     R, p = T[:3, :3], T[:3, 3]
-    vee = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2.0
-    sine, cosine = float(np.linalg.norm(vee)), (float(np.trace(R)) - 1.0) / 2.0
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R.tolist()
+    vee = np.array([(zy - yz) / 2.0, (xz - zx) / 2.0, (yx - xy) / 2.0])
+    sine, cosine = math.sqrt(vee.dot(vee)), (xx + yy + zz - 1.0) / 2.0
     angle = float(np.arctan2(sine, cosine))
     if angle < 1e-6:
         w = vee
@@ -49,7 +54,7 @@ def log(T: Matrix) -> Vector:
         w = angle * axis / np.linalg.norm(axis)
     W = skew(w)
     d = 1.0 / 12.0 if angle < 1e-4 else (1.0 - angle / (2.0 * np.tan(angle / 2.0))) / angle**2
-    return np.concatenate([(np.eye(3) - 0.5 * W + d * (W @ W)) @ p, w])
+    return np.concatenate([(_I3 - 0.5 * W + d * (W @ W)) @ p, w])
 
 
 def interpolated(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:

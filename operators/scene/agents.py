@@ -71,8 +71,11 @@ class Motion:
 
 
 def activity_of(body: Body, motion: Motion, relations: Mapping[Relation, float]) -> tuple[str, float, int]:
-    """Returns what an agent does, how sure that is, and the id of what it does it to, -1 for nothing."""
-    speed = float(np.hypot(*motion.velocity()[:2]))
+    """Returns what an agent does, how sure that is, and the id of what it does it to, -1 for nothing.
+
+    `body` has the velocity of its motion.
+    """
+    speed = float(np.hypot(*body.velocity[:2]))
     if len(motion.past) < 3:
         return UNKNOWN, 0.3, -1
     if body.label == "ball":
@@ -103,20 +106,20 @@ def _sure(more: float, less: float) -> float:
     return float(1 / (1 + np.exp(-4 * (more - less) / max(more + less, 1e-6))))
 
 
-def way_to(place: Array, goal: Body, support: Body | None) -> float:
-    """Returns the metres that are left from a place (2,) to a goal.
+def way_to(place: tuple[float, float], goal: Body, support: Body | None) -> float:
+    """Returns the metres that are left from a place on the ground to a goal.
 
     What lies on a support is reached for, from where one stands square to the support with the thing before the right
     hand: the nearest such place counts. Anything else is walked up to.
     """
+    (x, y), (u, v, _) = place, goal.center.tolist()
     if support is None:
-        return math.hypot(*(goal.center[:2] - place))
+        return math.hypot(u - x, v - y)
     ahead, left = _ARM
     ways = []
     for side in range(4):
         c, s = math.cos(support.yaw + side * math.pi / 2), math.sin(support.yaw + side * math.pi / 2)
-        stand = goal.center[:2] - (ahead * c - left * s, ahead * s + left * c)
-        ways.append(math.hypot(*(stand - place)))
+        ways.append(math.hypot(u - (ahead * c - left * s) - x, v - (ahead * s + left * c) - y))
     return min(ways) + _EFFORT
 
 
@@ -141,18 +144,18 @@ class GoalInference:
 
         `supports`: what candidates lie on, by their ids.
         """
-        here = body.center[:2]
+        x, y, _ = body.center.tolist()
+        away = {each.id: way_to((x, y), each, supports.get(each.id)) for each in candidates}
         if self._last is not None and time > self._last[0]:
             fade = float(np.exp(-(time - self._last[0]) / self._memory))
-            walked = float(np.hypot(*(here - self._last[1])))
+            u, v = self._last[1].tolist()
+            walked = float(np.hypot(x - u, y - v))
             belief = {}
             for each in candidates:
-                support = supports.get(each.id)
-                saved = way_to(self._last[1], each, support) - way_to(here, each, support)
+                saved = way_to((u, v), each, supports.get(each.id)) - away[each.id]
                 belief[each.id] = fade * self._belief.get(each.id, 0.0) + self._trust * (saved - walked)
             self._belief = belief
-        self._last = (time, here.copy())
-        away = {each.id: way_to(here, each, supports.get(each.id)) for each in candidates}
+        self._last = (time, body.center[:2].copy())
         nearest = min(away.values(), default=0.0)
         scores = {i: self._belief.get(i, 0.0) - _NEARNESS * (d - nearest) for i, d in away.items()}
         scores[-1] = -self._elsewhere

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+_STILL = np.zeros(3)
+_STILL.flags.writeable = False
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,21 @@ class Body:
         return float(self.center[2] + self.size[2] / 2)
 
     @cached_property
+    def height(self) -> float:
+        """Height of the centre."""
+        return float(self.center[2])
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius of the sphere around the box."""
+        return float(np.linalg.norm(self.size)) / 2
+
+    @cached_property
+    def flat_radius(self) -> float:
+        """Radius of the circle around the footprint."""
+        return float(np.linalg.norm(self.size[:2])) / 2
+
+    @cached_property
     def volume(self) -> float:
         width, depth, height = self.size.tolist()
         return float(width * depth * height)
@@ -52,6 +69,28 @@ class Body:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         half = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * self.size[:2] / 2
         return np.asarray(half @ np.array([[c, s], [-s, c]]) + self.center[:2])
+
+
+class BodyMemory:
+    """Makes bodies of boxes; one whose box is as it was is the same body, so that what was worked out of it stays."""
+
+    def __init__(self) -> None:
+        self._known: dict[int, tuple[str, bytes, Body]] = {}
+
+    def update(
+        self, ids: Sequence[int], labels: Sequence[str], centers: Array, sizes: Array, yaws: Array
+    ) -> list[Body]:
+        """Returns the bodies of one time: centres (N, 3), full sizes (N, 3), headings (N,); others are forgotten."""
+        before, self._known = self._known, {}
+        rows = np.column_stack([centers, sizes, yaws])
+        for k, (id, label) in enumerate(zip(ids, labels, strict=True)):
+            box = rows[k].tobytes()
+            known = before.get(id)
+            if known is None or known[:2] != (label, box):
+                body = Body(id, label, centers[k].copy(), sizes[k].copy(), float(yaws[k]), _STILL)
+                known = (label, box, body)
+            self._known[id] = known
+        return [body for _, _, body in self._known.values()]
 
 
 def footprint_share(first: Body, second: Body) -> float:
@@ -80,7 +119,7 @@ class BoxPairs:
     """Shares and gaps of pairs of bodies, worked out once for as long as both stay where they are."""
 
     def __init__(self) -> None:
-        self._boxes: dict[int, tuple[bytes, int]] = {}
+        self._boxes: dict[int, tuple[Body, bytes, int]] = {}
         self._shares: dict[tuple[int, int], tuple[int, int, float]] = {}
         self._gaps: dict[tuple[int, int], tuple[int, int, float]] = {}
         self._count = 0
@@ -89,11 +128,11 @@ class BoxPairs:
         """Takes where the bodies are now; what is kept of those that are gone goes."""
         before, self._boxes = self._boxes, {}
         for body in bodies:
-            box = body.center.tobytes() + body.size.tobytes() + np.float64(body.yaw).tobytes()
             old = before.get(body.id)
-            if old is None or old[0] != box:
-                self._count += 1
-                old = (box, self._count)
+            if old is None or old[0] is not body:
+                box = body.center.tobytes() + body.size.tobytes() + np.float64(body.yaw).tobytes()
+                self._count += old is None or old[1] != box
+                old = (body, box, self._count if old is None or old[1] != box else old[2])
             self._boxes[body.id] = old
         if len(self._boxes) < len(before):
             for table in (self._shares, self._gaps):
@@ -102,7 +141,7 @@ class BoxPairs:
 
     def share(self, first: Body, second: Body) -> float:
         """Returns the share of the first footprint's area that lies on the second."""
-        a, b = self._boxes[first.id][1], self._boxes[second.id][1]
+        a, b = self._boxes[first.id][2], self._boxes[second.id][2]
         known = self._shares.get((first.id, second.id))
         if known is None or known[0] != a or known[1] != b:
             known = (a, b, footprint_share(first, second))
@@ -111,7 +150,7 @@ class BoxPairs:
 
     def gap(self, first: Body, second: Body) -> float:
         """Returns the distance between two boxes, 0 where they touch."""
-        a, b = self._boxes[first.id][1], self._boxes[second.id][1]
+        a, b = self._boxes[first.id][2], self._boxes[second.id][2]
         known = self._gaps.get((first.id, second.id))
         if known is None or known[0] != a or known[1] != b:
             known = (a, b, gap(first, second))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -14,6 +15,7 @@ Array = NDArray[np.float64]
 Keys = NDArray[np.int64]
 
 _HALF = 1 << 20
+_FEW = 4096  # pairs of places
 _WEIGHTS = np.array([1 << 42, 1 << 21, 1], np.int64)
 
 
@@ -44,12 +46,33 @@ class Cells:
     @classmethod
     def of(cls, points: Array, side: float) -> Cells:
         """Returns the voxels of one view's points (N, 3)."""
+        return cls.of_each([points], side)[0]
+
+    @classmethod
+    def of_each(cls, sets: Sequence[Array], side: float) -> list[Cells]:
+        """Returns the voxels of each of several sets of one view's points: together they take a third of the time."""
+        if not sets:
+            return []
+        points = np.concatenate(sets)
+        keys, own = keys_of(points, side), np.repeat(np.arange(len(sets)), [len(p) for p in sets])
+        order = np.argsort(keys, kind="stable")
+        order = order[np.argsort(own[order], kind="stable")]  # by set, then by voxel
+        ranked, of_set = keys[order], own[order]
+        first = np.ones(len(order), np.bool_)
+        first[1:] = (ranked[1:] != ranked[:-1]) | (of_set[1:] != of_set[:-1])
+        of = np.empty(len(order), np.intp)
+        of[order] = np.cumsum(first) - 1
+        counts = np.bincount(of)
+        means = np.stack([np.bincount(of, column) for column in points.T], axis=1) / counts[:, None]
+        ends = np.cumsum(np.bincount(of_set[first], minlength=len(sets)))[:-1]
+        parts = zip(np.split(ranked[first], ends), np.split(means, ends), strict=True)
+        return [cls._made(side, own_keys, own_means) for own_keys, own_means in parts]
+
+    @classmethod
+    def _made(cls, side: float, keys: Keys, points: Array) -> Cells:
         made = cls(side)
-        keys = keys_of(points, side)
-        made._keys, of, counts = np.unique(keys, return_inverse=True, return_counts=True)
-        sums = np.stack([np.bincount(of, column, len(counts)) for column in points.T], axis=1)
-        made.points = np.asarray(sums / counts[:, None])
-        made.hits, made.free, made.other = np.ones(len(counts)), np.zeros(len(counts)), np.zeros(len(counts))
+        made._keys, made.points = keys, points
+        made.hits, made.free, made.other = np.ones(len(keys)), np.zeros(len(keys)), np.zeros(len(keys))
         return made
 
     def __len__(self) -> int:
@@ -57,12 +80,7 @@ class Cells:
 
     def add(self, other: Cells) -> None:
         """Takes in the voxels of another view, or of another object that is the same."""
-        place = np.searchsorted(self._keys, other._keys)
-        known = np.zeros(len(place), np.bool_)
-        if len(self):
-            known = self._keys[np.minimum(place, len(self) - 1)] == other._keys
-        keys = np.insert(self._keys, place[~known], other._keys[~known]) if not known.all() else self._keys
-        own, new = np.searchsorted(keys, self._keys), np.searchsorted(keys, other._keys)
+        keys, own, new = _merged(self._keys, other._keys)
         values = np.zeros((6, len(keys)))  # weighted coordinates, hits, free, other
         values[:3, own], values[3, own] = (self.points * self.hits[:, None]).T, self.hits
         values[4, own], values[5, own] = self.free, self.other
@@ -76,6 +94,8 @@ class Cells:
 
     def carve(self, free: NDArray[np.bool_]) -> None:
         """Counts the voxels that a view saw through, and drops those that were seen through too often."""
+        if not free.any():
+            return
         self.free = self.free + free
         gone = (self.free >= 3) & (self.free > 0.5 * self.hits)
         if gone.any():
@@ -87,14 +107,28 @@ class Cells:
         """Counts the confirmed voxels that are not near those which the object showed in the same view, as `weight`."""
         rows = np.flatnonzero(confirmed)
         if len(shown) and len(rows):
-            apart, _ = shown.tree().query(self.points[rows], distance_upper_bound=1.5 * self.side)
-            self.other[rows[~np.isfinite(apart)]] += weight
+            self.other[rows[~shown.near_each(self.points[rows], 1.5 * self.side)]] += weight
+
+    def near_each(self, points: Array, distance: float) -> NDArray[np.bool_]:
+        """Tells which points (N, 3) lie within a distance of a voxel's mean."""
+        if len(points) * len(self) <= _FEW:  # sooner compared each with each than put into a tree
+            square = np.zeros((len(points), len(self)))
+            for axis in range(3):
+                apart = points[:, axis, None] - self.points[None, :, axis]
+                square += apart * apart
+            return np.asarray((square < distance * distance).any(axis=1))
+        low, high = self.bounds
+        found = np.zeros(len(points), np.bool_)
+        around = np.flatnonzero(((points > low - distance) & (points < high + distance)).all(axis=1))
+        apart, _ = self.tree().query(points[around], distance_upper_bound=distance)
+        found[around] = np.isfinite(apart)
+        return found
 
     def sure(self) -> Array:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""
         if not len(self):
             return self.points
-        least = 0.25 * float(np.percentile(self.hits, 75))
+        least = 0.25 * _upper_quartile(self.hits)
         kept = (self.hits >= least) & (self.hits > self.free) & (self.hits >= self.other)
         return self.points[kept] if kept.any() else self.points
 
@@ -107,10 +141,10 @@ class Cells:
 
     @property
     def bounds(self) -> tuple[Array, Array]:
-        """Least and greatest coordinates (3,) of the voxels."""
+        """Least and greatest coordinates (3,) of the voxels; infinite and the wrong way round where there are none."""
         if self._bounds is None:
             columns = np.ascontiguousarray(self.points.T)  # along which extremes are found many times as fast
-            self._bounds = columns.min(axis=1), columns.max(axis=1)
+            self._bounds = columns.min(axis=1, initial=np.inf), columns.max(axis=1, initial=-np.inf)
         return self._bounds
 
     @property
@@ -137,8 +171,6 @@ class Cells:
 
         Negative where they overlap; infinite where one is empty.
         """
-        if not len(self) or not len(other):
-            return math.inf
         (a, b), (c, d) = self.bounds, other.bounds
         return float((np.maximum(a, c) - np.minimum(b, d)).max())
 
@@ -159,3 +191,30 @@ def standing_box(points: Array) -> tuple[Array, Array, float]:
     low, high = float(points[:, 2].min()), float(points[:, 2].max())
     center = np.array([x + points[0, 0], y + points[0, 1], (low + high) / 2])
     return center, np.array([width, depth, high - low]), float(np.radians(angle))
+
+
+def _upper_quartile(values: Array) -> float:
+    """Returns the 75th percentile of values (N,), in a tenth of the time that `np.percentile` takes for a few."""
+    place = 0.75 * (len(values) - 1)
+    before, after = math.floor(place), math.ceil(place)
+    ranked = np.partition(values, (before, after))
+    low, high = float(ranked[before]), float(ranked[after])
+    return low + (place - before) * (high - low)
+
+
+def _merged(own: Keys, other: Keys) -> tuple[Keys, slice | NDArray[np.intp], NDArray[np.intp]]:
+    """Returns the rising keys that either has, and where those of each (rising, each once) are among them."""
+    place = np.searchsorted(own, other)
+    fresh = np.ones(len(place), np.bool_)
+    if len(own):
+        fresh = own[np.minimum(place, len(own) - 1)] != other
+    count = int(np.count_nonzero(fresh))
+    if not count:
+        return own, slice(None), place
+    new = place + np.cumsum(fresh) - fresh  # by so many are those before it more
+    keys = np.empty(len(own) + count, np.int64)
+    kept = np.ones(len(keys), np.bool_)
+    kept[new[fresh]] = False
+    before = np.flatnonzero(kept)
+    keys[before], keys[new] = own, other
+    return keys, before, new

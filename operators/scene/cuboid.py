@@ -222,9 +222,12 @@ def _surface(rows: Array, points: Array, eyes: Array, noise: float, inset: float
     way = np.abs(eye).sum(axis=2) / len(eyes)
     distance = np.sqrt((way * way).sum(axis=1, keepdims=True))
     stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
-    residual = residual + np.concatenate([stray, stray], axis=1) - inset * np.concatenate([half, half], axis=1)
-    beyond = [np.count_nonzero(eye < -half[..., None], axis=2), np.count_nonzero(eye > half[..., None], axis=2)]
-    shown = np.concatenate(beyond, axis=1) / len(eyes) > 0.3
+    residual[:, :3] += stray
+    residual[:, 3:] += stray
+    if inset:
+        residual -= inset * np.concatenate([half, half], axis=1)
+    sides = half[..., None]
+    shown = np.concatenate([(eye < -sides).mean(axis=2), (eye > sides).mean(axis=2)], axis=1) > 0.3
     # positive: the side is beyond the points
     return np.asarray(np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE)
 

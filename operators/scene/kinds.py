@@ -30,6 +30,7 @@ class Kinds:
         """`telling` says how much a label counts, where that is not 1; `carriers` may hold what is `portable`."""
         self.carriers, self.portable = frozenset(carriers), frozenset(portable)
         self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
+        self._largest = {i: max((max(u.size) for u in self.usual.get(i, ())), default=0.0) for i in self.movers}
 
     def vote(self, class_id: int, score: float) -> float:
         """Returns how much a label with a score counts for its class."""
@@ -43,7 +44,7 @@ class Kinds:
         """Tells whether an object is small and lies still, so that it may be of a class that moves or not."""
         size, class_id = object.longest, object.class_id
         if class_id in self.movers:
-            size = max([size, *(max(u.size) for u in self.usual.get(class_id, ()))])
+            size = max(size, self._largest[class_id])
         return size <= _SMALL and max(map(abs, object.velocity.tolist())) <= _STILL
 
     def is_large(self, object: MapObject) -> bool:
@@ -66,12 +67,12 @@ class Kinds:
         usual = self.usual.get(class_id)
         if not usual:
             return points
-        way = points[:, :2] - eye[:2]
-        ranges = np.sqrt((way * way).sum(axis=1))
-        height = max(float(np.ptp(points[:, 2])), 0.01)
+        x, y, z = points[:, 0] - eye[0], points[:, 1] - eye[1], points[:, 2]
+        ranges = np.sqrt(x * x + y * y)
+        height = max(float(z.max() - z.min()), 0.01)
         form = min(usual, key=lambda u: abs(math.log(u.size[2] / height)))
-        deep = form.size[1] * math.exp(form.spread[1]) + 4 * noise * float(ranges.min()) ** 2
         ranked = np.sort(ranges)
+        deep = form.size[1] * math.exp(form.spread[1]) + 4 * noise * float(ranked[0]) ** 2
         counts = np.searchsorted(ranked, ranked + deep, side="right") - np.arange(len(ranked))
         first = ranked[int(np.argmax(counts))]
         return np.asarray(points[(ranges >= first) & (ranges <= first + deep)])

@@ -81,7 +81,7 @@ class LayeredGraph:
     def update(self, stamp: int, things: Sequence[Body], T_world_robot: Array | None) -> Snapshot:
         """Takes the objects of one time, which may have surfaces among them, and the robot's pose."""
         s, time = self._settings, stamp * 1e-9
-        bodies = [replace(b, agent=b.label in s.agents) for b in things]
+        bodies = [b if b.agent == (b.label in s.agents) else replace(b, agent=not b.agent) for b in things]
         for k, body in enumerate(bodies):
             if body.agent:
                 motion = self._motions.setdefault(body.id, Motion())
@@ -92,7 +92,11 @@ class LayeredGraph:
         vanished = self._known - ids
         self._forget(vanished)
         now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
-        goals = {b.id: self._goals_of(time, b, bodies, now) for b in bodies if b.agent and b.label == "person"}
+        people = [b for b in bodies if b.agent and b.label == "person"]
+        by_id = {b.id: b for b in bodies}
+        supports = {s: by_id[o] for (s, p, o) in now if p == "on" and s in by_id and o in by_id} if people else {}
+        wanted = [b for b in bodies if b.label in s.goals]
+        goals = {b.id: self._goals_of(time, b, wanted, supports, now) for b in people}
         held, began, ended = self._hysteresis.update(stamp, now)
         for agent, likely in goals.items():
             sure = {i: p for i, p in likely.items() if i >= 0 and p >= s.least_goal}
@@ -129,13 +133,15 @@ class LayeredGraph:
         return GoalInference(s.trust, s.memory, s.elsewhere)
 
     def _goals_of(
-        self, time: float, agent: Body, bodies: Sequence[Body], now: Mapping[Relation, float]
+        self,
+        time: float,
+        agent: Body,
+        wanted: Sequence[Body],
+        supports: Mapping[int, Body],
+        now: Mapping[Relation, float],
     ) -> dict[int, float]:
-        taken = {o for (s, p, o) in now if s == agent.id and p == "sitting_on"}
-        wanted = [b for b in bodies if b.label in self._settings.goals and b.id not in taken]
-        by_id = {b.id: b for b in bodies}
-        supports = {s: by_id[o] for (s, p, o) in now if p == "on" and s in by_id and o in by_id}
-        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, wanted, supports)
+        free = [b for b in wanted if (agent.id, "sitting_on", b.id) not in now]
+        return self._goals.setdefault(agent.id, self._inference()).update(time, agent, free, supports)
 
     def _act(self, stamp: int, agent: Body, held: Mapping[Relation, float], goals: Mapping[int, float]) -> Act:
         activity, score, object = activity_of(agent, self._motions[agent.id], held)
@@ -146,7 +152,8 @@ class LayeredGraph:
         return Act(agent.id, activity, score, object, since, goals)
 
     def _forget(self, ids: set[int]) -> None:
-        self._hysteresis.forget(ids)
+        if ids:
+            self._hysteresis.forget(ids)
         for i in ids:
             for table in (self._motions, self._goals, self._acts):
                 table.pop(i, None)

@@ -57,9 +57,13 @@ class MapObject:
     beside: Counter[int] = field(default_factory=Counter)
     held: bool = False
 
-    @property
-    def class_id(self) -> int:
-        return int(self.votes.argmax())
+    def __post_init__(self) -> None:
+        self.class_id = int(self.votes.argmax())
+
+    def vote(self, class_id: int, count: float) -> None:
+        """Counts labels of a class."""
+        self.votes[class_id] += count
+        self.class_id = int(self.votes.argmax())
 
     @property
     def score(self) -> float:

@@ -79,8 +79,8 @@ class MapSurface:
     def area(self) -> float:
         """Area that was seen of it, m²: that of the squares of the grid that hold points."""
         axes = np.array([[1.0, 0, 0], [0, 1, 0]]) if self.level else np.array([self._along, [0, 0, 1]])
-        flat = np.floor((self.cells.points - self.middle) @ axes.T / SIDE).astype(np.int64)
-        return len(np.unique(flat, axis=0)) * SIDE * SIDE
+        column, row = np.floor((self.cells.points - self.middle) @ axes.T / SIDE).astype(np.int64).T
+        return len(np.unique((column << 32) + row)) * SIDE * SIDE
 
     @property
     def _along(self) -> Array:

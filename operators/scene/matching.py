@@ -119,16 +119,16 @@ class InImages:
 
 
 def in_image(seen: Sequence[Observation], rows: Array, rounded: NDArray[np.bool_]) -> InImages | None:
-    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without images."""
-    if any(each.image is None for each in seen):
+    """Returns how the images of observations (N) and boxes (M, 7), some of round things, agree; None without any."""
+    if not len(rows) or any(each.image is None for each in seen):
         return None
     images = [each.image for each in seen if each.image is not None]
     boxes = np.stack([image.box for image in images])
     known = image_boxes(rows, images[0].P, rounded)
-    for image in images:  # what reaches beyond the image is cut off there
-        for edge in np.flatnonzero(~image.edges).tolist():
-            cut = np.maximum if edge < 2 else np.minimum
-            known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], image.box[edge])
+    beyond = ~np.stack([image.edges for image in images])
+    for k, edge in np.argwhere(beyond).tolist():  # what reaches beyond the image is cut off there
+        cut = np.maximum if edge < 2 else np.minimum
+        known[:, edge % 2 :: 2] = cut(known[:, edge % 2 :: 2], boxes[k, edge])
     iou = np.nan_to_num(overlap(boxes, known))
     low = np.maximum(boxes[:, None, :2], known[None, :, :2])
     high = np.minimum(boxes[:, None, 2:], known[None, :, 2:])

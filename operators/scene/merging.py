@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from operators.scene.box_overlap import shared_volume
+from operators.scene.cells import Cells
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
 from operators.scene.matching import closeness, tolerance
@@ -15,6 +19,13 @@ _PART = 0.4  # that share where the classes differ
 _LIKE = 6.0  # times smaller, and what is in the other is no part of it
 _NEAR, _NEAR_MOVERS = 0.1, 0.3  # metres that the bounds of two entries of one thing are apart at most
 _SELDOM = 0.15  # share of the views in which both are seen beside each other, from which they are two
+
+
+def may_be_one(cells: Sequence[Cells], rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """Tells of some entries (N,) of the map and all (M,) whether their bounds are near enough to be `are_one`'s."""
+    low, high = (np.array([each.bounds[side] for each in cells]) for side in (0, 1))
+    apart = np.maximum(low[rows, None], low[None]) - np.minimum(high[rows, None], high[None])
+    return np.asarray(apart.max(axis=2) <= _NEAR_MOVERS)
 
 
 def are_one(a: MapObject, b: MapObject, kinds: Kinds, voxel: float) -> bool:
@@ -58,7 +69,8 @@ def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
         best.cells.add(other.cells)
         for image in other.images:
             best.look(image)
-    best.votes = best.votes + other.votes
+    for class_id, count in enumerate(other.votes.tolist()):
+        best.vote(class_id, count)
     best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
     best.seen, best.views = max(best.seen, other.seen), best.views + other.views
     best.view = best.view + other.view

@@ -25,7 +25,7 @@ from operators.scene.matching import (
     in_places_of_their_own,
     outside,
 )
-from operators.scene.merging import are_one, merge
+from operators.scene.merging import are_one, may_be_one, merge
 from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
@@ -86,10 +86,8 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
-        cells = [
-            Cells.of(self._kinds.near_side(each.points, each.class_id, view.origin, s.range_noise), s.voxel)
-            for each in seen
-        ]
+        near_sides = [self._kinds.near_side(each.points, each.class_id, view.origin, s.range_noise) for each in seen]
+        cells = Cells.of_each(near_sides, s.voxel)
         joined = self._joined(seen, cells, stamp, view)
         in_hands = carried(seen, cells, joined, view, self.objects, self._kinds, s.views)
         for k, each in enumerate(seen):
@@ -125,23 +123,24 @@ class ObjectMap:
         if not ids or not seen:
             return {}
         known = [self.objects[i] for i in ids]
-        rows = np.array([[*o.center, *o.size, o.yaw] for o in known])
+        centers, sizes = np.array([o.center for o in known]), np.array([o.size for o in known])
         moves = np.array([self._kinds.is_mover(o) for o in known])
         still = np.array([self._kinds.is_still(o) for o in known])
         classes = np.array([o.class_id for o in known])
-        images = in_image(seen, rows, np.array([self._kinds.is_round(o) for o in known]))
+        movers = np.array([each.class_id in self._kinds.movers for each in seen])
+        halves = np.array([[float(c.extent.max()) / 2] for c in cells]) + np.linalg.norm(sizes, axis=1) / 2
+        near = np.linalg.norm(centers[None] - np.array([c.middle for c in cells])[:, None], axis=2) - halves
+        here = ~moves & (near <= s.reach) & (still | ~movers[:, None])
+        compared = np.flatnonzero(here.any(axis=0)).tolist()
+        boxes = np.column_stack([centers, sizes, [o.yaw for o in known]])[compared]
+        images = in_image(seen, boxes, np.array([self._kinds.is_round(known[j]) for j in compared], bool))
+        for k, n in np.argwhere(here[:, compared]).tolist():
+            j, image = compared[n], None if images is None else images.of(k, n)
+            value[k, j] = alike(seen[k], cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
         left: dict[int, bool] = {}
-        for k, each in enumerate(seen):
-            mover = each.class_id in self._kinds.movers
-            near = np.linalg.norm(rows[:, :3] - cells[k].middle, axis=1)
-            near -= float(cells[k].extent.max()) / 2 + np.linalg.norm(rows[:, 3:6], axis=1) / 2
-            here = ~moves & (near <= s.reach) & (still if mover else True)
-            for j in np.flatnonzero(here).tolist():
-                image = None if images is None else images.of(k, j)
-                value[k, j] = alike(each, cells[k], known[j], image, s, large=self._kinds.is_large(known[j]))
-            if not mover:
-                continue
-            around = (near <= s.mover_reach + 2 * s.mover_speed) & (classes == each.class_id) & (value[k] == 0)
+        for k in np.flatnonzero(movers).tolist():
+            each = seen[k]
+            around = (near[k] <= s.mover_reach + 2 * s.mover_speed) & (classes == each.class_id) & (value[k] == 0)
             for j in np.flatnonzero(around).tolist():
                 if not moves[j] and j not in left:
                     left[j] = self._has_left(known[j], view)
@@ -161,7 +160,7 @@ class ObjectMap:
         object.view = direction * object.views if mover else object.view + direction
         before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
         voted = object.class_id
-        object.votes[each.class_id] += self._kinds.vote(each.class_id, each.score)
+        object.vote(each.class_id, self._kinds.vote(each.class_id, each.score))
         object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
@@ -266,23 +265,24 @@ class ObjectMap:
         if not changed:
             return
         ids = sorted(self.objects)
-        centers = np.array([self.objects[i].center for i in ids])
-        radii = np.array([self.objects[i].longest for i in ids])
+        known = [self.objects[i] for i in ids]
+        centers, radii = np.array([o.center for o in known]), np.array([o.longest for o in known])
         rows = np.searchsorted(ids, changed)
         apart = np.linalg.norm(centers[None] - centers[rows, None], axis=2)
         close = apart <= (radii[None] + radii[rows, None]) / 2 + 0.1
-        for i, near in zip(changed, close, strict=True):
-            if i not in self.objects:
+        touch = may_be_one([o.cells for o in known], rows)
+        joined = False  # then what touches has changed
+        for k, n in np.argwhere(close).tolist():
+            i, j = changed[k], ids[n]
+            if i not in self.objects or j not in self.objects or i == j or not (joined or touch[k, n]):
                 continue
-            for j in (ids[n] for n in np.flatnonzero(near).tolist()):
-                if i not in self.objects or j not in self.objects or i == j:
-                    continue
-                a, b = self.objects[i], self.objects[j]
-                if are_one(a, b, self._kinds, self._settings.voxel):
-                    del self.objects[i], self.objects[j]
-                    one = merge(a, b, self._kinds)
-                    self._fit(one)
-                    self.objects[one.id] = one
+            a, b = self.objects[i], self.objects[j]
+            if are_one(a, b, self._kinds, self._settings.voxel):
+                del self.objects[i], self.objects[j]
+                one = merge(a, b, self._kinds)
+                self._fit(one)
+                self.objects[one.id] = one
+                joined = True
 
     def _drop(self, stamp: int) -> None:
         """Drops what is not there any more; what appeared elsewhere instead keeps its id."""

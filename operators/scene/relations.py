@@ -68,13 +68,16 @@ def relations_of(
     boxes = BoxPairs() if known is None else known
     boxes.update(bodies)
     found: dict[Relation, float] = {}
-    things = [b for b in bodies if b.id > FLOOR]
+    things = sorted((b for b in bodies if b.id > FLOOR), key=lambda b: b.id)
     tops = [b for b in bodies if b.id < SURFACE and b.label in rules.tops]
     floor = next((b for b in bodies if b.id == FLOOR), None)
     held: set[int] = set()
-    around = _pairs(things, [b for b in things if b.agent], 1.5 + rules.above, flat=False)
-    stacks = _pairs(things, things, 0.0, flat=True)
-    beside = _pairs(things, things, 1.2 * rules.near, flat=False)
+    centers = np.array([b.center for b in things]).reshape(-1, 3)
+    spheres = _gaps(centers, np.array([b.radius for b in things]))
+    agents = np.array([b.agent for b in things], bool)
+    around = _pairs(things, (spheres <= 1.5 + rules.above) & agents[:, None])
+    stacks = _pairs(things, _gaps(centers[:, :2], np.array([b.flat_radius for b in things])) <= 0.0)
+    beside = _pairs(things, np.triu(spheres <= 1.2 * rules.near))  # each two once, since ids rise
     for person in things:
         if person.agent:
             held |= _contact(found, person, [b for b in around[person.id] if not b.agent], things, boxes, rules)
@@ -91,8 +94,7 @@ def relations_of(
         for second in stacks[first.id]:
             _stacked(found, first, second, boxes, rules)
         for second in beside[first.id]:
-            if first.id < second.id:
-                _beside(found, first, second, seen, boxes, rules)
+            _beside(found, first, second, seen, boxes, rules)
         if first.agent:
             for second in around[first.id]:
                 _moving(found, first, second, rules)
@@ -104,19 +106,17 @@ def relations_of(
     return found
 
 
-def _pairs(things: Sequence[Body], of: Sequence[Body], reach: float, *, flat: bool) -> dict[int, list[Body]]:
-    """Returns the other things whose spheres, or circles as seen from above, come within a reach of each one's."""
-    axes = 2 if flat else 3
-    centers = np.array([b.center[:axes] for b in things]).reshape(-1, axes)
-    radii = np.array([float(np.linalg.norm(b.size[:axes])) / 2 for b in things])
-    row = {b.id: k for k, b in enumerate(things)}
-    own = np.array([row[b.id] for b in of], np.intp)
-    apart = np.sqrt(((centers[None] - centers[own, None]) ** 2).sum(axis=2)) - radii - radii[own, None]
-    near = apart <= reach
-    near[np.arange(len(own)), own] = False
-    close: dict[int, list[Body]] = {b.id: [] for b in of}
+def _gaps(centers: Array, radii: Array) -> Array:
+    """Returns how far spheres, or circles, are apart (N, N); below 0 where they overlap."""
+    return np.asarray(np.sqrt(((centers[None] - centers[:, None]) ** 2).sum(axis=2)) - radii - radii[:, None])
+
+
+def _pairs(things: Sequence[Body], near: NDArray[np.bool_]) -> dict[int, list[Body]]:
+    """Returns the other things that are near each one (N, N), by its id."""
+    close: dict[int, list[Body]] = {b.id: [] for b in things}
     for k, j in zip(*(found.tolist() for found in np.nonzero(near)), strict=True):
-        close[of[k].id].append(things[j])
+        if k != j:
+            close[things[k].id].append(things[j])
     return close
 
 
@@ -134,14 +134,14 @@ def _placed(
         if other.agent:
             continue
         off = abs(body.bottom - other.top)
-        upon = off <= 2 * rules.touch and body.center[2] > other.top
+        upon = off <= 2 * rules.touch and body.height > other.top
         if not upon and min(body.top, other.top) <= max(body.bottom, other.bottom):
             continue
         share = boxes.share(body, other)
         if other.label in rules.containers and other.volume > 1.5 * body.volume and share > 0.3:
             inside = min(body.top, other.top) - max(body.bottom, other.bottom)
             deep = inside / max(float(body.size[2]), 1e-3)
-            if deep > 0.5 and body.center[2] < other.top - 0.02:
+            if deep > 0.5 and body.height < other.top - 0.02:
                 best = max(best, (0.5 * min(1.0, share / 0.6) + 0.5 * min(1.0, deep), "in", other.id))
                 continue
         if share > 0.3 and upon:
@@ -272,6 +272,7 @@ class Hysteresis:
         self._begin, self._end, self._seconds = begin, end, seconds
         self._means: dict[Relation, float] = {}
         self._held: dict[Relation, None] = {}
+        self._ordered: list[Relation] | None = None  # what is held; None where that has to be sorted anew
         self._stamp: int | None = None
 
     def update(
@@ -282,22 +283,25 @@ class Hysteresis:
         if self._stamp is not None:
             share = 1 - float(np.exp(-(stamp - self._stamp) * 1e-9 / self._seconds))
         self._stamp = stamp
-        for relation in sorted({*self._means, *now}):
-            before, value = self._means.get(relation, 0.0), now.get(relation, 0.0)
-            self._means[relation] = before + share * (value - before)
-        began = [r for r in sorted(now) if r not in self._held and self._means[r] >= self._begin]
-        ended = [r for r in self._held if self._means[r] <= self._end]
+        means = {r: before + share * (now.get(r, 0.0) - before) for r, before in self._means.items()}
+        for relation in sorted(now.keys() - means.keys()):
+            means[relation] = share * now[relation]
+        began = sorted(r for r in now if r not in self._held and means[r] >= self._begin)
+        ended = [r for r in self._held if means[r] <= self._end]
         for relation in began:
             self._held[relation] = None
         for relation in ended:
             del self._held[relation]
-        self._means = {r: m for r, m in self._means.items() if m > 0.02}
-        return {r: min(self._means[r], 1.0) for r in sorted(self._held)}, began, ended
+        if began or ended or self._ordered is None:
+            self._ordered = sorted(self._held)
+        self._means = {r: m for r, m in means.items() if m > 0.02}
+        return {r: min(means[r], 1.0) for r in self._ordered}, began, ended
 
     def forget(self, ids: set[int]) -> None:
         """Drops the relations of nodes that are no more."""
         self._means = {r: m for r, m in self._means.items() if not {r[0], r[2]} & ids}
         self._held = {r: None for r in self._held if not {r[0], r[2]} & ids}
+        self._ordered = None
 
     def snapshot(self) -> dict[str, object]:
         return {
@@ -313,4 +317,5 @@ class Hysteresis:
         assert stamp is None or isinstance(stamp, int)
         self._means = {(int(s), str(p), int(o)): float(m) for s, p, o, m in means}
         self._held = {(int(s), str(p), int(o)): None for s, p, o in held}
+        self._ordered = None
         self._stamp = stamp

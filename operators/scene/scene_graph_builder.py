@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import Activity, Diagnostics, Odometry, Pose, SceneGraph, Transforms
 from dataflow.messages.diagnostics import Level
@@ -14,7 +15,7 @@ from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES, UNKNOWN
-from operators.scene.bodies import Body
+from operators.scene.bodies import Body, BodyMemory
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
 from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 
@@ -84,6 +85,7 @@ class SceneGraphBuilder(Operator):
             )
         )
         self._names: dict[int, str] = {}
+        self._bodies = BodyMemory()
 
     def process(
         self,
@@ -100,7 +102,8 @@ class SceneGraphBuilder(Operator):
             T = robot.matrix()
             if self.robot_frame is not None:
                 T = T @ transform_between(extrinsics, self.robot_frame, robot.child_frame)
-        bodies, unusable = _bodies(nodes)
+        usable = _usable(nodes)
+        bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
         now = self._graph.update(nodes.stamp, bodies, T)
         self._names |= {b.id: _name(b) for b in now.bodies}
         self._counts.update({"graphs": 1, "unusable nodes": unusable, "relations begun": len(now.began)})
@@ -130,13 +133,24 @@ class SceneGraphBuilder(Operator):
     def summary(self) -> Mapping[str, float | int]:
         return dict(self._counts)
 
+    def _bodies_of(self, nodes: SceneGraph, rows: NDArray[np.intp]) -> list[Body]:
+        """Returns the nodes in some rows as upright bodies."""
+        names, class_ids = nodes.class_names, nodes.class_ids[rows].tolist()
+        labels = [names[c] if names else str(c) for c in class_ids]
+        yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
+        return self._bodies.update(
+            nodes.ids[rows].tolist(), labels, nodes.positions[rows], nodes.sizes[rows], yaws[rows]
+        )
+
     def _message(self, nodes: SceneGraph, now: Snapshot) -> SceneGraph:
         classes = (*nodes.class_names, *(n for n in EXTRA.values() if n not in nodes.class_names))
-        row = {int(i): k for k, i in enumerate(nodes.ids.tolist())}
+        row = {i: k for k, i in enumerate(nodes.ids.tolist())}
         at = {b.id: k for k, b in enumerate(now.bodies)}
+        place = {name: k for k, name in reversed([*enumerate(classes)])}
 
-        def given(values: Any, id: int, otherwise: Any) -> Any:
-            return otherwise if values is None or id not in row else values[row[id]]
+        def given(values: NDArray[Any] | None, otherwise: float) -> list[Any]:
+            known = () if values is None else values.tolist()
+            return [otherwise if values is None or b.id not in row else known[row[b.id]] for b in now.bodies]
 
         held = list(now.relations.items())
         return SceneGraph(
@@ -146,12 +160,12 @@ class SceneGraphBuilder(Operator):
             labels=tuple(self._names[b.id] for b in now.bodies),
             predicates=tuple(p for (_, p, _), _ in held),
             ids=np.array([b.id for b in now.bodies], np.int64),
-            class_ids=np.array([classes.index(b.label) for b in now.bodies], np.int32),
+            class_ids=np.array([place[b.label] for b in now.bodies], np.int32),
             positions=np.array([b.center for b in now.bodies]).reshape(-1, 3),
             sizes=np.array([b.size for b in now.bodies]).reshape(-1, 3),
             orientations=quaternion_from_yaw(np.array([b.yaw for b in now.bodies])).reshape(-1, 4),
-            scores=np.array([given(nodes.scores, b.id, 1.0) for b in now.bodies], np.float32),
-            last_seen=np.array([given(nodes.last_seen, b.id, nodes.stamp) for b in now.bodies], np.int64),
+            scores=np.array(given(nodes.scores, 1.0), np.float32),
+            last_seen=np.array(given(nodes.last_seen, nodes.stamp), np.int64),
             subjects=np.array([at[s] for (s, _, _), _ in held], np.int32),
             objects=np.array([at[o] for (_, _, o), _ in held], np.int32),
             relation_scores=np.array([min(score, 1.0) for _, score in held], np.float32),
@@ -208,21 +222,8 @@ def _name(body: Body) -> str:
     return EXTRA.get(body.id, f"{body.label} {SURFACE - body.id if body.id < SURFACE else body.id}")
 
 
-def _bodies(nodes: SceneGraph) -> tuple[list[Body], int]:
-    """Returns the usable nodes as upright bodies, and how many are not."""
+def _usable(nodes: SceneGraph) -> NDArray[np.intp]:
+    """Returns the rows of the nodes that are finite and of a kind that the graph knows."""
     usable = np.isfinite(nodes.positions).all(axis=1) & np.isfinite(nodes.sizes).all(axis=1)
     usable &= (nodes.sizes >= 0).all(axis=1) & ((nodes.ids >= FLOOR) | (nodes.ids < SURFACE))
-    yaws = np.zeros(nodes.count) if nodes.orientations is None else yaw_of(nodes.orientations)
-    names = nodes.class_names
-    bodies = [
-        Body(
-            int(nodes.ids[k]),
-            names[nodes.class_ids[k]] if names else str(nodes.class_ids[k]),
-            nodes.positions[k],
-            nodes.sizes[k],
-            float(yaws[k]),
-            np.zeros(3),
-        )
-        for k in np.flatnonzero(usable)
-    ]
-    return bodies, nodes.count - len(bodies)
+    return np.flatnonzero(usable)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -149,11 +149,12 @@ class SemanticMap(Operator):
         T = pose.matrix() @ transform_between(extrinsics, cloud.frame, sensor)
         usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
         points = cloud.points[usable].astype(np.float64)
-        labels, world = clusters.labels[usable], transform_points(T, points)
         shown = _images(boxes, cloud, images, image_info, T, extrinsics)
+        rows, ends = _by_label(clusters.labels[usable], boxes.count)
+        world, colors = transform_points(T, points[rows]), _mean_colors(cloud, usable[rows], ends)
         seen = [
-            self._observation(boxes, cloud, rows, usable, world, k, shown[k])
-            for k, rows in enumerate(_rows_of(labels, boxes.count))
+            self._observation(boxes, world[ends[k] : ends[k + 1]], None if colors is None else colors[k], k, shown[k])
+            for k in range(boxes.count)
         ]
         known.floor = self._surfaces.floor
         view = RangeView(points[:: 1 + len(points) // 20_000], T, 0.012)
@@ -259,18 +260,15 @@ class SemanticMap(Operator):
     def _observation(
         self,
         boxes: Boxes3D,
-        cloud: PointCloud,
-        rows: NDArray[np.intp],
-        usable: NDArray[np.intp],
-        world: NDArray[np.float64],
+        points: NDArray[np.float64],
+        color: NDArray[np.float64] | None,
         k: int,
         image: ImageView | None,
     ) -> Observation | None:
-        if len(rows) < 3:
+        if len(points) < 3:
             return None
-        color = None if cloud.colors is None else cloud.colors[usable[rows]].mean(axis=0) / 255.0
         class_id = int(boxes.class_ids[k]) if self._classes else 0
-        return Observation(world[rows], class_id, float(boxes.scores[k]), color, image)
+        return Observation(points, class_id, float(boxes.scores[k]), color, image)
 
     def _boxes(self, stamp: int, objects: list[MapObject]) -> Boxes3D:
         return Boxes3D(
@@ -288,11 +286,20 @@ class SemanticMap(Operator):
         )
 
 
-def _rows_of(labels: NDArray[np.int32], count: int) -> list[NDArray[np.intp]]:
-    """Returns the rows of each label from 0 on."""
-    order = np.argsort(labels, kind="stable")
-    ends = np.searchsorted(labels[order], np.arange(count + 1))
-    return [order[ends[k] : ends[k + 1]] for k in range(count)]
+def _by_label(labels: NDArray[np.int32], count: int) -> tuple[NDArray[np.intp], list[int]]:
+    """Returns the rows with labels from 0 on, by label, and where those of each label begin and the last ones end."""
+    labelled = np.flatnonzero(labels >= 0)
+    rows = labelled[np.argsort(labels[labelled], kind="stable")]
+    return rows, np.searchsorted(labels[rows], np.arange(count + 1)).tolist()
+
+
+def _mean_colors(cloud: PointCloud, rows: NDArray[np.intp], ends: Sequence[int]) -> NDArray[np.float64] | None:
+    """Returns the mean colour (K, 3) in [0, 1] of the rows between each two ends; None where the cloud has none."""
+    if cloud.colors is None:
+        return None
+    sums = np.zeros((len(rows) + 1, 3), np.int64)
+    np.cumsum(cloud.colors[rows], axis=0, out=sums[1:])
+    return np.asarray(np.diff(sums[list(ends)], axis=0) / np.maximum(np.diff(ends), 1)[:, None] / 255.0)
 
 
 def _images(

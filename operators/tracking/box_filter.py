@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,13 +45,7 @@ class BoxFilter:
 
     def predict(self, seconds: float) -> None:
         """Moves on by a time; sizes stay above one pixel."""
-        F = np.array([[1.0, seconds], [0.0, 1.0]])
-        steps = np.array([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
-        n, height = self._noise, self.mean[3, 0]
-        spread = (np.array([n.acceleration, n.acceleration, n.growth, n.growth]) * height) ** 2
-        self.mean = self.mean @ F.T
-        self.covariance = F @ self.covariance @ F.T + spread[:, None, None] * steps
-        self.mean[2:, 0] = np.maximum(self.mean[2:, 0], 1.0)
+        predict([self], self._noise, seconds)
 
     def hold_size(self) -> None:
         """Stops growing and shrinking: what is not seen is taken to keep its size."""
@@ -68,8 +63,7 @@ class BoxFilter:
     @property
     def box(self) -> Array:
         """The box (4,) as (x1, y1, x2, y2)."""
-        middle, size = self.mean[:2, 0], self.mean[2:, 0]
-        return np.concatenate([middle - size / 2, middle + size / 2])
+        return boxes_of([self])[0]
 
     def snapshot(self) -> dict[str, Any]:
         return {"mean": self.mean, "covariance": self.covariance}
@@ -83,5 +77,29 @@ class BoxFilter:
         return np.asarray(spread**2)
 
 
+def predict(filters: Sequence[BoxFilter], noise: BoxNoise, seconds: float) -> None:
+    """Moves filters of one noise on by a time, all at once; sizes stay above one pixel."""
+    if not filters:
+        return
+    F = np.array([[1.0, seconds], [0.0, 1.0]])
+    steps = np.array([[seconds**4 / 4, seconds**3 / 2], [seconds**3 / 2, seconds**2]])
+    means, covariances = np.stack([f.mean for f in filters]), np.stack([f.covariance for f in filters])
+    shares = np.array([noise.acceleration, noise.acceleration, noise.growth, noise.growth])
+    spread = (shares * means[:, 3, 0, None]) ** 2
+    means = means @ F.T
+    means[:, 2:, 0] = np.maximum(means[:, 2:, 0], 1.0)
+    covariances = F @ covariances @ F.T + spread[..., None, None] * steps
+    for filter, mean, covariance in zip(filters, means, covariances, strict=True):
+        filter.mean, filter.covariance = mean, covariance
+
+
+def boxes_of(filters: Sequence[BoxFilter]) -> Array:
+    """Returns the boxes (N, 4) of filters as (x1, y1, x2, y2)."""
+    means = np.array([f.mean[:, 0] for f in filters]).reshape(-1, 4)
+    middle, half = means[:, :2], means[:, 2:] / 2
+    return np.concatenate([middle - half, middle + half], axis=1)
+
+
 def _middle(box: Array) -> Array:
-    return np.array([(box[0] + box[2]) / 2, (box[1] + box[3]) / 2, box[2] - box[0], box[3] - box[1]])
+    left, upper, right, lower = box.tolist()
+    return np.array([(left + right) / 2, (upper + lower) / 2, right - left, lower - upper])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import TrackState
 from operators.tracking.assignment import assign, overlap
-from operators.tracking.box_filter import BoxFilter, BoxNoise
+from operators.tracking.box_filter import BoxFilter, BoxNoise, boxes_of, predict
 
 Array = NDArray[np.float64]
 _MOST = 4.0  # evidence is bounded, so that a long life does not hide a present absence
@@ -91,8 +91,7 @@ class BoxTracker:
         s = self._settings
         seconds = 0.0 if self._stamp is None else (stamp - self._stamp) * 1e-9
         self._stamp = stamp
-        for track in self.tracks:
-            track.filter.predict(seconds)
+        predict([t.filter for t in self.tracks], s.noise, seconds)
         free = set(range(len(self.tracks)))
         strong = [k for k in range(len(boxes)) if scores[k] >= s.strong]
         weak = [k for k in range(len(boxes)) if scores[k] < s.strong]
@@ -144,7 +143,7 @@ class BoxTracker:
             return
         tracks = [self.tracks[i] for i in rows]
         found = boxes[detections]
-        close = overlap(_grown(np.array([t.filter.box for t in tracks]), grow), _grown(found, grow))
+        close = overlap(_grown(boxes_of([t.filter for t in tracks]), grow), _grown(found, grow))
         same = np.array([t.class_id for t in tracks])[:, None] == class_ids[detections][None, :]
         value = close
         if features is not None and self._settings.appearance > 0:

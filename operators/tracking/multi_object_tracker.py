@@ -13,7 +13,7 @@ from dataflow.messages import Detections2D, Diagnostics, FeatureVector, Tracks, 
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.status import counted_status
-from operators.tracking.box_filter import BoxNoise
+from operators.tracking.box_filter import BoxNoise, boxes_of
 from operators.tracking.box_tracker import BoxTrack, BoxTracker, BoxTrackerSettings
 
 Array = NDArray[np.float64]
@@ -150,7 +150,7 @@ class MultiObjectTracker(Operator):
             class_ids=np.array([t.class_id for t in tracks], np.int32),
             ages=np.array([(now - t.born) * 1e-9 for t in tracks], np.float32),
             unseen=np.array([(now - t.seen) * 1e-9 for t in tracks], np.float32),
-            boxes=np.array([t.filter.box for t in tracks], np.float32).reshape(-1, 4),
+            boxes=boxes_of([t.filter for t in tracks]).astype(np.float32),
         )
 
 

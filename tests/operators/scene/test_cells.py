@@ -39,6 +39,28 @@ def test_views_are_added_as_a_dictionary_of_voxels_would_add_them(seed: int) -> 
     np.testing.assert_array_equal(cells.free, [free for _, _, free in rows])
 
 
+def test_sets_of_points_have_the_same_voxels_together_and_alone() -> None:
+    rng = np.random.default_rng(1)
+    sets = [view(rng), np.zeros((0, 3)), view(rng), view(rng) + 0.01]
+    for points, together in zip(sets, Cells.of_each(sets, SIDE), strict=True):
+        alone = Cells(SIDE)
+        for key in sorted({*keys_of(points, SIDE).tolist()}):
+            alone.add(Cells.of(points[keys_of(points, SIDE) == key], SIDE))
+        np.testing.assert_array_equal(together.points, alone.points)
+        np.testing.assert_array_equal(together.hits, np.ones(len(alone)))
+
+
+@pytest.mark.parametrize("count", [5, 2000])  # each with each, and by a tree
+def test_points_near_voxels_are_those_within_the_distance_of_one(count: int) -> None:
+    rng = np.random.default_rng(2)
+    cells, points = Cells.of(view(rng), SIDE), rng.uniform(-0.6, 0.6, (count, 3))
+    apart = np.linalg.norm(points[:, None] - cells.points[None], axis=2).min(axis=1)
+    found = cells.near_each(points, 0.15)
+    np.testing.assert_array_equal(found, apart < 0.15)
+    assert 0 < found.sum() < count
+    assert not Cells(SIDE).near_each(points, 0.15).any()
+
+
 def test_bounds_are_as_far_apart_as_along_the_axis_of_the_widest_gap() -> None:
     first = Cells.of(np.array([[0.0, 0, 0], [1, 1, 1]]), SIDE)
     second = Cells.of(np.array([[1.2, 0.5, 0.5], [2, 2, 2]]), SIDE)
