@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Transforms
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.back_projection import Rays, beside_edge, sample_colors, within_range
-from operators.geometry.calibration import check_calibration
+from operators.geometry.calibration import check_calibration, told_again
 from operators.geometry.extrinsics import transform_between
 
 
@@ -64,7 +64,7 @@ class CloudBuilder(Operator):
         """The ray table, made once for each calibration and stride."""
         if self._rays is not None:
             known, rays = self._rays
-            if rays.stride == self.stride and (known is info or known == info):
+            if rays.stride == self.stride and told_again(known, info):
                 return rays
         rays = Rays.through(info.K, (info.width, info.height), self.stride)
         self._rays = info, rays

@@ -11,7 +11,7 @@ import numpy as np
 from dataflow.messages import CameraInfo, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.geometry.calibration import check_fit
+from operators.geometry.calibration import check_fit, told_again
 from operators.geometry.lens import check_model, is_distorted
 from operators.image.preparation import Preparation, Tone, grey_of
 from operators.image.view import Window, fitting_view
@@ -53,7 +53,7 @@ class ImagePreprocess(Operator):
     def process(self, image: Image, image_info: CameraInfo) -> dict[str, Any]:
         """Raises ValueError where image and calibration do not fit, or that does not do for what is asked for."""
         check_fit("image", image, image_info)
-        if self._made is None or self._made[0] != image_info:
+        if self._made is None or not told_again(self._made[0], image_info):
             self._made = (image_info, self._preparation(image_info))
         preparation = self._made[1]
         pixels = preparation.apply(grey_of(image.data) if self.grey else image.data)

@@ -24,9 +24,9 @@ class LandmarkSlam(Operator, merge=True):
 
     The map frame is the first pose. Sightings, polar or Cartesian, are taken at their own stamp, between the odometry
     messages around it. Motion noise is that of each message's twist covariance, taken as independent from message to
-    message; where there is none, that of a differential drive by the parameters. Landmarks without identity are
-    associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a known landmark
-    to be it and too near to be another is ignored and counted.
+    message; where there is none that can be used, that of a differential drive by the parameters. Landmarks without
+    identity are associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a
+    known landmark to be it and too near to be another is ignored and counted, and so is what is not finite.
 
     Method: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
     """
@@ -66,6 +66,8 @@ class LandmarkSlam(Operator, merge=True):
         self, odometry: Odometry | None, sightings: LandmarkSightings | None, extrinsics: Transforms | None = None
     ) -> dict[str, Any] | None:
         """Raises ValueError where no transform relates the sightings' frame to the robot's."""
+        if odometry is not None and not self._moves(odometry):
+            odometry = None
         base = odometry or self._last
         if sightings is not None:
             if base is None:
@@ -130,6 +132,16 @@ class LandmarkSlam(Operator, merge=True):
             "ignored, ambiguous": counts.ambiguous,
         } | ignored
 
+    def _moves(self, odometry: Odometry) -> bool:
+        """Tells whether odometry can be used; where not, it is counted, and the next tells of both ways."""
+        if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
+            self._ignored["odometry: not finite"] += 1
+            return False
+        if self._last is not None and odometry.stamp <= self._last.stamp:
+            self._ignored["odometry: stamp not later than the last"] += 1
+            return False
+        return True
+
     def _planar(self, sightings: LandmarkSightings, T_base_sensor: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Identities, positions (N, 2) and covariances (N, 2, 2) in the robot's frame, of what is usable."""
         points, spread = _cartesian(sightings)
@@ -142,7 +154,9 @@ class LandmarkSlam(Operator, merge=True):
         ids = sightings.ids if self.association == "known" else np.full(sightings.count, -1)
         first = np.zeros(len(ids), bool)
         first[np.unique(ids, return_index=True)[1]] = True
-        usable &= first | (ids < 0)  # one landmark is one sighting of a message
+        again = ~first & (ids >= 0)  # one landmark is one sighting of a message
+        self._ignored["twice in a message"] += int((usable & again).sum())
+        usable &= ~again
         return ids[usable], flat[usable], R @ spread[usable] @ R.T
 
     def _advance(self, odometry: Odometry) -> bool:
@@ -177,7 +191,10 @@ class LandmarkSlam(Operator, merge=True):
         """Covariance (3, 3) of a step (x, y, heading)."""
         if odometry.twist_covariance is not None:
             planar = [0, 1, 5]
-            return np.asarray(odometry.twist_covariance[np.ix_(planar, planar)] * seconds**2)
+            given = odometry.twist_covariance[np.ix_(planar, planar)]
+            if np.isfinite(given).all() and (np.diag(given) >= 0).all():
+                return np.asarray(given * seconds**2)
+            self._ignored["covariance of odometry: not finite or negative"] += 1
         way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
         heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
         return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])

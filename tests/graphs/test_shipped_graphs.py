@@ -17,6 +17,11 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 GRAPHS = sorted((REPOSITORY / "graphs").rglob("*.yaml"))
 DEMO = REPOSITORY / "graphs" / "simulated_robot.yaml"
 
+SIMULATED = (
+    "cloud", "dead_reckoning", "depth", "fusion", "landmarks", "localize", "mapping", "mono", "orientation", "places",
+    "preprocessing", "redundant", "registration", "simulated_lidar", "simulated_stereo", "slam", "slam_lidar",
+)  # fmt: skip
+
 needs_weights = pytest.mark.skipif(
     not (shipped("detector.onnx").is_file() and shipped("segmenter.onnx").is_file()),
     reason="the networks are not in operators/weights",
@@ -34,6 +39,14 @@ def dataflow(*words: object) -> str:
 @pytest.mark.parametrize("file", [g for g in GRAPHS if g.parent.name == "graphs"], ids=lambda file: file.stem)
 def test_a_graph_passes_the_check(file: Path) -> None:
     assert load_graph(file).nodes
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_a_graph_of_geometry_runs_from_the_simulator(name: str) -> None:
+    words = ["--set", "duration=350ms", "--one-process", "--json", "-q"]
+    report = json.loads(dataflow("run", f"graphs/{name}.yaml", *words))
+    assert {operator: n["firings"] for operator, n in report["operators"].items() if not n["firings"]} == {}
+    assert {operator: n["dropped"] for operator, n in report["operators"].items() if n["dropped"]} == {}
 
 
 def test_the_simulated_robot_is_the_one_of_the_recording() -> None:
