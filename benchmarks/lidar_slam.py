@@ -93,9 +93,14 @@ def _wrong(off: Array) -> bool:
 
 
 def worlds(
-    named: list[tuple[str, int]], cache: Path, peers: Path | None, first: int, params: dict[str, Any], file: Path | None,
+    named: list[tuple[str, int]],
+    cache: Path,
+    peers: Path | None,
+    first: int,
+    params: dict[str, Any],
+    file: Path | None,
     motions: list[str],
-) -> None:  # fmt: skip
+) -> None:
     for world, seed in named:
         whole = rendered(cache, world, seed, seconds(world), 0.8).part(0, 10 * (first or seconds(world)))
         plain, by_azimuth = whole.without_times(), {"sweep": {"period": 1 / whole.sensor["rate"]}}
