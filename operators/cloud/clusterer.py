@@ -55,7 +55,7 @@ class Clusterer(Operator):
         doc="volume of the convex hull in m³, linearity, planarity and sphericity of each cluster, in the same order"
     )
     status: Out[Diagnostics] = Out(
-        doc="clusters, points in them, and points in none; a warning for an empty cloud, and for a pose that is not finite"
+        doc="clusters, points in them, points in none; a warning for an empty cloud, and a pose that is not finite"
     )
 
     up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")

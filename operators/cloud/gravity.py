@@ -31,8 +31,8 @@ def gravity(
 ) -> tuple[Array, float]:
     """Returns up (3,) in the cloud's frame and the height of that frame's origin in the pose's frame, whose z is up.
 
-    Without a finite pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the extrinsics
-    relate to it; ValueError says where they do not.
+    Without a finite pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the
+    extrinsics relate to it; ValueError says where they do not.
     """
     T = standing(cloud, pose, extrinsics)
     return (fallback, 0.0) if T is None else (np.asarray(T[2, :3]), float(T[2, 3]))

@@ -12,7 +12,7 @@ from dataflow.messages import CameraInfo, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_fit, told_again
-from operators.geometry.lens import check_model, is_distorted
+from operators.geometry.lens import check_model, check_projection, is_distorted
 from operators.image.preparation import Preparation, Tone, grey_of
 from operators.image.view import Window, fitting_view
 from operators.status import counted_status
@@ -86,6 +86,7 @@ class ImagePreprocess(Operator):
         else:
             if info.P is None:
                 raise ValueError("image_info must hold P, and R where it is turned, to rectify by")
+            check_projection("image", info)
             R, P = np.eye(3) if info.R is None else info.R, info.P
             K = P[:, :3]
         ideal = info.replace(

@@ -15,7 +15,7 @@ from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_fit, told_again
 from operators.geometry.extrinsics import transform_between
-from operators.geometry.lens import check_model
+from operators.geometry.lens import check_model, check_projection
 from operators.geometry.se3 import Matrix
 from operators.image.preparation import Preparation, Tone, grey_of
 from operators.image.rectification import projection, rectify
@@ -137,6 +137,8 @@ class StereoPreprocess(Operator):
         if T_left_right is None:
             assert left.P is not None
             assert right.P is not None
+            check_projection("left", left)
+            check_projection("right", right)
             turns, projections = (_rotation(left), _rotation(right)), (left.P, right.P)
         else:
             found = rectify(left, right, T_left_right, self.keep)

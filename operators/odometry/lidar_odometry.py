@@ -49,7 +49,9 @@ class LidarOdometry(Operator):
     near: float = Param(0.5, ge=0, doc="nearer points are left out: the robot itself", unit="m")
     far: float = Param(100.0, gt=1, doc="farther points are left out", unit="m")
     sweep: Sweep | None = Param(
-        None, doc="how the LiDAR turns, where its points do not say when each was measured; nothing is deskewed if none"
+        None,
+        doc="how the LiDAR turns (period, begins, clockwise, stamped), where its points do not say when each was measured; "
+        "nothing is deskewed if none",
     )
     spacing: float | None = Param(
         None, gt=0.01, doc="distance of the points that are kept; a fortieth of the median range if none", unit="m"

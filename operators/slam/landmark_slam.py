@@ -26,7 +26,8 @@ class LandmarkSlam(Operator, merge=True):
     messages around it. Motion noise is that of each message's twist covariance, taken as independent from message to
     message; where there is none that can be used, that of a differential drive by the parameters. Landmarks without
     identity are associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a
-    known landmark to be it and too near to be another is ignored and counted, and so is what is not finite.
+    known landmark to be it and too near to be another is ignored and counted, and so is what is not finite. Where
+    odometry jumps (its origin began anew), the robot may be anywhere that it can have reached.
 
     Method: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
     """
@@ -52,6 +53,9 @@ class LandmarkSlam(Operator, merge=True):
     side_noise: float = Param(0.005, gt=0, doc="and across it", unit="m/√m")
     turn_noise: float = Param(0.02, gt=0, doc="standard deviation of the heading after 1 m of travel", unit="rad/√m")
     spin_noise: float = Param(0.02, ge=0, doc="and after 1 rad of turning", unit="√rad")
+    max_speed: float = Param(
+        50.0, gt=0, doc="odometry that is faster has jumped: it tells nothing of this step", unit="m/s"
+    )
 
     def setup(self) -> None:
         self._begin()
@@ -169,7 +173,12 @@ class LandmarkSlam(Operator, merge=True):
             begin, span = last.stamp, odometry.stamp - last.stamp
             T = invert(_flat(last)) @ _flat(odometry)
             step = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
-            covariance = self._noise(odometry, step, span * 1e-9)
+            reach = self.max_speed * span * 1e-9
+            if math.hypot(step[0], step[1]) > reach:
+                self._ignored["step of odometry: a jump"] += 1
+                step, covariance = np.zeros(3), np.diag([reach**2, reach**2, min(math.pi, 10.0 * span * 1e-9) ** 2])
+            else:
+                covariance = self._noise(odometry, step, span * 1e-9)
         due, self._pending = self._pending, []
         done = 0.0
         for stamp, ids, points, spread in due:
@@ -228,6 +237,7 @@ def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
         raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
     r, b = sightings.ranges, sightings.bearings
     e = np.zeros_like(r) if sightings.elevations is None else sightings.elevations
+    r, b, e = (np.where(np.isfinite(one), one, np.nan) for one in (r, b, e))
     level = r * np.cos(e)
     points = np.column_stack([level * np.cos(b), level * np.sin(b), r * np.sin(e)])
     J = np.empty((len(r), 2, 2))

@@ -200,6 +200,7 @@ def test_hue_stays_where_brightness_changes() -> None:
     [
         (camera(distortion_model="poly", distortion=np.ones(3)), {}, "'poly'; known here are none, plumb_bob"),
         (camera(), {"lens": "rectify"}, "must hold P"),
+        (camera(P=np.zeros((3, 4))), {"lens": "rectify"}, "must hold P with focal lengths above zero"),
         (camera(), {"crop": (100, 0, 100, 10)}, r"crop \[100, 0, 100, 10\] reaches outside the image of 160x120"),
         (camera(width=WIDTH + 1), {}, "image has 160x120 pixels"),
         (camera(frame="other"), {}, "image is in frame 'camera'"),

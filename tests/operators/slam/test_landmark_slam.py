@@ -242,8 +242,8 @@ def test_bad_odometry_is_counted_and_the_next_tells_of_both_ways() -> None:
     messages = walk.messages()
     odometry = list(messages["odometry"])
     plain = play(LandmarkSlam(), messages)
-    odometry[40] = odometry[40].replace(position=[np.nan, 0, 0])  # type: ignore[attr-defined]
-    for k, C in ((60, np.full((6, 6), np.nan)), (61, -np.eye(6))):
+    odometry[30] = odometry[30].replace(position=[np.nan, 0, 0])  # type: ignore[attr-defined]
+    for k, C in ((45, np.full((6, 6), np.nan)), (46, -np.eye(6))):
         odometry[k] = odometry[k].replace(twist_covariance=C)  # type: ignore[attr-defined]
     operator = LandmarkSlam()
     result = play(operator, messages | {"odometry": odometry})
@@ -254,6 +254,20 @@ def test_bad_odometry_is_counted_and_the_next_tells_of_both_ways() -> None:
     counted = operator.summary()
     assert counted["ignored, odometry: not finite"] == 1
     assert counted["ignored, covariance of odometry: not finite or negative"] == 2
+
+
+def test_odometry_that_begins_anew_is_a_jump_and_the_landmarks_place_the_robot_again() -> None:
+    walk = Walk(2)
+    messages = walk.messages()
+    odometry = list(messages["odometry"])
+    for k in range(70, len(odometry)):
+        odometry[k] = odometry[k].replace(position=odometry[k].position + np.array([900.0, -400, 0]))  # type: ignore[attr-defined]
+    operator = LandmarkSlam()
+    result = play(operator, messages | {"odometry": odometry})
+    assert operator.summary()["ignored, step of odometry: a jump"] == 1
+    plain = play(LandmarkSlam(), messages)
+    off = result["pose"][-1].position - plain["pose"][-1].position  # type: ignore[attr-defined]
+    assert np.linalg.norm(off) < 0.1
 
 
 def test_a_landmark_that_is_twice_in_a_message_counts_once() -> None:
