@@ -18,8 +18,8 @@ class BaseOdometry(Operator):
     """Puts a camera's odometry on the robot: the pose of its base in the frame in which the base began.
 
     A camera's own odometry begins at its optical frame, tilted as it is mounted. With the extrinsics this gives a frame
-    whose z is up where the robot stood level at first, and whose origin is on the floor. A pose that is not finite gives
-    none, and is counted.
+    whose z is up where the robot stood level at first, and whose origin is on the floor. A pose that is not finite
+    gives none, and is counted.
     """
 
     sensor: In[Odometry] = In(doc="pose of a sensor in the frame where that sensor began")

@@ -50,8 +50,8 @@ class LidarOdometry(Operator):
     far: float = Param(100.0, gt=1, doc="farther points are left out", unit="m")
     sweep: Sweep | None = Param(
         None,
-        doc="how the LiDAR turns (period, begins, clockwise, stamped), where its points do not say when each was measured; "
-        "nothing is deskewed if none",
+        doc="how the LiDAR turns (period, begins, clockwise, stamped), where its points do not say when each was "
+        "measured; nothing is deskewed if none",
     )
     spacing: float | None = Param(
         None, gt=0.01, doc="distance of the points that are kept; a fortieth of the median range if none", unit="m"
