@@ -35,7 +35,7 @@ def main() -> None:
             seconds, points = [], []
             for frame in frames:
                 start = time.perf_counter()
-                cloud = builder.process(
+                made = builder.process(
                     frame["depth"],  # type: ignore[arg-type]
                     frame["image"],  # type: ignore[arg-type]
                     statics["depth_info"],  # type: ignore[arg-type]
@@ -43,7 +43,7 @@ def main() -> None:
                     statics["extrinsics"],  # type: ignore[arg-type]
                 )
                 seconds.append(time.perf_counter() - start)
-                points.append(len(cloud.points))
+                points.append(len(made["cloud"].points))  # type: ignore[attr-defined]
             edges = "on" if edge_ratio else "off"
             print(f"| {stride} | {edges} | {np.median(points):.0f} | {np.median(seconds) * 1e3:.1f} |")
 

@@ -15,7 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Boxes3D, CameraInfo, DepthImage, Image, Planes, Pose, SegmentationMap, Transforms
+from dataflow.messages import (
+    Boxes3D,
+    CameraInfo,
+    DepthImage,
+    Image,
+    Planes,
+    PointCloud,
+    Pose,
+    SegmentationMap,
+    Transforms,
+)
 from operators.cloud import CloudBuilder, CloudFilter, Clusterer, PlaneSegmenter
 from operators.cloud.plane_search import covered_area
 from operators.depth import DepthFilter
@@ -197,6 +207,12 @@ def score_flying(score: Score, fine: DepthImage, noise: float, rng: np.random.Ge
         score.counts[f"square {name}"] += error(image, where)  # type: ignore[assignment]
 
 
+def made_by(builder: CloudBuilder, *given: Any) -> PointCloud:
+    cloud = builder.process(*given)["cloud"]
+    assert isinstance(cloud, PointCloud)
+    return cloud
+
+
 def run(world: str, seed: int, frames: int) -> Score:
     score = Score()
     camera: dict[str, Any] = {"rate": 1.0}
@@ -230,8 +246,8 @@ def run(world: str, seed: int, frames: int) -> Score:
         rows, columns = np.mgrid[: depth.height, : depth.width]
         number = (rows * depth.width + columns).astype(np.int64)
         code = np.stack([number >> 16, (number >> 8) & 255, number & 255], axis=-1).astype(np.uint8)
-        cloud = builder.process(depth, image, info, image_info, extrinsics)
-        coded = builder.process(depth, image.replace(data=code), info, image_info)
+        cloud = made_by(builder, depth, image, info, image_info, extrinsics)
+        coded = made_by(builder, depth, image.replace(data=code), info, image_info)
         assert coded.colors is not None
         pixel = coded.colors.astype(np.int64) @ [65536, 256, 1]
         classes, instances = masks.classes.ravel()[pixel], masks.instances.ravel()[pixel]

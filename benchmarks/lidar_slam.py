@@ -34,6 +34,7 @@ from operators.slam import LidarSlam  # noqa: E402
 Array = NDArray[np.float64]
 
 TRY = 20  # scans at 10 Hz within which a LiDAR is to be found
+MOTIONS = ("deskewed", "as taken", "as taken, middle", "by azimuth")
 WRONG = (0.2, 0.1)  # metres and radians beyond which a pose or a loop is wrong
 COLUMNS = ("world", "motion", "odometry: ATE cm", "end cm", "SLAM: ATE cm", "end cm", "keyframes cm",
            "kiss-icp: ATE cm", "end cm", "NEES/6", "loops", "false", "keyframes", "views", "CPU ms: mean", "p95",
@@ -92,14 +93,24 @@ def _wrong(off: Array) -> bool:
 
 
 def worlds(
-    named: list[tuple[str, int]], cache: Path, peers: Path | None, first: int, params: dict[str, Any], file: Path | None
+    named: list[tuple[str, int]],
+    cache: Path,
+    peers: Path | None,
+    first: int,
+    params: dict[str, Any],
+    file: Path | None,
+    motions: list[str],
 ) -> None:
     for world, seed in named:
         whole = rendered(cache, world, seed, seconds(world), 0.8).part(0, 10 * (first or seconds(world)))
-        for motion, drive in (("deskewed", whole), ("as taken", whole.without_times())):
+        plain, by_azimuth = whole.without_times(), {"sweep": {"period": 1 / whole.sensor["rate"]}}
+        drives = {"deskewed": whole, "as taken": plain, "as taken, middle": plain.at_middle(), "by azimuth": plain}
+        for motion in motions:
+            drive = drives[motion]
             name = f"{world} {seed}, {len(drive.clouds) / 10:.0f} s"
-            row: dict[str, Any] = {"world": name, "motion": motion, **scored(drive, params)}
-            if peers is not None:
+            more = by_azimuth if motion == "by azimuth" else {}
+            row: dict[str, Any] = {"world": name, "motion": motion, **scored(drive, params | more)}
+            if peers is not None and motion in ("deskewed", "as taken"):
                 drive.sensor["far"] = params.get("far", drive.sensor["far"])
                 other = peer("kiss", peers)(drive)
                 row["kiss ATE"], row["kiss end"], _ = drift(other.poses, drive.truth)
@@ -121,8 +132,10 @@ def table(rows: list[Any]) -> None:
     print(f"| {' | '.join(COLUMNS)} |\n| --- | --- |{' ---: |' * (len(COLUMNS) - 2)}")
     for row in rows:
         print(_line(row))
-    for motion in ("deskewed", "as taken"):
+    for motion in MOTIONS:
         own = [row for row in rows if row["motion"] == motion]
+        if not own:
+            continue
         figures = [name for name in own[0] if name not in ("world", "motion")]
         for said, f in (("mean", np.mean), ("worst", np.max)):
             summary = {name: float(f([row[name] for row in own])) for name in figures}
@@ -184,6 +197,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=20, help="scans from try to try")
     parser.add_argument("--seconds", type=int, default=0, help="of a drive, if not the whole")
     parser.add_argument("--json", type=Path, help="file to which all figures are added")
+    parser.add_argument("--motions", nargs="+", choices=MOTIONS, default=["deskewed", "as taken"])
     arguments = parser.parse_args()
     if arguments.what == "table":
         table(json.loads(Path(arguments.worlds[0]).read_text()))
@@ -193,7 +207,7 @@ def main() -> None:
         relocalise(named, arguments.cache, arguments.every)
         return
     params = {name: float(value) for name, value in (pair.split("=") for pair in arguments.set)}
-    worlds(named, arguments.cache, arguments.peers, arguments.seconds, params, arguments.json)
+    worlds(named, arguments.cache, arguments.peers, arguments.seconds, params, arguments.json, arguments.motions)
 
 
 if __name__ == "__main__":

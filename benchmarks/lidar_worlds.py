@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Odometry, PointCloud, Transforms
+from dataflow.messages.geometry import invert
+from operators.geometry import se3
 
 Array = NDArray[np.float64]
 
@@ -26,6 +29,12 @@ class Drive:
 
     def without_times(self) -> Drive:
         return Drive([cloud.replace(time_offsets=None) for cloud in self.clouds], self.truth, self.sensor)
+
+    def at_middle(self) -> Drive:
+        """Returns the drive with the truth of half a turn before each stamp, which a scan without times shows."""
+        steps = [se3.log(invert(a) @ b) for a, b in pairwise(self.truth)]
+        truth = [T @ se3.exp(-0.5 * step) for T, step in zip(self.truth, [steps[0], *steps], strict=True)]
+        return Drive(self.clouds, truth, self.sensor)
 
     def part(self, first: int, count: int) -> Drive:
         """Returns `count` scans from the scan number `first` on."""

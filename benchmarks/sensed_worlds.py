@@ -123,9 +123,9 @@ def sense(kind: str, seed: int) -> World:
     frames = []
     for messages in robot.stream():
         m: dict[str, Any] = dict(messages)
-        cloud = builder.process(
-            m["depth"], m["image"], static["depth_info"], static["image_info"], static["extrinsics"]
-        )
+        made = builder.process(m["depth"], m["image"], static["depth_info"], static["image_info"], static["extrinsics"])
+        cloud = made["cloud"]
+        assert isinstance(cloud, PointCloud)
         frames.append(
             Frame(
                 detections=detector.process(m["image"]),

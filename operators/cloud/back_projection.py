@@ -50,6 +50,8 @@ def beside_edge(depth: Depth, stride: int, ratio: float) -> NDArray[np.bool_]:
     """
     height, width = depth.shape
     rows, columns = np.arange(0, height, stride), np.arange(0, width, stride)
+    if np.isinf(depth).any():  # as some cameras say that there was no return
+        depth = np.where(np.isinf(depth), np.float32(0), depth)
     z = depth[::stride, ::stride]
     edge = np.zeros(z.shape, np.bool_)
     for dv, du in ((-1, 0), (1, 0), (0, -1), (0, 1)):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Transforms
+import numpy as np
+
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, PointCloud, Transforms
+from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.back_projection import Rays, beside_edge, sample_colors, within_range
-from operators.geometry.calibration import check_calibration
+from operators.geometry.calibration import check_calibration, told_again
 from operators.geometry.extrinsics import transform_between
+from operators.status import counted_status
 
 
 class CloudBuilder(Operator):
@@ -27,6 +31,9 @@ class CloudBuilder(Operator):
         required=False, doc="holds the transform between the two cameras' frames, in either direction"
     )
     cloud: Out[PointCloud] = Out(doc="points with colours, row by row")
+    status: Out[Diagnostics] = Out(
+        doc="pixels, points, points that the colour camera sees; a warning where there is none"
+    )
 
     stride: int = Param(2, ge=1, live=True, doc="keep every stride-th pixel in both directions")
     min_range: float = Param(0.3, ge=0, live=True, doc="nearest depth kept", unit="m")
@@ -48,7 +55,7 @@ class CloudBuilder(Operator):
         depth_info: CameraInfo,
         image_info: CameraInfo,
         extrinsics: Transforms | None = None,
-    ) -> PointCloud:
+    ) -> dict[str, Message]:
         """Raises ValueError where an image has not the size or frame of its calibration, or no transform fits."""
         check_calibration("depth", depth, depth_info)
         check_calibration("image", image, image_info)
@@ -57,15 +64,27 @@ class CloudBuilder(Operator):
             usable &= ~beside_edge(depth.data, self.stride, self.edge_ratio)
         points = self._rays_of(depth_info).back_project(depth.data, usable)
         T_image_depth = transform_between(extrinsics, depth.frame, image.frame)
-        colors, _ = sample_colors(points, image.data, image_info.K, T_image_depth)
-        return PointCloud(stamp=depth.stamp, frame=depth.frame, points=points, colors=colors)
+        colors, seen = sample_colors(points, image.data, image_info.K, T_image_depth)
+        return {
+            "cloud": PointCloud(stamp=depth.stamp, frame=depth.frame, points=points, colors=colors),
+            "status": _status(depth.stamp, usable.size, len(points), int(np.count_nonzero(seen))),
+        }
 
     def _rays_of(self, info: CameraInfo) -> Rays:
         """The ray table, made once for each calibration and stride."""
         if self._rays is not None:
             known, rays = self._rays
-            if rays.stride == self.stride and (known is info or known == info):
+            if rays.stride == self.stride and told_again(known, info):
                 return rays
         rays = Rays.through(info.K, (info.width, info.height), self.stride)
         self._rays = info, rays
         return rays
+
+
+def _status(stamp: int, pixels: int, points: int, seen: int) -> Diagnostics:
+    text, level = f"{points} points of {pixels} pixels", Level.OK
+    if not points:
+        text, level = "no depth in range", Level.WARN
+    elif not seen:
+        text, level = f"{text}; the colour camera sees none of them", Level.WARN
+    return counted_status("cloud_builder", stamp, text, level, {"pixels": pixels, "points": points, "seen": seen})

@@ -25,7 +25,7 @@ from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.boards import Points, with_contents
 from operators.cloud.clustering import Shape, dbscan, kept, shape_of
 from operators.cloud.filtering import Voxels, finite
-from operators.cloud.gravity import gravity, unit
+from operators.cloud.gravity import gravity, told, unit
 from operators.status import counted_status
 
 FEATURES = "cluster shape: volume (m³), linearity, planarity, sphericity"
@@ -54,7 +54,9 @@ class Clusterer(Operator):
     features: Out[FeatureVector] = Out(
         doc="volume of the convex hull in m³, linearity, planarity and sphericity of each cluster, in the same order"
     )
-    status: Out[Diagnostics] = Out(doc="clusters, points in them, and points in none; a warning for an empty cloud")
+    status: Out[Diagnostics] = Out(
+        doc="clusters, points in them, points in none; a warning for an empty cloud, and a pose that is not finite"
+    )
 
     up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
     voxel: float = Param(0.02, gt=0.001, doc="side of the voxels that are clustered", unit="m")
@@ -93,12 +95,13 @@ class Clusterer(Operator):
             "points in clusters": int(sizes.sum()),
             "points in none": len(usable) - int(sizes.sum()),
         }
-        self._counts.update(counts | {"clouds": 1, "clouds without clusters": not shapes})
+        lost = pose is not None and not told(pose)
+        self._counts.update(counts | {"clouds": 1, "clouds without clusters": not shapes, "poses not finite": lost})
         return {
             "clusters": _clusters(cloud, labels, shapes),
             "boxes": _boxes(cloud, sizes, shapes),
             "features": _features(cloud, shapes),
-            "status": _status(cloud.stamp, counts),
+            "status": _status(cloud.stamp, counts, lost),
         }
 
     def snapshot(self) -> Mapping[str, Any]:
@@ -165,9 +168,10 @@ def _rows(rows: list[Any], width: int) -> NDArray[np.float64]:
     return np.array(rows, np.float64).reshape(-1, width)
 
 
-def _status(stamp: int, counts: Mapping[str, int]) -> Diagnostics:
+def _status(stamp: int, counts: Mapping[str, int], lost: bool) -> Diagnostics:
     usable = counts["points"] - counts["not finite"]
     text = f"{counts['clusters']} clusters of {counts['points in clusters']} points; {counts['points in none']} in none"
     if not usable:
         text = "the cloud has no finite point" if counts["points"] else "the cloud is empty"
-    return counted_status("clusterer", stamp, text, Level.OK if usable else Level.WARN, counts)
+    text += "; the pose is not finite, so up is the parameter's" if lost else ""
+    return counted_status("clusterer", stamp, text, Level.WARN if lost or not usable else Level.OK, counts)

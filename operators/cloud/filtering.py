@@ -11,12 +11,13 @@ from scipy.spatial import cKDTree
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+FARTHEST = 1e4  # metres: no sensor of a robot sees so far, so that is no measurement
 _LIMIT = 1 << 20  # voxels along one axis on either side of the origin; three such indices fit one int64
 
 
 def finite(points: NDArray[np.float32]) -> Mask:
-    """Returns which points have three finite coordinates."""
-    return np.asarray(np.isfinite(points).all(axis=1))
+    """Returns which points have three finite coordinates, none of them `FARTHEST` or more."""
+    return np.asarray((np.abs(points) < np.float32(FARTHEST)).all(axis=1))
 
 
 def in_range(points: NDArray[np.float32], near: float, far: float) -> Mask:

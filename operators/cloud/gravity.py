@@ -21,21 +21,27 @@ def unit(up: tuple[float, float, float]) -> Array:
     return np.array(up) / length
 
 
+def told(pose: Pose | Odometry | None) -> bool:
+    """Tells whether there is a pose, and it is finite: one that is not tells nothing of up."""
+    return pose is not None and bool(np.isfinite(pose.position).all() and np.isfinite(pose.orientation).all())
+
+
 def gravity(
     cloud: PointCloud, pose: Pose | Odometry | None, extrinsics: Transforms | None, fallback: Array
 ) -> tuple[Array, float]:
     """Returns up (3,) in the cloud's frame and the height of that frame's origin in the pose's frame, whose z is up.
 
-    Without a pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the extrinsics
-    relate to it; ValueError says where they do not.
+    Without a finite pose they are `fallback` and 0. The pose may be of the cloud's own frame or of one that the
+    extrinsics relate to it; ValueError says where they do not.
     """
     T = standing(cloud, pose, extrinsics)
     return (fallback, 0.0) if T is None else (np.asarray(T[2, :3]), float(T[2, 3]))
 
 
 def standing(cloud: PointCloud, pose: Pose | Odometry | None, extrinsics: Transforms | None) -> Array | None:
-    """Returns the pose (4, 4) of the cloud's frame in the pose's frame; None without a pose. Errors as `gravity`."""
-    if pose is None:
+    """Returns the pose (4, 4) of the cloud's frame in the pose's frame; None without a finite one. Errors as
+    `gravity`."""
+    if pose is None or not told(pose):
         return None
     posed = pose.child_frame or cloud.frame
     if posed != cloud.frame and extrinsics is None:

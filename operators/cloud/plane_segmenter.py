@@ -14,7 +14,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.cloud.filtering import finite
-from operators.cloud.gravity import standing, unit
+from operators.cloud.gravity import standing, told, unit
 from operators.cloud.plane_search import Plane, Scene, Search, find_planes, in_plane, tolerances
 from operators.cloud.surfaces import SURFACES, Rules, Surface, recognised
 from operators.cloud.wall_directions import WallDirections
@@ -52,7 +52,9 @@ class PlaneSegmenter(Operator):
     )
     surfaces: Out[Boxes3D] = Out(doc="the same planes in the same order as flat boxes with a class")
     rest: Out[PointCloud] = Out(doc="the points on no floor, wall, table top or ceiling")
-    status: Out[Diagnostics] = Out(doc="how many of each were found; a warning where the cloud is too small for any")
+    status: Out[Diagnostics] = Out(
+        doc="how many of each were found; a warning where the cloud is too small for any, or its pose is not finite"
+    )
 
     period: float = Param(0.0, ge=0, doc="clouds that come sooner after the last one looked at are left out", unit="s")
     up: tuple[float, float, float] = Param((0.0, 0.0, 1.0), doc="direction up in the cloud's frame where no pose comes")
@@ -114,7 +116,8 @@ class PlaneSegmenter(Operator):
         self._looked = cloud.stamp
         T = standing(cloud, pose, extrinsics)
         up, height = (self._up, 0.0) if T is None else (T[2, :3], float(T[2, 3]))
-        usable = np.flatnonzero(finite(cloud.points))
+        lost = pose is not None and not told(pose)
+        usable = np.flatnonzero(finite(cloud.points) & (not lost))
         points = cloud.points[usable]
         surfaces: list[Surface] = []
         labels = np.full(cloud.count, -1, np.int32)
@@ -129,12 +132,13 @@ class PlaneSegmenter(Operator):
         named = np.array([surface.name != "other" for surface in surfaces] + [False])
         found = Counter(surface.name for surface in surfaces)
         self._counts.update({name: found[name] for name in SURFACES} | {"clouds": 1, "clouds without": not surfaces})
+        self._counts["poses not finite"] += lost
         boxes = _boxes(cloud, surfaces, labels)
         return {
             "planes": _planes(cloud, surfaces, labels),
             "surfaces": boxes,
             "rest": _without(cloud, named[labels]),
-            "status": _status(cloud, found, self._floor is not None),
+            "status": _status(cloud, found, self._floor is not None, lost),
         }
 
     def _surfaces(self, scene: Scene, floor: float | None, R: Array) -> tuple[list[Surface], float | None]:
@@ -250,10 +254,12 @@ def _without(cloud: PointCloud, taken: NDArray[np.bool_]) -> PointCloud:
     )
 
 
-def _status(cloud: PointCloud, found: Mapping[str, int], floor_known: bool) -> Diagnostics:
+def _status(cloud: PointCloud, found: Mapping[str, int], floor_known: bool, lost: bool) -> Diagnostics:
     text = ", ".join(f"{found[name]} {name}" for name in SURFACES if found[name]) or "no plane in the cloud"
     if not floor_known:
         text += "; no floor so far, so level planes have no class"
+    if lost:
+        text = "the pose is not finite, so nobody knows where up is, and no plane was looked for"
     level = Level.OK if found and floor_known else Level.WARN
     counts = {"points": cloud.count} | {name: found[name] for name in SURFACES}
     return counted_status("plane_segmenter", cloud.stamp, text, level, counts)

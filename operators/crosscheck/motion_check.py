@@ -82,11 +82,17 @@ class MotionCheck(Operator, merge=True):
         for sample in imu:
             name = f"gyroscope of {sample.frame}"
             self._blind.add(name)
+            if not np.isfinite(sample.angular_velocity).all():
+                self._counts[f"{name}: not finite"] += 1
+                continue
             rate = turns[sample.frame] @ sample.angular_velocity
             self._follow(name, sample.stamp, sample.angular_velocity)
             self._track(name).twist(sample.stamp, np.concatenate([np.zeros(3), rate]))
         for stream, odometry in (motions or {}).items():
             T = transform_between(extrinsics, odometry.child_frame, self.base_frame)
+            if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
+                self._counts[f"{stream.partition('/')[2]}: not finite"] += 1
+                continue
             self._track(stream.partition("/")[2]).pose(odometry.stamp, T @ odometry.matrix() @ invert(T))
         messages: dict[str, Message] = {}
         if wheels is not None:
@@ -135,6 +141,10 @@ class MotionCheck(Operator, merge=True):
         """The wheels' message if nothing contradicts it."""
         if wheels.linear is None or wheels.angular is None:
             return {"checked": wheels}
+        if not all(np.isfinite(part).all() for part in (wheels.position, wheels.linear, wheels.angular)):
+            self._counts["wheels: not finite"] += 1
+            self._counts["held back"] += 1
+            return {}
         self._track(_WHEELS).twist(wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
         self._follow(_WHEELS, wheels.stamp, np.concatenate([wheels.linear, wheels.angular]))
         self._slipping = self._slips(wheels)

@@ -23,13 +23,16 @@ if TYPE_CHECKING:
 
 Nearness = NDArray[np.float32]
 
+LEAST_CONTRAST = 4.0  # standard deviation of grey levels below which an image shows nothing
+
 
 class MonoDepth(Operator):
     """Estimates which pixels of an image are near, with an ONNX model on one CPU thread; metric where depths are given.
 
     One image tells no scale: `relative` is inverse depth up to a factor and a constant. Where `sparse` gives metric
     depth at some pixels (a stereo pair's, a projected LiDAR's), both are fitted to it, robustly, image by image, and
-    `depth` is the whole image in metres; without agreement there is no `depth`, and `status` says so.
+    `depth` is the whole image in metres; without agreement there is no `depth`, and `status` says so. An image that is
+    black or without contrast gives neither.
 
     The model takes one (1, 3, H, W) float32 input of RGB from 0 to 255 and gives one value per pixel, larger for
     nearer, as those of Li et al., "Enforcing temporal consistency in video depth estimation", 2021 (TCMonoDepth). The
@@ -44,7 +47,9 @@ class MonoDepth(Operator):
     )
     relative: Out[RelativeDepth] = Out(doc="nearness at the image's pixels")
     depth: Out[DepthImage] = Out(doc="depth in metres, where `sparse` gives a scale; 0 where it is beyond `max_range`")
-    status: Out[Diagnostics] = Out(doc="the scale and how many depths agree; a warning where `sparse` gives none")
+    status: Out[Diagnostics] = Out(
+        doc="the scale and how many depths agree; a warning where `sparse` gives none, or the image shows nothing"
+    )
 
     model: str = Param(min_length=1, doc="ONNX file")
     align: Literal["scale_and_shift", "scale"] = Param(
@@ -65,9 +70,12 @@ class MonoDepth(Operator):
 
     def process(self, image: Image, sparse: DepthImage | None = None) -> dict[str, Any]:
         """Raises ValueError where the given depths are of another view, ModelError for an output of another shape."""
+        counts = {"given": 0, "agreeing": 0}
+        if (flaw := _flaw(image.data)) is not None:
+            self._counts.update({"images": 1, f"images {flaw}": 1})
+            return {"status": counted_status("mono_depth", image.stamp, f"the image is {flaw}", Level.WARN, counts)}
         nearness = self._nearness(image.data)
         messages: dict[str, Any] = {"relative": RelativeDepth(stamp=image.stamp, frame=image.frame, data=nearness)}
-        counts = {"given": 0, "agreeing": 0}
         scaling, text, level = None, "no metric depth is given: relative only", Level.OK
         if sparse is not None:
             scaling, counts = self._scaling(nearness, sparse)
@@ -131,6 +139,14 @@ class MonoDepth(Operator):
             if found.agreeing < self.least_agreeing * found.given:
                 found = None
         return found, counts
+
+
+def _flaw(pixels: NDArray[np.uint8]) -> str | None:
+    """Returns what keeps an image from showing anything."""
+    spread = float(pixels.std())
+    if spread >= LEAST_CONTRAST:
+        return None
+    return "black" if float(pixels.mean()) < 16.0 else "without contrast"
 
 
 def _input_of(file: Path, session: onnxruntime.InferenceSession) -> tuple[str, tuple[int, int]]:

@@ -52,7 +52,7 @@ class ConsistencyMetrics(Operator):
         self._true_stamps: list[int] = []
         self._truths: list[Pose | Odometry] = []
         self._innovations: Innovations = {}
-        self._passed_over = 0
+        self._passed_over = self._truths_not_finite = 0
         self._figures: dict[str, float | int | str] = {}
 
     def process(
@@ -72,6 +72,9 @@ class ConsistencyMetrics(Operator):
                         f"the ground truth {what} {true!r} but the estimate {found!r}: covariances are of one frame, "
                         "so nothing is aligned"
                     )
+            if not (np.isfinite(truth.position).all() and np.isfinite(truth.orientation).all()):
+                self._truths_not_finite += 1
+                continue
             self._true_stamps.append(truth.stamp)
             self._truths.append(truth)
         if status is not None:
@@ -91,6 +94,8 @@ class ConsistencyMetrics(Operator):
         """Computes the figures."""
         pairs = mutually_nearest(self._stamps, self._true_stamps, self.tolerance)
         self._figures = {"matched": len(pairs), "estimates without finite covariance": self._passed_over}
+        if self._truths_not_finite:
+            self._figures["truths not finite"] = self._truths_not_finite
         found = []
         for i, j in pairs:
             estimate, covariance = self._estimates[i]

@@ -47,7 +47,7 @@ class TrajectoryMetrics(Operator):
 
     def setup(self) -> None:
         self._estimate, self._truth = PoseLog(), PoseLog()
-        self._not_finite = 0
+        self._not_finite = self._truths_not_finite = 0
         self._figures: dict[str, float | int | str] = {}
 
     def process(self, estimate: Pose | Odometry, ground_truth: tuple[Pose | Odometry, ...]) -> None:
@@ -58,7 +58,10 @@ class TrajectoryMetrics(Operator):
                     f"the ground truth poses {truth.child_frame!r} but the estimate {estimate.child_frame!r}: "
                     f"both must pose the same frame"
                 )
-            self._truth.append(truth.stamp, truth.position, truth.orientation)
+            if np.isfinite(truth.position).all():
+                self._truth.append(truth.stamp, truth.position, truth.orientation)
+            else:
+                self._truths_not_finite += 1
         if np.isfinite(estimate.position).all():
             self._estimate.append(estimate.stamp, estimate.position, estimate.orientation)
         else:
@@ -80,6 +83,8 @@ class TrajectoryMetrics(Operator):
             "path_m": path_length(matches.truth),
             "alignment": self.alignment,
         }
+        if self._truths_not_finite:
+            self._figures["truths_not_finite"] = self._truths_not_finite
         try:
             self._figures |= absolute_error(matches, self.alignment)
         except ValueError as error:

@@ -73,7 +73,8 @@ class TrajectoryPlots(Operator):
             self._told_at = status.stamp
             self._innovate(status)
         truth = self._truth
-        if truth is None or abs(estimate.stamp - truth.stamp) > self.tolerance or not _finite(estimate):
+        far = truth is None or abs(estimate.stamp - truth.stamp) > self.tolerance
+        if truth is None or far or not (_finite(estimate) and _finite(truth)):
             self._unpaired += 1
             return {}
         if estimate.child_frame and truth.child_frame and estimate.child_frame != truth.child_frame:

@@ -22,8 +22,8 @@ class TransformTree(Operator, merge=True):
     A pose is asked for at the stamp of every message of `at`, and answered as soon as all transforms on the way are
     known at that stamp or after it: between two stamps they are interpolated on SE(3), at a constant twist. One answer
     is given at a time, oldest first, stamped as the question. A question that cannot be answered in time is dropped;
-    one before a transform's first stamp or in a gap, at once. A transform that contradicts the tree (a loop, a second
-    parent, a repeated stamp) is left out. Status names and counts each.
+    one before a transform's first stamp or in a gap, at once. A transform that is not finite or contradicts the tree (a
+    loop, a second parent, a repeated stamp) is left out. Status names and counts each.
 
     Method: Foote, "tf: the transform library", 2013; REP 105 for the tree's shape.
     """

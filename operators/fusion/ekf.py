@@ -53,7 +53,8 @@ class EkfFusion(Operator):
     Settings of a stream stand under the end of its name (`robot/fix`); the status names those of no stream. A
     chi-square gate refuses what does not fit; measurements that fit only because the filter knows little wait for a
     second one that agrees, and refused ones that agree with each other show the filter to be wrong, which makes room
-    for them. Detections of a radar and ranges may be of something else, so the filter never yields to those.
+    for them. Detections of a radar and ranges may be of something else, so the filter never yields to those. A radar
+    counts by its Doppler velocities, or, as `range`, by its distances from landmarks that its `ids` name.
 
     A sensor's time offset is a setting, `offset`; with `offset_sigma` it is a state of the filter and estimated, as far
     as the motion tells of it. So are a position's error that changes slowly, as satellites have (`drift`), and the

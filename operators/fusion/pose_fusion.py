@@ -94,6 +94,9 @@ class PoseFusion(Operator):
         given = message.covariance if isinstance(message, Pose) else message.pose_covariance
         if given is None:
             raise ValueError(f"{name}: its messages have no covariance: how good they are must be known")
+        if not (np.isfinite(message.position).all() and np.isfinite(message.orientation).all()):
+            self._sensors.ignored[f"{name}: not finite"] += 1
+            return None
         T_child_base = invert(transform_between(extrinsics, message.child_frame or self.base_frame, self.base_frame))
         T = transform_matrix(message.position, message.orientation) @ T_child_base
         J = np.eye(6)

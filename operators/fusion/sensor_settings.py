@@ -98,7 +98,7 @@ _FITTING: dict[str, tuple[type[Message], ...]] = {
     "heading": (MagneticField,),
     "control": (Twist,),
     "doppler": (RadarScan,),
-    "range": (LandmarkSightings,),
+    "range": (LandmarkSightings, RadarScan),
 }
 
 

@@ -80,9 +80,9 @@ def measurements(
             raise Unusable("no field")
         sigma = settings.angular_sigma or 0.1
         yield time, name, MagneticHeading(measured, settings.azimuth), np.array([[sigma**2]])
-    elif isinstance(message, RadarScan):
+    elif isinstance(message, RadarScan) and use == "doppler":
         yield from _doppler(time, name, message, settings, around)
-    elif isinstance(message, LandmarkSightings):
+    elif isinstance(message, LandmarkSightings | RadarScan):
         yield from _ranges(time, name, message, settings, around)
 
 
@@ -225,10 +225,14 @@ def _doppler(time: int, name: str, scan: RadarScan, settings: SensorSettings, ar
 
 
 def _ranges(
-    time: int, name: str, sightings: LandmarkSightings, settings: SensorSettings, around: Surroundings
+    time: int, name: str, sightings: LandmarkSightings | RadarScan, settings: SensorSettings, around: Surroundings
 ) -> Iterator[Found]:
+    """Distances to landmarks, of a sensor that knows which they are: a radar's detections by their `ids`."""
     if sightings.ranges is None:
         raise Unusable("no ranges")
+    if sightings.ids is None:
+        raise Unusable("no identities")
+    covariances = sightings.covariances if isinstance(sightings, LandmarkSightings) else None
     if around.landmarks is None or around.landmarks.positions is None:
         raise Unusable("no map of landmarks")
     if around.landmarks.positions.shape[1] != 3:
@@ -236,7 +240,7 @@ def _ranges(
     places = dict(zip(around.landmarks.ids.tolist(), around.landmarks.positions, strict=True))
     lever = around.place(sightings.frame)[:3, 3]
     for k, (identity, distance) in enumerate(zip(sightings.ids.tolist(), sightings.ranges.tolist(), strict=True)):
-        C = None if sightings.covariances is None else sightings.covariances[k, :1, :1]
+        C = None if covariances is None else covariances[k, :1, :1]
         try:
             noise = covariance_of(name, C, settings.sigma, "sigma")[:1, :1]
             if identity not in places:

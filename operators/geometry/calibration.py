@@ -7,6 +7,14 @@ import numpy as np
 from dataflow.messages import CameraInfo, DepthImage, Image
 
 
+def told_again(known: CameraInfo | None, given: CameraInfo) -> bool:
+    """Tells whether a calibration says what is known already, whatever its stamp: many cameras send it with each image.
+
+    None is known of nothing.
+    """
+    return known is given or (known is not None and known.replace(stamp=given.stamp) == given)
+
+
 def check_fit(port: str, image: DepthImage | Image, info: CameraInfo) -> None:
     """Raises ValueError unless an image has the size and frame of its calibration.
 

@@ -13,14 +13,21 @@ from operators.geometry.se3 import Matrix
 def transform_between(extrinsics: Transforms | None, source: str, target: str) -> Matrix:
     """Returns `T_target_source` (4, 4): the identity where the frames are one or no extrinsics are given.
 
-    Raises ValueError where the extrinsics do not relate the two frames, in either direction or over others.
+    Raises ValueError where the extrinsics do not relate the two frames, in either direction or over others, or by a
+    transform that is not finite.
     """
     if extrinsics is None or source == target:
         return np.eye(4)
+    T_target_source = _between(extrinsics, source, target)
+    if not np.isfinite(T_target_source).all():
+        raise ValueError(f"extrinsics hold a transform between {source!r} and {target!r} that is not finite")
+    return T_target_source
+
+
+def _between(extrinsics: Transforms, source: str, target: str) -> Matrix:
     known = list(zip(extrinsics.frames, extrinsics.child_frames, strict=True))
     if (target, source) in known:
-        T_target_source: Matrix = extrinsics.matrices()[known.index((target, source))]
-        return T_target_source
+        return np.asarray(extrinsics.matrices()[known.index((target, source))])
     if (source, target) in known:
         return invert(extrinsics.matrices()[known.index((source, target))])
     tree = FrameTree()

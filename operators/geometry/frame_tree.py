@@ -18,7 +18,9 @@ from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.geometry.se3 import Matrix
 
-Reason = Literal["loop", "second parent", "repeated", "unknown frame", "not connected", "too early", "too late", "gap"]
+Reason = Literal[
+    "loop", "second parent", "repeated", "not finite", "unknown frame", "not connected", "too early", "too late", "gap"
+]
 
 
 class TransformError(ValueError):
@@ -51,14 +53,19 @@ class FrameTree:
         self._edges: dict[str, _Edge] = {}
 
     def fix(self, frame: str, child: str, T_frame_child: Matrix) -> None:
-        """Takes in a transform that never changes. Raises TransformError for a loop or a second parent."""
+        """Takes in a transform that never changes.
+
+        Raises TransformError for a loop, a second parent, or one that is not finite.
+        """
+        _check_finite(frame, child, T_frame_child)
         self._edge(frame, child).fixed = np.array(T_frame_child, np.float64)
 
     def add(self, stamp: int, frame: str, child: str, T_frame_child: Matrix) -> None:
         """Takes in a transform at a stamp above the newest one of its frame.
 
-        Raises TransformError for a loop, a second parent, or a stamp that is not newer.
+        Raises TransformError for a loop, a second parent, a stamp that is not newer, or one that is not finite.
         """
+        _check_finite(frame, child, T_frame_child)
         edge = self._edge(frame, child)
         if edge.stamps and stamp <= edge.stamps[-1]:
             raise TransformError(
@@ -153,6 +160,11 @@ class FrameTree:
                 "gap", f"{name} is not known between {before} and {after}, {(after - before) * 1e-9:.3f} s apart"
             )
         return se3.interpolated(matrices[i - 1], matrices[i], (stamp - before) / (after - before))
+
+
+def _check_finite(frame: str, child: str, T_frame_child: Matrix) -> None:
+    if not np.isfinite(T_frame_child).all():
+        raise TransformError("not finite", f"{child!r} in {frame!r} is not finite")
 
 
 def told_by(message: Transforms | Pose | Odometry) -> list[tuple[str, str, Matrix]]:

@@ -33,6 +33,12 @@ def check_model(port: str, info: CameraInfo) -> None:
         raise ValueError(f"{port}_info has the distortion model {info.distortion_model!r}; known here are {known}")
 
 
+def check_projection(port: str, info: CameraInfo) -> None:
+    """Raises ValueError where P of the rectified camera has no focal lengths: the camera was not calibrated."""
+    if info.P is None or not (info.P[0, 0] > 0 and info.P[1, 1] > 0):
+        raise ValueError(f"{port}_info must hold P with focal lengths above zero to rectify by, got {info.P}")
+
+
 def undistorted(pixels: Pixels, info: CameraInfo) -> Pixels:
     """Returns normalised coordinates (N, 2) of raw pixels (N, 2).
 

@@ -11,8 +11,8 @@ import numpy as np
 from dataflow.messages import CameraInfo, Diagnostics, Image
 from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.geometry.calibration import check_fit
-from operators.geometry.lens import check_model, is_distorted
+from operators.geometry.calibration import check_fit, told_again
+from operators.geometry.lens import check_model, check_projection, is_distorted
 from operators.image.preparation import Preparation, Tone, grey_of
 from operators.image.view import Window, fitting_view
 from operators.status import counted_status
@@ -53,7 +53,7 @@ class ImagePreprocess(Operator):
     def process(self, image: Image, image_info: CameraInfo) -> dict[str, Any]:
         """Raises ValueError where image and calibration do not fit, or that does not do for what is asked for."""
         check_fit("image", image, image_info)
-        if self._made is None or self._made[0] != image_info:
+        if self._made is None or not told_again(self._made[0], image_info):
             self._made = (image_info, self._preparation(image_info))
         preparation = self._made[1]
         pixels = preparation.apply(grey_of(image.data) if self.grey else image.data)
@@ -86,6 +86,7 @@ class ImagePreprocess(Operator):
         else:
             if info.P is None:
                 raise ValueError("image_info must hold P, and R where it is turned, to rectify by")
+            check_projection("image", info)
             R, P = np.eye(3) if info.R is None else info.R, info.P
             K = P[:, :3]
         ideal = info.replace(

@@ -13,22 +13,25 @@ from dataflow.messages import CameraInfo, Diagnostics, Image, Transforms
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import In, Operator, Out, Param, Sampled
-from operators.geometry.calibration import check_fit
+from operators.geometry.calibration import check_fit, told_again
 from operators.geometry.extrinsics import transform_between
-from operators.geometry.lens import check_model
+from operators.geometry.lens import check_model, check_projection
 from operators.geometry.se3 import Matrix
 from operators.image.preparation import Preparation, Tone, grey_of
 from operators.image.rectification import projection, rectify
 from operators.image.view import Window
 from operators.status import counted_status
 
-Calibration = tuple[CameraInfo, CameraInfo, Transforms | None]
-
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """Both images' preparations, what they have in common, and where the rectified cameras look."""
+    """Both images' preparations, what they have in common, and where the rectified cameras look.
 
+    `infos` and `T_left_right` (None where the calibrations say all) are what it was made of.
+    """
+
+    infos: tuple[CameraInfo, CameraInfo]
+    T_left_right: Matrix | None
     left: Preparation
     right: Preparation
     baseline: float
@@ -71,7 +74,7 @@ class StereoPreprocess(Operator):
     normalize: Tone = Param("none", doc="how brightness is made even: stretched, equalised, or equalised in parts")
     suffix: str = Param("_rectified", min_length=1, doc="added to the frames' names")
 
-    _made: tuple[Calibration, _Pair] | None = None
+    _pair: _Pair | None = None
 
     def setup(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -83,10 +86,7 @@ class StereoPreprocess(Operator):
         """Raises ValueError where an image does not fit its calibration, or the two cannot be rectified."""
         check_fit("left", left, left_info)
         check_fit("right", right, right_info)
-        given = (left_info, right_info, extrinsics)
-        if self._made is None or self._made[0] != given:
-            self._made = (given, self._pair(*given))
-        pair = self._made[1]
+        pair = self._pair_of(left_info, right_info, extrinsics)
         messages: dict[str, Any] = {"frames": pair.frames.replace(stamp=left.stamp)}
         for name, image, preparation in (("left", left, pair.left), ("right", right, pair.right)):
             pixels = preparation.apply(grey_of(image.data) if self.grey else image.data)
@@ -110,7 +110,23 @@ class StereoPreprocess(Operator):
     def summary(self) -> Mapping[str, float | int]:
         return dict(self._counts)
 
-    def _pair(self, left: CameraInfo, right: CameraInfo, extrinsics: Transforms | None) -> _Pair:
+    def _pair_of(self, left: CameraInfo, right: CameraInfo, extrinsics: Transforms | None) -> _Pair:
+        """Returns how the pair is prepared; that is worked out anew where it is told something else."""
+        T_left_right = None
+        if left.P is None or right.P is None:
+            if extrinsics is None:
+                raise ValueError("left_info and right_info hold no P to rectify by, and there are no extrinsics")
+            T_left_right = transform_between(extrinsics, right.frame, left.frame)
+        made = self._pair
+        if made is None or not (
+            told_again(made.infos[0], left)
+            and told_again(made.infos[1], right)
+            and np.array_equal(made.T_left_right, T_left_right)
+        ):
+            made = self._pair = self._worked_out(left, right, T_left_right)
+        return made
+
+    def _worked_out(self, left: CameraInfo, right: CameraInfo, T_left_right: Matrix | None) -> _Pair:
         check_model("left", left)
         check_model("right", right)
         if (left.width, left.height) != (right.width, right.height):
@@ -118,12 +134,13 @@ class StereoPreprocess(Operator):
                 f"left has {left.width}x{left.height} pixels, but right {right.width}x{right.height}: a pair that is "
                 f"rectified must have one size"
             )
-        if left.P is not None and right.P is not None:
+        if T_left_right is None:
+            assert left.P is not None
+            assert right.P is not None
+            check_projection("left", left)
+            check_projection("right", right)
             turns, projections = (_rotation(left), _rotation(right)), (left.P, right.P)
-        elif extrinsics is None:
-            raise ValueError("left_info and right_info hold no P to rectify by, and there are no extrinsics")
         else:
-            T_left_right = transform_between(extrinsics, right.frame, left.frame)
             found = rectify(left, right, T_left_right, self.keep)
             turns = (found.R_left, found.R_right)
             projections = (projection(found.K, 0.0), projection(found.K, found.baseline))
@@ -133,7 +150,8 @@ class StereoPreprocess(Operator):
             for info, R, P in zip((left, right), turns, projections, strict=True)
         ]
         baseline = float((projections[0][0, 3] - projections[1][0, 3]) / projections[1][0, 0])
-        return _Pair(prepared[0], prepared[1], baseline, _turned((left, right), turns, self.suffix))
+        frames = _turned((left, right), turns, self.suffix)
+        return _Pair((left, right), T_left_right, prepared[0], prepared[1], baseline, frames)
 
 
 def _rotation(info: CameraInfo) -> Matrix:

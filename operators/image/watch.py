@@ -43,5 +43,5 @@ class DepthWatch(Watching, Operator):
     least: float = Param(0.01, ge=0, le=1, live=True, doc="least share of pixels with a return")
 
     def process(self, depth: DepthImage) -> Mapping[str, Message]:
-        empty = float((depth.data > 0).mean()) < self.least
+        empty = float(((depth.data > 0) & (depth.data < float("inf"))).mean()) < self.least
         return self.passed(depth, depth.data, "has no returns" if empty else None)

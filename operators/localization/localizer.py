@@ -206,6 +206,8 @@ class ParticleFilterLocalizer(Operator, merge=True):
     def _take_map(self, grid: OccupancyGrid) -> None:
         if grid.frame != self.map_frame:
             raise ValueError(f"the map is in {grid.frame!r}, but the robot is looked for in {self.map_frame!r}")
+        if not np.isfinite(grid.matrix()).all():
+            raise ValueError(f"the map's place in {grid.frame!r} is not finite: {grid.position.tolist()}")
         self._grid, self._field = grid, LikelihoodField(grid, self.hit_sigma, self.stray)
 
     def _moves(self, odometry: Odometry) -> bool:

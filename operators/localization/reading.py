@@ -28,6 +28,9 @@ from operators.localization.observations import Observation, Placed, Scan, Sight
 Array = NDArray[np.float64]
 
 
+_FARTHEST = 1e6  # metres from the origin of a map: farther landmarks are none
+
+
 class Unusable(Exception):
     """A message that is ignored: says why."""
 
@@ -107,8 +110,10 @@ def _landmarks(name: str, sightings: LandmarkSightings, around: Surroundings) ->
     if sightings.covariances is None:
         raise ValueError(f"{name}: sightings have no covariances: how well a landmark was seen must be known")
     seen, spread = cartesian(sightings)
-    everywhere = np.asarray(around.landmarks.positions[:, :2])
-    known = {i: everywhere[k : k + 1] for k, i in enumerate(around.landmarks.ids.tolist())}
+    flat = np.asarray(around.landmarks.positions[:, :2])
+    placed = (np.abs(flat) < _FARTHEST).all(axis=1)  # not where a coordinate is not finite
+    everywhere = flat[placed]
+    known = {i: flat[k : k + 1] for k, i in enumerate(around.landmarks.ids.tolist()) if placed[k]}
     places = [known.get(i) if i >= 0 else everywhere for i in sightings.ids.tolist()]
     return _sightings(seen, spread, places, sightings.frame, around)
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from dataflow.messages import Odometry, Transforms
@@ -14,10 +18,9 @@ class BaseOdometry(Operator):
     """Puts a camera's odometry on the robot: the pose of its base in the frame in which the base began.
 
     A camera's own odometry begins at its optical frame, tilted as it is mounted. With the extrinsics this gives a frame
-    whose z is up where the robot stood level at first, and whose origin is on the floor.
+    whose z is up where the robot stood level at first, and whose origin is on the floor. A pose that is not finite
+    gives none, and is counted.
     """
-
-    stateless = True
 
     sensor: In[Odometry] = In(doc="pose of a sensor in the frame where that sensor began")
     extrinsics: Sampled[Transforms] = Sampled(doc="holds the transform between the sensor's frame and the base's")
@@ -26,7 +29,10 @@ class BaseOdometry(Operator):
     base_frame: str = Param("base_link", min_length=1, doc="frame of the robot's base")
     frame: str = Param("odom_base", min_length=1, doc="name of the frame in which the base began")
 
-    def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry:
+    def setup(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry | None:
         """Raises ValueError where the extrinsics do not hold the sensor, or a pose without scale is beside the base."""
         T_base_sensor = transform_between(extrinsics, sensor.child_frame, self.base_frame)
         if _without_scale(sensor) and T_base_sensor[:3, 3].any():
@@ -34,6 +40,9 @@ class BaseOdometry(Operator):
                 f"{sensor.child_frame!r} is posed without a scale (its positions have infinite variances), so where "
                 f"{self.base_frame!r} is beside it cannot be told"
             )
+        if not (np.isfinite(sensor.position).all() and np.isfinite(sensor.orientation).all()):
+            self._counts["poses not finite"] += 1
+            return None
         T = T_base_sensor @ sensor.matrix() @ invert(T_base_sensor)
         return Odometry.from_matrix(
             T,
@@ -42,6 +51,15 @@ class BaseOdometry(Operator):
             child_frame=self.base_frame,
             pose_covariance=_carried(sensor, T_base_sensor, T),
         )
+
+    def snapshot(self) -> Mapping[str, Any]:
+        return dict(self._counts)
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        self._counts = Counter({key: int(count) for key, count in state.items()})
+
+    def summary(self) -> Mapping[str, int]:
+        return dict(self._counts)
 
 
 def _without_scale(sensor: Odometry) -> bool:

@@ -35,6 +35,12 @@ class RgbdCamera:
 
     T_color_depth: Matrix = field(init=False)
 
+    def check_same(self, other: "RgbdCamera") -> None:
+        """Raises ValueError unless another has the same geometry: what was seen through this one says nothing of it."""
+        for name in ("K_color", "K_depth", "T_depth_color"):
+            if not np.array_equal(getattr(self, name), getattr(other, name)):
+                raise ValueError(f"the calibration changed ({name} is another): one camera, one calibration")
+
     def depth_at(
         self, pixels_color: Pixels, depth: NDArray[np.float32], near: float, far: float
     ) -> tuple[Points, NDArray[np.bool_]]:

@@ -14,6 +14,7 @@ from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.se3 import Matrix, about_fixed_axes, adjoint
+from operators.odometry.lidar_sweep import Sweep
 from operators.odometry.lidar_tracker import LidarTracker, State, Tracked, TrackerConfig
 
 _LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
@@ -22,11 +23,13 @@ _LEVELS = {State.PREDICTED: Level.WARN, State.LOST: Level.ERROR}
 class LidarOdometry(Operator):
     """Tracks a LiDAR by the planes of a map that it makes of its own scans; the first scan is the origin.
 
-    A scan whose points have `time_offsets` is deskewed with the velocity that its own pose means. Scans that measure
+    A scan whose points have `time_offsets`, or get them by `sweep`, is deskewed with the velocity that its own pose
+    means. Without either, its pose is that of the middle of the turn rather than that of the stamp. Scans that measure
     nothing are bridged with the velocity so far, for `patience`; then the LiDAR is lost, there are no poses, and it is
     looked for within three metres of where it was, in any heading; after `give_up` a new map begins there. The
     covariance is that of the whole way: it grows when the LiDAR leaves what it has mapped and with every bridge, and
-    along directions that the surroundings tell nothing of (a bare corridor), which the status names.
+    along directions that the surroundings tell nothing of (a bare corridor), which the status names. A scan that repeats
+    the last one means that the LiDAR stands: where a sensor may hang, ScanWatch before this operator holds it back.
 
     Method: scan to map, point to plane. Yuan et al., "Efficient and probabilistic adaptive voxel mapping for accurate
     online LiDAR odometry", 2022; prediction and kernel as in Vizzo et al., "KISS-ICP", 2023; directions without support
@@ -46,6 +49,11 @@ class LidarOdometry(Operator):
     body_frame: str = Param("", doc="frame whose pose is given; the LiDAR's own where empty")
     near: float = Param(0.5, ge=0, doc="nearer points are left out: the robot itself", unit="m")
     far: float = Param(100.0, gt=1, doc="farther points are left out", unit="m")
+    sweep: Sweep | None = Param(
+        None,
+        doc="how the LiDAR turns (period, begins, clockwise, stamped), where its points do not say when each was "
+        "measured; nothing is deskewed if none",
+    )
     spacing: float | None = Param(
         None, gt=0.01, doc="distance of the points that are kept; a fortieth of the median range if none", unit="m"
     )
@@ -75,7 +83,10 @@ class LidarOdometry(Operator):
         if body != cloud.frame and extrinsics is None:
             raise ValueError(f"the cloud is in {cloud.frame!r}; extrinsics that relate it to {body!r} are missing")
         T_body_lidar = transform_between(extrinsics, cloud.frame, body)
-        tracked = self._tracker.track(cloud.points, cloud.time_offsets, cloud.stamp)
+        offsets = cloud.time_offsets
+        if offsets is None and self.sweep is not None:
+            offsets = self.sweep.offsets(cloud.points)
+        tracked = self._tracker.track(cloud.points, offsets, cloud.stamp)
         self._counts[tracked.state.value] += 1
         self._counts["with a direction untold"] += len(tracked.blind) > 0
         messages: dict[str, Message] = {"status": _status(cloud.stamp, tracked)}

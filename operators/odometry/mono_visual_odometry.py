@@ -71,7 +71,6 @@ class MonoVisualOdometry(Operator):
     scale_sigma: float = Param(0.02, gt=0, doc="share by which the ways of `scale` may be wrong")
 
     _tracker: MonoOdometry | None = None
-    _calibration: CameraInfo | None = None
     _restored: MonoState | None = None
 
     def setup(self) -> None:
@@ -84,7 +83,8 @@ class MonoVisualOdometry(Operator):
         scale: Odometry | None = None,
         extrinsics: Transforms | None = None,
     ) -> dict[str, Any]:
-        """Raises ValueError where an image does not fit its calibration, or `scale` poses what no transform relates."""
+        """Raises ValueError where an image does not fit its calibration, that changes, or `scale` poses what no
+        transform relates."""
         check_calibration("image", image, image_info)
         T_reference = None if scale is None else _camera_by(scale, image, extrinsics)
         result = self._tracking(image_info).track(image.data, image.stamp, T_reference)
@@ -93,7 +93,7 @@ class MonoVisualOdometry(Operator):
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._tracker = self._calibration = self._restored = None
+        self._tracker = self._restored = None
 
     def snapshot(self) -> Mapping[str, Any]:
         """The motion and the map."""
@@ -127,12 +127,14 @@ class MonoVisualOdometry(Operator):
         return told
 
     def _tracking(self, image_info: CameraInfo) -> MonoOdometry:
-        """The tracker, made once for each calibration."""
-        if self._tracker is None or self._calibration != image_info:
-            self._tracker, self._calibration = MonoOdometry(image_info.K, self._config()), image_info
+        """The tracker, made for the first calibration, which later ones must repeat."""
+        if self._tracker is None:
+            self._tracker = MonoOdometry(image_info.K, self._config())
             if self._restored is not None:
                 self._tracker.restore(self._restored)
                 self._restored = None
+        elif not np.array_equal(self._tracker.K, image_info.K):
+            raise ValueError("the calibration changed (K of image_info is another): one camera, one calibration")
         return self._tracker
 
     def _config(self) -> MonoOdometryConfig:

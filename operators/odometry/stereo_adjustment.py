@@ -36,6 +36,11 @@ class StereoRig:
         if not (np.isfinite(self.baseline) and self.baseline > 0):
             raise ValueError(f"StereoRig.baseline must be positive metres, got {self.baseline}")
 
+    def check_same(self, other: "StereoRig") -> None:
+        """Raises ValueError unless another has the same geometry: what was seen through this one says nothing of it."""
+        if not np.array_equal(self.K, other.K) or self.baseline != other.baseline:
+            raise ValueError("the calibration changed (K or the baseline is another): one rig, one calibration")
+
     def project(self, points: Points) -> NDArray[np.float64]:
         """Returns (N, 3) left column, row, right column of points (N, 3) in the left camera; z at least NEAR."""
         z = np.maximum(points[:, 2], NEAR)

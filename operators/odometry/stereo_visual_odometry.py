@@ -47,7 +47,7 @@ class StereoVisualOdometry(Operator):
         self._frames: Counter[str] = Counter()
 
     def process(self, left: Image, right: Image, left_info: CameraInfo, right_info: CameraInfo) -> dict[str, Any]:
-        """Raises ValueError where an image does not fit its calibration, or that holds no baseline."""
+        """Raises ValueError where an image does not fit its calibration, that changes, or holds no baseline."""
         check_calibration("left", left, left_info)
         check_calibration("right", right, right_info)
         result = self._tracking(left_info, right_info).track(left.data, right.data, left.stamp)
@@ -72,16 +72,19 @@ class StereoVisualOdometry(Operator):
         return dict(self._frames)
 
     def _tracking(self, left_info: CameraInfo, right_info: CameraInfo) -> StereoOdometry:
-        """The tracker, made once for each calibration."""
+        """The tracker, made for the first calibration, which later ones must repeat."""
         given = (left_info, right_info)
-        if self._tracker is None or self._calibration != given:
+        if self._tracker is None:
             config = StereoOdometryConfig(
                 corners=self.corners, min_inliers=self.min_inliers, window=self.window, patience_s=self.patience
             )
-            self._tracker, self._calibration = StereoOdometry(rig_of(left_info, right_info), config), given
+            self._tracker = StereoOdometry(rig_of(left_info, right_info), config)
             if self._restored is not None:
                 self._tracker.restore(self._restored)
                 self._restored = None
+        elif self._calibration is None or any(a is not b for a, b in zip(self._calibration, given, strict=True)):
+            self._tracker.rig.check_same(rig_of(*given))
+        self._calibration = given
         return self._tracker
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odometry, Transforms
@@ -19,11 +18,18 @@ from operators.odometry.rgbd_odometry import RgbdOdometry, State
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import DepthNoise
 
+Calibration = tuple[CameraInfo, CameraInfo, Transforms | None]
 
-@dataclass(frozen=True)
-class _Tracker:
-    calibration: tuple[CameraInfo, CameraInfo, Transforms | None]
-    odometry: RgbdOdometry
+
+def camera_of(image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdCamera:
+    """Returns the camera that calibrations describe. Raises ValueError where they describe none."""
+    T_image_depth = transform_between(extrinsics, depth_info.frame, image_info.frame)
+    return RgbdCamera(image_info.K, depth_info.K, invert(T_image_depth))
+
+
+def same(known: Calibration | None, given: Calibration) -> bool:
+    """Tells whether these are the very messages that are known, so that nothing has to be compared."""
+    return known is not None and all(a is b for a, b in zip(known, given, strict=True))
 
 
 class VisualOdometry(Operator):
@@ -63,7 +69,8 @@ class VisualOdometry(Operator):
     patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
     give_up: float = Param(2.0, ge=0, doc="time in a new map until it counts as tracking although apart", unit="s")
 
-    _tracker: _Tracker | None = None
+    _tracker: RgbdOdometry | None = None
+    _calibration: Calibration | None = None
     _restored: State | None = None
 
     def setup(self) -> None:
@@ -77,7 +84,7 @@ class VisualOdometry(Operator):
         depth_info: CameraInfo,
         extrinsics: Transforms | None = None,
     ) -> dict[str, Any]:
-        """Raises ValueError where an image does not fit its calibration, or no transform fits."""
+        """Raises ValueError where an image does not fit its calibration, that changes, or no transform fits."""
         check_calibration("image", image, image_info)
         check_calibration("depth", depth, depth_info)
         result = self._tracking(image_info, depth_info, extrinsics).track(image.data, depth.data, depth.stamp)
@@ -86,11 +93,11 @@ class VisualOdometry(Operator):
 
     def on_reset(self, input: str) -> None:
         """The clock of a stream began anew, so nothing before it can be compared with."""
-        self._tracker = self._restored = None
+        self._tracker = self._calibration = self._restored = None
 
     def snapshot(self) -> Mapping[str, Any]:
         """The motion and the keyframes."""
-        state = self._restored if self._tracker is None else self._tracker.odometry.snapshot()
+        state = self._restored if self._tracker is None else self._tracker.snapshot()
         return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -103,16 +110,16 @@ class VisualOdometry(Operator):
         return dict(self._frames)
 
     def _tracking(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdOdometry:
-        """The tracker, made once for each calibration."""
-        given = (image_info, depth_info, extrinsics)
-        if self._tracker is None or self._tracker.calibration != given:
-            T_image_depth = transform_between(extrinsics, depth_info.frame, image_info.frame)
-            camera = RgbdCamera(image_info.K, depth_info.K, invert(T_image_depth))
-            self._tracker = _Tracker(given, RgbdOdometry(camera, self._config()))
+        """The tracker, made for the first calibration, which later ones must repeat."""
+        if self._tracker is None:
+            self._tracker = RgbdOdometry(camera_of(image_info, depth_info, extrinsics), self._config())
             if self._restored is not None:
-                self._tracker.odometry.restore(self._restored)
+                self._tracker.restore(self._restored)
                 self._restored = None
-        return self._tracker.odometry
+        elif not same(self._calibration, (image_info, depth_info, extrinsics)):
+            self._tracker.camera.check_same(camera_of(image_info, depth_info, extrinsics))
+        self._calibration = (image_info, depth_info, extrinsics)
+        return self._tracker
 
     def _config(self) -> RgbdOdometryConfig:
         return RgbdOdometryConfig(

@@ -24,9 +24,10 @@ class LandmarkSlam(Operator, merge=True):
 
     The map frame is the first pose. Sightings, polar or Cartesian, are taken at their own stamp, between the odometry
     messages around it. Motion noise is that of each message's twist covariance, taken as independent from message to
-    message; where there is none, that of a differential drive by the parameters. Landmarks without identity are
-    associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a known landmark
-    to be it and too near to be another is ignored and counted.
+    message; where there is none that can be used, that of a differential drive by the parameters. Landmarks without
+    identity are associated by Mahalanobis distance, each with one sighting of a message; one that is too far from a
+    known landmark to be it and too near to be another is ignored and counted, and so is what is not finite. Where
+    odometry jumps (its origin began anew), the robot may be anywhere that it can have reached.
 
     Method: Barrau and Bonnabel, "An EKF-SLAM algorithm with consistency properties", 2015.
     """
@@ -52,6 +53,9 @@ class LandmarkSlam(Operator, merge=True):
     side_noise: float = Param(0.005, gt=0, doc="and across it", unit="m/√m")
     turn_noise: float = Param(0.02, gt=0, doc="standard deviation of the heading after 1 m of travel", unit="rad/√m")
     spin_noise: float = Param(0.02, ge=0, doc="and after 1 rad of turning", unit="√rad")
+    max_speed: float = Param(
+        50.0, gt=0, doc="odometry that is faster has jumped: it tells nothing of this step", unit="m/s"
+    )
 
     def setup(self) -> None:
         self._begin()
@@ -66,6 +70,8 @@ class LandmarkSlam(Operator, merge=True):
         self, odometry: Odometry | None, sightings: LandmarkSightings | None, extrinsics: Transforms | None = None
     ) -> dict[str, Any] | None:
         """Raises ValueError where no transform relates the sightings' frame to the robot's."""
+        if odometry is not None and not self._moves(odometry):
+            odometry = None
         base = odometry or self._last
         if sightings is not None:
             if base is None:
@@ -130,6 +136,16 @@ class LandmarkSlam(Operator, merge=True):
             "ignored, ambiguous": counts.ambiguous,
         } | ignored
 
+    def _moves(self, odometry: Odometry) -> bool:
+        """Tells whether odometry can be used; where not, it is counted, and the next tells of both ways."""
+        if not (np.isfinite(odometry.position).all() and np.isfinite(odometry.orientation).all()):
+            self._ignored["odometry: not finite"] += 1
+            return False
+        if self._last is not None and odometry.stamp <= self._last.stamp:
+            self._ignored["odometry: stamp not later than the last"] += 1
+            return False
+        return True
+
     def _planar(self, sightings: LandmarkSightings, T_base_sensor: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Identities, positions (N, 2) and covariances (N, 2, 2) in the robot's frame, of what is usable."""
         points, spread = _cartesian(sightings)
@@ -142,7 +158,9 @@ class LandmarkSlam(Operator, merge=True):
         ids = sightings.ids if self.association == "known" else np.full(sightings.count, -1)
         first = np.zeros(len(ids), bool)
         first[np.unique(ids, return_index=True)[1]] = True
-        usable &= first | (ids < 0)  # one landmark is one sighting of a message
+        again = ~first & (ids >= 0)  # one landmark is one sighting of a message
+        self._ignored["twice in a message"] += int((usable & again).sum())
+        usable &= ~again
         return ids[usable], flat[usable], R @ spread[usable] @ R.T
 
     def _advance(self, odometry: Odometry) -> bool:
@@ -155,7 +173,12 @@ class LandmarkSlam(Operator, merge=True):
             begin, span = last.stamp, odometry.stamp - last.stamp
             T = invert(_flat(last)) @ _flat(odometry)
             step = np.array([T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])])
-            covariance = self._noise(odometry, step, span * 1e-9)
+            reach = self.max_speed * span * 1e-9
+            if math.hypot(step[0], step[1]) > reach:
+                self._ignored["step of odometry: a jump"] += 1
+                step, covariance = np.zeros(3), np.diag([reach**2, reach**2, min(math.pi, 10.0 * span * 1e-9) ** 2])
+            else:
+                covariance = self._noise(odometry, step, span * 1e-9)
         due, self._pending = self._pending, []
         done = 0.0
         for stamp, ids, points, spread in due:
@@ -177,7 +200,10 @@ class LandmarkSlam(Operator, merge=True):
         """Covariance (3, 3) of a step (x, y, heading)."""
         if odometry.twist_covariance is not None:
             planar = [0, 1, 5]
-            return np.asarray(odometry.twist_covariance[np.ix_(planar, planar)] * seconds**2)
+            given = odometry.twist_covariance[np.ix_(planar, planar)]
+            if np.isfinite(given).all() and (np.diag(given) >= 0).all():
+                return np.asarray(given * seconds**2)
+            self._ignored["covariance of odometry: not finite or negative"] += 1
         way, turned = float(np.hypot(step[0], step[1])) + 1e-6, abs(float(step[2]))
         heading = self.turn_noise**2 * way + self.spin_noise**2 * turned
         return np.diag([self.forward_noise**2 * way, self.side_noise**2 * way, heading])
@@ -211,6 +237,7 @@ def _cartesian(sightings: LandmarkSightings) -> tuple[Array, Array]:
         raise ValueError("sightings have no covariances: how well a landmark was seen must be known")
     r, b = sightings.ranges, sightings.bearings
     e = np.zeros_like(r) if sightings.elevations is None else sightings.elevations
+    r, b, e = (np.where(np.isfinite(one), one, np.nan) for one in (r, b, e))
     level = r * np.cos(e)
     points = np.column_stack([level * np.cos(b), level * np.sin(b), r * np.sin(e)])
     J = np.empty((len(r), 2, 2))

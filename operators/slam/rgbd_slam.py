@@ -41,7 +41,7 @@ class RgbdSlam:
     """Maps with one camera. Deterministic: the same frames give the same bytes, in every process."""
 
     def __init__(self, camera: RgbdCamera, config: RgbdOdometryConfig, settings: GraphSettings) -> None:
-        self._camera, self._config = camera, config
+        self.camera, self._config = camera, config
         self._odometry = RgbdOdometry(camera, config)
         self.graph = VisualGraph(settings)
         self._jumped = False  # the odometry found its map again, and no keyframe has told the graph
@@ -56,7 +56,7 @@ class RgbdSlam:
         added = Added()
         if result.keyframe:
             factor = max(1, image.shape[1] // self._config.image_width)
-            working = replace(self._camera, K_color=scaled_intrinsics(self._camera.K_color, 1.0 / factor))
+            working = replace(self.camera, K_color=scaled_intrinsics(self.camera.K_color, 1.0 / factor))
             state = self._odometry.snapshot()
             added = self.graph.add(state.keyframes[-1], Fitter(working, self._config, state.noise), self._jumped)
             self._jumped &= not added.node

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -19,15 +18,13 @@ from dataflow.messages import (
     PointCloud,
     Transforms,
 )
-from dataflow.messages.geometry import invert
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
-from operators.geometry.extrinsics import transform_between
-from operators.odometry.camera import RgbdCamera
 from operators.odometry.emission import LEVELS as ODOMETRY_LEVELS
 from operators.odometry.emission import outputs
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.surface import DepthNoise
+from operators.odometry.visual_odometry import Calibration, camera_of, same
 from operators.slam.emission import corrections, map_poses, path_of, sizes, status_of
 from operators.slam.rgbd_slam import RgbdSlam, SlamResult
 from operators.slam.visual_cloud import cloud_of
@@ -35,12 +32,6 @@ from operators.slam.visual_graph import GraphSettings
 from operators.slam.visual_map_file import read_visual_map, write_visual_map
 from operators.slam.visual_view import Judge
 from operators.status import counted_status
-
-
-@dataclass(frozen=True)
-class _Run:
-    calibration: tuple[CameraInfo, CameraInfo, Transforms | None]
-    slam: RgbdSlam
 
 
 class VisualSlam(Operator):
@@ -94,7 +85,8 @@ class VisualSlam(Operator):
     voxel: float = Param(0.05, gt=0.005, doc="side of the voxels that the map's points are thinned to", unit="m")
     period: int = Param(10, ge=1, live=True, doc="keyframes from map to map")
 
-    _run: _Run | None = None
+    _slam: RgbdSlam | None = None
+    _calibration: Calibration | None = None
     _restored: Mapping[str, Any] | None = None
 
     def setup(self) -> None:
@@ -110,7 +102,7 @@ class VisualSlam(Operator):
         depth_info: CameraInfo,
         extrinsics: Transforms | None = None,
     ) -> dict[str, Message]:
-        """Raises ValueError where an image does not fit its calibration, or no transform fits."""
+        """Raises ValueError where an image does not fit its calibration, that changes, or no transform fits."""
         check_calibration("image", image, image_info)
         check_calibration("depth", depth, depth_info)
         slam = self._running(image_info, depth_info, extrinsics)
@@ -130,16 +122,16 @@ class VisualSlam(Operator):
 
     def finish(self) -> None:
         """Writes the map."""
-        if self.save is not None and self._run is not None:
-            write_visual_map(self._run.slam.graph, FilePath(self.save).expanduser())
+        if self.save is not None and self._slam is not None:
+            write_visual_map(self._slam.graph, FilePath(self.save).expanduser())
 
     def on_reset(self, input: str) -> None:
         """Begins a new map, or a new search in the saved one: the clock of a stream began anew."""
-        self._run = self._restored = None
+        self._slam = self._calibration = self._restored = None
 
     def snapshot(self) -> Mapping[str, Any]:
         """The odometry's memory and the map."""
-        state = self._restored if self._run is None else self._run.slam.snapshot()
+        state = self._restored if self._slam is None else self._slam.snapshot()
         return {} if state is None else {"slam": state, "counts": dict(self._counts)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
@@ -149,7 +141,7 @@ class VisualSlam(Operator):
 
     def summary(self) -> Mapping[str, float | int]:
         """Returns the number of frames of each state, of loops, and of views that were refused, by reason."""
-        kept = {} if self._run is None else sizes(self._run.slam.graph) | {"loops": self._run.slam.graph.loops}
+        kept = {} if self._slam is None else sizes(self._slam.graph) | {"loops": self._slam.graph.loops}
         return dict(self._counts) | kept
 
     # -- what is sent ------------------------------------------------------------------------------------
@@ -173,19 +165,19 @@ class VisualSlam(Operator):
     # -- what runs ---------------------------------------------------------------------------------------
 
     def _running(self, image_info: CameraInfo, depth_info: CameraInfo, extrinsics: Transforms | None) -> RgbdSlam:
-        """The tracker and its map, made once for each calibration."""
-        given = (image_info, depth_info, extrinsics)
-        if self._run is None or self._run.calibration != given:
-            T_image_depth = transform_between(extrinsics, depth_info.frame, image_info.frame)
-            camera = RgbdCamera(image_info.K, depth_info.K, invert(T_image_depth))
-            slam = RgbdSlam(camera, self._config(), self._settings())
+        """The tracker and its map, made for the first calibration, which later ones must repeat."""
+        if self._slam is None:
+            camera = camera_of(image_info, depth_info, extrinsics)
+            self._slam = RgbdSlam(camera, self._config(), self._settings())
             if self._restored is not None:
-                slam.restore(self._restored)
+                self._slam.restore(self._restored)
                 self._restored = None
             elif self._known is not None:
-                slam.graph.begin_in(self._known)
-            self._run = _Run(given, slam)
-        return self._run.slam
+                self._slam.graph.begin_in(self._known)
+        elif not same(self._calibration, (image_info, depth_info, extrinsics)):
+            self._slam.camera.check_same(camera_of(image_info, depth_info, extrinsics))
+        self._calibration = (image_info, depth_info, extrinsics)
+        return self._slam
 
     def _config(self) -> RgbdOdometryConfig:
         noise = DepthNoise(self.depth_noise_floor, self.depth_noise_quadratic)

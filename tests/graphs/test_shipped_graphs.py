@@ -10,12 +10,18 @@ from typing import Any
 
 import pytest
 
+from dataflow import run
 from dataflow.graph import load_graph
 from operators.weights import shipped
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 GRAPHS = sorted((REPOSITORY / "graphs").rglob("*.yaml"))
 DEMO = REPOSITORY / "graphs" / "simulated_robot.yaml"
+
+SIMULATED = (
+    "cloud", "dead_reckoning", "depth", "fusion", "landmarks", "localize", "mapping", "mono", "orientation", "places",
+    "preprocessing", "redundant", "registration", "simulated_lidar", "simulated_stereo", "slam", "slam_lidar",
+)  # fmt: skip
 
 needs_weights = pytest.mark.skipif(
     not (shipped("detector.onnx").is_file() and shipped("segmenter.onnx").is_file()),
@@ -34,6 +40,18 @@ def dataflow(*words: object) -> str:
 @pytest.mark.parametrize("file", [g for g in GRAPHS if g.parent.name == "graphs"], ids=lambda file: file.stem)
 def test_a_graph_passes_the_check(file: Path) -> None:
     assert load_graph(file).nodes
+
+
+@pytest.mark.parametrize("name", SIMULATED)
+def test_every_operator_of_a_graph_of_geometry_fires_on_the_simulators_first_moment(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(REPOSITORY)
+    file = REPOSITORY / "graphs" / f"{name}.yaml"
+    report = run(file, settings={"duration": "350ms"}).report
+    uses = {operator: node.use for operator, node in load_graph(file).nodes.items()}
+    idle = [operator for operator, counts in report.operators.items() if not counts.firings]
+    assert [operator for operator in idle if not uses[operator].startswith("operators.evaluation:")] == []
 
 
 def test_the_simulated_robot_is_the_one_of_the_recording() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataflow.messages import Diagnostics, PointCloud
+from dataflow.messages import Diagnostics, PointCloud, Pose
 from dataflow.testing import play
 from operators.cloud import CloudFilter, Clusterer, PlaneSegmenter
 from operators.odometry import LidarOdometry
@@ -31,6 +31,7 @@ BAD = {
     "one point": room()[:1],
     "nothing finite": np.full((500, 3), np.nan, np.float32),
     "one point many times": np.ones((500, 3), np.float32),
+    "nothing that a sensor could see": room() * np.float32(1e18),
 }
 
 
@@ -45,3 +46,26 @@ def test_a_bad_cloud_among_good_ones_is_survived_and_said(made: Any, bad: np.nda
     said = {m.stamp: m for m in played["status"] if isinstance(m, Diagnostics)}
     assert len(said) == 3
     assert said[200_000_000].messages != said[100_000_000].messages
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+@pytest.mark.parametrize("made", [Clusterer, PlaneSegmenter], ids=["Clusterer", "PlaneSegmenter"])
+def test_a_pose_that_is_not_finite_among_good_ones_is_survived_and_said(made: Any, wrong: float) -> None:
+    poses = [pose(k, [0.0, 0, 0.6 if k != 1 else wrong]) for k in range(3)]
+    operator, clean = made(), made()
+    played = play(operator, {"cloud": [scan(room(), k) for k in range(3)], "pose": poses})
+    plain = play(
+        clean, {"cloud": [scan(room(), k) for k in range(3)], "pose": [pose(k, [0.0, 0, 0.6]) for k in range(3)]}
+    )
+    said = [m.messages[0] for m in played["status"] if isinstance(m, Diagnostics)]
+    assert ["the pose is not finite" in text for text in said] == [False, True, False]
+    assert operator.summary()["poses not finite"] == 1
+    for port in played.outputs:
+        if port not in ("status", "features"):
+            assert played[port][-1].digest() == plain[port][-1].digest()
+
+
+def pose(k: int, position: list[float]) -> Pose:
+    return Pose(
+        stamp=(k + 1) * 100_000_000, frame="map", child_frame="lidar", position=position, orientation=[0, 0, 0, 1]
+    )

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataflow.messages import CameraInfo, DepthImage, Image, PointCloud, Pose, Transforms
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Message, PointCloud, Pose, Transforms
 from operators.cloud import CloudBuilder
 from operators.sources import SyntheticRgbd
 
@@ -35,7 +35,14 @@ def build(
     depth: np.ndarray, extrinsics: Transforms | None = None, image_focal: float = 50.0, **params: object
 ) -> PointCloud:
     builder = CloudBuilder(**({"stride": 1, "min_range": 0.0, "max_range": 10.0} | params))
-    return builder.process(depth_image(depth), position_image(), info("depth"), info("color", image_focal), extrinsics)
+    given = (depth_image(depth), position_image(), info("depth"), info("color", image_focal), extrinsics)
+    return cloud_of(builder.process(*given))
+
+
+def cloud_of(messages: dict[str, Message]) -> PointCloud:
+    cloud = messages["cloud"]
+    assert isinstance(cloud, PointCloud)
+    return cloud
 
 
 @settings(max_examples=25, deadline=None)
@@ -60,6 +67,13 @@ def test_missing_and_out_of_range_depths_make_no_points() -> None:
     cloud = build(depth, min_range=1.0, max_range=3.0, edge_ratio=0)
     assert len(cloud.points) == WIDTH * HEIGHT - 5
     assert build(np.zeros((HEIGHT, WIDTH))).points.shape == (0, 3)
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan, np.inf])
+def test_what_lies_beside_a_missing_return_is_no_edge(nothing: float) -> None:
+    depth = np.full((HEIGHT, WIDTH), 2.0)
+    depth[20, 30] = nothing
+    assert len(build(depth).points) == WIDTH * HEIGHT - 1
 
 
 def test_the_colour_cameras_own_focal_length_is_used() -> None:
@@ -100,7 +114,7 @@ def test_flying_pixels_at_edges_are_dropped_and_slopes_kept() -> None:
 def test_grey_images_colour_in_grey() -> None:
     grey = Image(stamp=5, frame="color", data=np.full((HEIGHT, WIDTH), 77, np.uint8))
     depth = depth_image(np.full((HEIGHT, WIDTH), 2.0))
-    cloud = CloudBuilder(stride=8).process(depth, grey, info("depth"), info("color"))
+    cloud = cloud_of(CloudBuilder(stride=8).process(depth, grey, info("depth"), info("color")))
     assert cloud.colors is not None
     assert (cloud.colors == 77).all()
 
@@ -108,8 +122,8 @@ def test_grey_images_colour_in_grey() -> None:
 def test_a_new_calibration_replaces_the_ray_table() -> None:
     builder = CloudBuilder(stride=4, edge_ratio=0)
     depth, image = depth_image(np.full((HEIGHT, WIDTH), 2.0)), position_image()
-    narrow = builder.process(depth, image, info("depth", 100.0), info("color"))
-    wide = builder.process(depth, image, info("depth", 50.0), info("color"))
+    narrow = cloud_of(builder.process(depth, image, info("depth", 100.0), info("color")))
+    wide = cloud_of(builder.process(depth, image, info("depth", 50.0), info("color")))
     np.testing.assert_allclose(wide.points[:, 0], 2 * narrow.points[:, 0], rtol=1e-6)
 
 
@@ -121,9 +135,10 @@ def test_clouds_of_a_sequence_agree_in_the_world() -> None:
     K_info = statics["depth_info"]
     assert isinstance(K_info, CameraInfo)
     builder = CloudBuilder(stride=3)
-    cloud = builder.process(
+    made = builder.process(
         frames[0]["depth"], frames[0]["image"], K_info, statics["image_info"], statics["extrinsics"]  # type: ignore[arg-type]
     )  # fmt: skip
+    cloud = cloud_of(made)
     first, second, depth, image = *(f["ground_truth"] for f in frames), frames[1]["depth"], frames[1]["image"]
     assert isinstance(first, Pose)
     assert isinstance(second, Pose)
@@ -144,6 +159,26 @@ def test_equal_inputs_give_equal_digests() -> None:
     first, again = build(depth, edge_ratio=0), build(depth, edge_ratio=0)
     assert first.digest() == again.digest()
     assert first.digest() != build(depth + 0.001, edge_ratio=0).digest()
+
+
+@pytest.mark.parametrize(
+    ("depth", "focal", "text"),
+    [
+        (0.0, 50.0, "no depth in range"),
+        (np.nan, 50.0, "no depth in range"),
+        (np.inf, 50.0, "no depth in range"),
+        (2.0, 50.0, "3072 points of 3072 pixels"),
+        (2.0, 5000.0, "3072 points of 3072 pixels; the colour camera sees none of them"),
+    ],
+)
+def test_the_status_says_what_became_of_the_pixels(depth: float, focal: float, text: str) -> None:
+    builder = CloudBuilder(stride=1)
+    given = depth_image(np.full((HEIGHT, WIDTH), depth))
+    aside = Transforms.from_matrix(np.eye(4) + np.eye(4, k=3), stamp=0, frame="color", child_frame="depth")
+    status = builder.process(given, position_image(), info("depth"), info("color", focal), aside)["status"]
+    assert isinstance(status, Diagnostics)
+    assert status.messages == (text,)
+    assert int(status.levels[0]) == (0 if text.endswith("pixels") else 1)
 
 
 def test_what_does_not_fit_is_named() -> None:

@@ -170,6 +170,26 @@ def test_a_sensor_that_is_turned_against_its_extrinsic_is_named(sensor: str, axi
     assert any(text.startswith(f"{name}: direction off by") for text in said[-1].split("; "))
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_readings_that_are_not_finite_are_counted_and_left_out(wrong: float) -> None:
+    driven, turned, carried = wheels(), gyroscope(), odometry("camera", 10, 1)
+    driven[40] = driven[40].replace(linear=[wrong, 0, 0])
+    turned[500] = turned[500].replace(angular_velocity=[wrong, 0, 0])
+    carried[50] = carried[50].replace(position=[wrong, 0, 0])
+    operator = MotionCheck()
+    given: dict[str, Any] = {
+        "wheels": driven,
+        "motions": {"camera": carried, "lidar": odometry("lidar", 20, 2)},
+        "imu": {"imu": turned},
+        "extrinsics": [extrinsics()],
+    }
+    played = play(operator, given, static=["extrinsics"])
+    assert warnings(played) == []
+    assert [m.stamp for m in played["checked"]] == [m.stamp for m in driven if m is not driven[40]]
+    counted = {name: n for name, n in operator.summary().items() if "not finite" in name}
+    assert counted == {"gyroscope of imu: not finite": 1, "motions/camera: not finite": 1, "wheels: not finite": 1}
+
+
 def test_of_two_nobody_knows_which_is_wrong_and_wheels_still_pass() -> None:
     given = {
         "wheels": wheels(1.05),

@@ -76,6 +76,16 @@ def status_of(played: Played) -> tuple[str, int]:
     return status.messages[0], int(status.levels[0])
 
 
+@pytest.mark.parametrize(("level", "text"), [(0, "the image is black"), (150, "the image is without contrast")])
+def test_an_image_that_shows_nothing_gives_no_depth_whatever_is_given(model: Path, level: int, text: str) -> None:
+    depth = scene()
+    blank = photograph(depth).replace(data=np.full((HEIGHT, WIDTH, 3), level, np.uint8))
+    played = estimated(model, blank, sparse_of(depth, 200))
+    assert not played["relative"]
+    assert not played["depth"]
+    assert status_of(played) == (text, 1)
+
+
 def test_without_metric_depth_there_is_only_nearness(model: Path) -> None:
     depth = scene()
     played = estimated(model, photograph(depth), None)

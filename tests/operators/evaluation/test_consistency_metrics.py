@@ -100,3 +100,19 @@ def test_innovations_of_a_filter_are_judged_by_sensor(noise: float, word: str) -
     assert found["robot/fix, nis"] == pytest.approx(total / 300, abs=1e-5)
     assert str(found["robot/fix, nis_band_95_percent"]).endswith(f", {word}")
     assert not any(name.startswith("robot/silent") for name in found)
+
+
+def test_a_truth_that_is_not_finite_is_counted_and_the_others_score() -> None:
+    poses = [
+        Odometry(
+            stamp=k, frame="world", child_frame="base", position=[0.1, 0, 0], orientation=[0, 0, 0, 1],
+            pose_covariance=np.eye(6) * 0.01,
+        )
+        for k in range(5)
+    ]  # fmt: skip
+    truths = [p.replace(position=[np.nan if p.stamp == 2 else 0.0, 0, 0]) for p in poses]
+    operator = ConsistencyMetrics()
+    play(operator, {"estimate": poses, "ground_truth": truths})
+    figures = operator.summary()
+    assert (figures["matched"], figures["truths not finite"]) == (4, 1)
+    assert figures["position_nees_mean"] == pytest.approx(1 / 3)

@@ -168,6 +168,19 @@ def test_a_path_that_does_not_move_cannot_be_aligned_and_says_so() -> None:
     assert score(still, still, alignment="none")["ate_rmse_m"] == 0
 
 
+def test_a_truth_that_is_not_finite_is_counted_and_the_others_score() -> None:
+    path = circle()
+    metrics = TrajectoryMetrics()
+    metrics.setup()
+    for k, T in enumerate(path):
+        true = truth(T, k)
+        metrics.process(estimate(T, k), (true.replace(position=[np.nan, 0, 0]) if k in (3, 4) else true,))
+    metrics.finish()
+    figures = metrics.summary()
+    assert (figures["matched"], figures["unmatched_estimates"], figures["truths_not_finite"]) == (61, 2, 2)
+    assert figures["ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+
+
 def test_an_estimate_that_is_not_finite_is_counted_and_not_scored() -> None:
     path = circle(20)
     broken = path.copy()

@@ -120,6 +120,17 @@ def test_transforms_that_contradict_the_tree_are_left_out_and_counted() -> None:
     assert "'base' is in 'odom', and is told in 'world' as well" in texts(played)
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf])
+def test_a_transform_that_is_not_finite_is_left_out_and_counted(wrong: float) -> None:
+    moving = odometry(0, 100, 200)
+    moving[1] = moving[1].replace(position=[wrong, 0, 0])
+    played, counts = looked_up(moving, questions(50, 150))
+    assert counts == {"asked": 2, "left out: not finite": 1, "answered": 2}
+    assert texts(played) == ["'base' in 'odom' is not finite"]
+    for pose in played["pose"]:
+        np.testing.assert_allclose(pose.matrix(), true_pose(pose.stamp) @ T_base_lidar, atol=1e-9)  # type: ignore[attr-defined]
+
+
 def test_fixed_transforms_that_contradict_each_other_stop_the_graph() -> None:
     ring = Transforms(
         stamp=0,

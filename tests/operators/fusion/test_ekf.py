@@ -18,6 +18,7 @@ from dataflow.messages import (
     NavSatFix,
     Odometry,
     Pose,
+    RadarScan,
     Twist,
 )
 from dataflow.messages.geometry import matrix_to_quaternion, yaw_of
@@ -134,16 +135,21 @@ def test_wheels_hold_a_robot_that_stands() -> None:
     assert operator.summary()["robot/wheels standstill, used"] > 100
 
 
-def test_ranges_to_known_landmarks_and_a_magnetometer_place_it() -> None:
+@pytest.mark.parametrize("by_radar", [False, True], ids=["sightings", "radar"])
+def test_ranges_to_known_landmarks_and_a_magnetometer_place_it(by_radar: bool) -> None:
     robot = Robot(8.0)
     places = np.array([[5.0, 5, 2], [-5, 4, 0], [4, -6, 3], [-4, -5, 1]])
     world = LandmarkSightings(stamp=0, frame="world", ids=np.arange(4), positions=places)
-    ranges, fields = [], []
+    ranges, fields = list[Message](), []
     for k in range(0, len(robot.t), 5):
         T = robot.T_world_base[k]
         distances = np.linalg.norm(T[:3, 3] - places, axis=1)
         stamp = int(robot.stamps[k])
-        ranges.append(LandmarkSightings(stamp=stamp, frame="base_link", ids=np.arange(4), ranges=distances))
+        if by_radar:
+            given = {"ranges": distances.astype(np.float32), "azimuths": np.zeros(4, np.float32)}
+            ranges.append(RadarScan(stamp=stamp, frame="base_link", ids=np.arange(4), **given))
+        else:
+            ranges.append(LandmarkSightings(stamp=stamp, frame="base_link", ids=np.arange(4), ranges=distances))
         fields.append(MagneticField(stamp=stamp, frame="base_link", field=T[:3, :3].T @ [0, 2e-5, -4e-5]))
     sensors = {"robot/ranges": {"use": "range", "sigma": 0.05}, "robot/field": {"angular_sigma": 0.05}}
     streams = {"robot/imu": robot.imu, "robot/ranges": ranges, "robot/field": fields, "robot/fix": robot.fixes()[:8]}

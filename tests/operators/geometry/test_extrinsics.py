@@ -84,3 +84,10 @@ def test_an_image_that_fits_is_taken() -> None:
     image = Image(stamp=0, frame="camera", data=np.zeros((3, 4, 3), np.uint8))
     check_calibration("image", image, info())
     check_calibration("image", image, info(distortion_model="plumb_bob", distortion=np.zeros(5)))
+
+
+def test_a_transform_that_is_not_finite_is_named() -> None:
+    broken = transforms("depth", "color", T_depth_color).replace(translations=np.full((1, 3), np.nan))
+    for source, target in (("color", "depth"), ("depth", "color")):
+        with pytest.raises(ValueError, match=f"transform between '{source}' and '{target}' that is not finite"):
+            transform_between(broken, source, target)

@@ -16,8 +16,8 @@ from dataflow.messages import CameraInfo, Diagnostics, Image
 from dataflow.testing import Played, play
 from operators.geometry import se3
 from operators.geometry.lens import distorted, undistorted
-from operators.image import ImagePreprocess
-from operators.image.preparation import toned
+from operators.image import ImagePreprocess, image_preprocess
+from operators.image.preparation import Preparation, toned
 from operators.image.view import Window
 
 WIDTH, HEIGHT = 160, 120
@@ -200,6 +200,7 @@ def test_hue_stays_where_brightness_changes() -> None:
     [
         (camera(distortion_model="poly", distortion=np.ones(3)), {}, "'poly'; known here are none, plumb_bob"),
         (camera(), {"lens": "rectify"}, "must hold P"),
+        (camera(P=np.zeros((3, 4))), {"lens": "rectify"}, "must hold P with focal lengths above zero"),
         (camera(), {"crop": (100, 0, 100, 10)}, r"crop \[100, 0, 100, 10\] reaches outside the image of 160x120"),
         (camera(width=WIDTH + 1), {}, "image has 160x120 pixels"),
         (camera(frame="other"), {}, "image is in frame 'camera'"),
@@ -210,6 +211,26 @@ def test_hue_stays_where_brightness_changes() -> None:
 def test_what_cannot_be_done_is_named(info: CameraInfo, params: dict[str, Any], text: str) -> None:
     with pytest.raises(OperatorFailure, match=text):
         prepared(np.zeros((HEIGHT, WIDTH), np.uint8), info, **params)
+
+
+def test_a_calibration_that_comes_with_every_image_is_worked_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[Preparation]()
+
+    def making(*given: Any, **more: Any) -> Preparation:
+        made.append(Preparation(*given, **more))
+        return made[-1]
+
+    monkeypatch.setattr(image_preprocess, "Preparation", making)
+    info = camera(**LENSES["fisheye"])
+    images = [Image(stamp=k, frame="camera", data=raw_image(info)) for k in (1, 2, 3)]
+    streams = {"image": images, "image_info": [info.replace(stamp=k) for k in (1, 2)]}
+    play(ImagePreprocess(), streams)
+    assert len(made) == 1
+    play(
+        ImagePreprocess(),
+        {"image": images, "image_info": [info, info.replace(stamp=2, K=np.diag([1.01, 1.01, 1.0]) @ info.K)]},
+    )
+    assert len(made) == 3
 
 
 def test_two_plays_are_equal_and_a_restored_operator_sums_up_alike() -> None:

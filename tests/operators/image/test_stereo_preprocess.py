@@ -16,8 +16,8 @@ from dataflow.testing import Played, play
 from operators.depth import StereoDepth
 from operators.geometry import se3
 from operators.geometry.lens import undistorted
-from operators.image import StereoPreprocess
-from operators.image.rectification import rectify
+from operators.image import StereoPreprocess, stereo_preprocess
+from operators.image.rectification import Rectification, rectify
 
 WIDTH, HEIGHT = 200, 150
 # the right camera, 0.2 m to the right, a little below, turned about all axes
@@ -182,6 +182,22 @@ def test_missing_and_mismatched_calibrations_are_named() -> None:
     small = infos()[1].replace(width=100)
     with pytest.raises(OperatorFailure, match="a pair that is rectified must have one size"):
         prepared(left, right[:, :100], given=(infos()[0], small))
+
+
+def test_calibrations_that_come_with_every_pair_are_worked_out_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = list[Rectification]()
+
+    def rectifying(*given: Any) -> Rectification:
+        made.append(rectify(*given))
+        return made[-1]
+
+    monkeypatch.setattr(stereo_preprocess, "rectify", rectifying)
+    given = streams(*views())
+    pairs = {name: [given[name][0].replace(stamp=k) for k in (1, 2, 3)] for name in ("left", "right")}
+    infos = {name: [given[name][0].replace(stamp=k) for k in (1, 2)] for name in ("left_info", "right_info")}
+    mounts = [mount().replace(stamp=k) for k in (1, 2, 3)]
+    play(StereoPreprocess(), pairs | infos | {"extrinsics": mounts})
+    assert len(made) == 1
 
 
 def test_two_plays_are_equal_and_a_restored_operator_sums_up_alike() -> None:

@@ -40,7 +40,7 @@ def test_a_black_image_is_held_back() -> None:
     assert "is black" in texts(played)[1]
 
 
-@pytest.mark.parametrize("kept", [0.0, 1.0], ids=["empty", "frozen"])
+@pytest.mark.parametrize("kept", [0.0, 1.0, np.inf], ids=["empty", "frozen", "all infinite"])
 def test_a_depth_image_without_news_is_held_back(kept: float) -> None:
     rng = np.random.default_rng(2)
     data = [rng.uniform(1, 3, (24, 32)).astype(np.float32) for _ in range(3)]

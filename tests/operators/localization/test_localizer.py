@@ -71,6 +71,23 @@ def test_landmarks_without_identity_and_positions_localize_too() -> None:
     assert errors(drive, played["position_pose"], since=4.0)[0] < 0.2
 
 
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
+@pytest.mark.parametrize("known", [True, False])
+def test_a_landmark_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: float, known: bool) -> None:
+    drive = Drive(3.0)
+    whole = drive.landmark_map()
+    assert whole.positions is not None
+    positions = whole.positions.copy()
+    positions[0] = wrong
+    operator = ParticleFilterLocalizer(modality_particles=0)
+    given = {
+        "odometry": drive.odometry(), "measurements": {"scan": drive.scans(), "seen": drive.sightings(known=known)},
+        "map": [drive.grid], "landmark_map": [whole.replace(positions=positions)], "extrinsics": [mounts()],
+    }  # fmt: skip
+    played = play(operator, given, static=("map", "landmark_map", "extrinsics"))
+    assert errors(drive, played["pose"], since=2.0)[0] < 0.1
+
+
 def test_the_robot_is_found_again_by_landmarks_alone() -> None:
     drive = Drive(6.0, carried=(3.0, 0.45))
     played, _ = localized(drive, {"seen": drive.sightings()})
@@ -214,6 +231,9 @@ def test_maps_that_do_not_fit_are_refused() -> None:
     full = room().replace(cells=np.full((4, 4), 100, np.int8), frame="hall")
     with pytest.raises(ValueError, match="no free cell among its 16"):
         operator.process(odometry, {}, map=full)
+    nowhere = room().replace(position=[np.nan, 0, 0], frame="hall")
+    with pytest.raises(ValueError, match="the map's place in 'hall' is not finite"):
+        operator.process(odometry, {}, map=nowhere)
     place = Pose(stamp=1, frame="hall", child_frame="base_link", position=[0, 0, 0], orientation=[0, 0, 0, 1])
     with pytest.raises(ValueError, match="its messages have no covariance"):
         operator.process(odometry.replace(stamp=10), {"ns/place/pose": place})

@@ -67,3 +67,12 @@ def test_a_pose_without_scale_turns_and_is_refused_beside_the_base() -> None:
     beside = Transforms.from_matrix(turned, stamp=0, frame="base_link", child_frame="camera")
     with pytest.raises(ValueError, match="without a scale"):
         BaseOdometry().process(sensor, beside)
+
+
+def test_a_pose_that_is_not_finite_gives_none_and_is_counted() -> None:
+    good = seen(np.eye(4))
+    poses = [good, good.replace(stamp=good.stamp + 1, position=[np.nan, 0, 0]), good.replace(stamp=good.stamp + 2)]
+    operator = BaseOdometry()
+    played = play(operator, {"sensor": poses, "extrinsics": [MOUNT]}, static=["extrinsics"])
+    assert [m.stamp - good.stamp for m in played["odometry"]] == [0, 2]
+    assert operator.summary() == {"poses not finite": 1}

@@ -17,6 +17,7 @@ from operators.geometry import se3
 from operators.odometry import LidarOdometry
 from operators.odometry.lidar_map import PlaneMap, thinned
 from operators.odometry.lidar_scan import deskewed
+from operators.odometry.lidar_sweep import Sweep
 
 Array = NDArray[np.float64]
 STEP = 100_000_000  # ns
@@ -118,6 +119,32 @@ def test_points_with_times_are_deskewed() -> None:
     assert np.linalg.norm(off[:, :3], axis=1).max() < 0.03
     assert np.linalg.norm(off[:, 3:], axis=1).max() < 0.01
     assert np.linalg.norm(off[-1, :3]) < np.linalg.norm(skewed[-1, :3])
+
+
+def test_points_without_times_are_deskewed_by_their_azimuth_where_it_is_known_how_the_lidar_turns() -> None:
+    clouds = [scan(ROOM, circling, k, timed=True) for k in range(20)]
+    plain = [c.replace(time_offsets=None) for c in clouds]
+    timed = errors(play(LidarOdometry(), {"cloud": clouds}), circling)
+    swept = errors(play(LidarOdometry(sweep={"period": 0.1}), {"cloud": plain}), circling)
+    assert np.linalg.norm(swept - timed, axis=1).max() < 0.005
+    told = play(LidarOdometry(sweep={"period": 5.0, "clockwise": True}), {"cloud": clouds})
+    assert told.digests() == play(LidarOdometry(), {"cloud": clouds}).digests()  # what messages say counts
+
+
+@pytest.mark.parametrize(
+    ("sweep", "expected"),
+    [
+        (Sweep(period=0.1), [-0.1, -0.075, -0.05, -0.025]),
+        (Sweep(period=0.1, clockwise=True), [-0.1, -0.025, -0.05, -0.075]),
+        (Sweep(period=0.2, begins=np.pi, stamped="begin"), [0.1, 0.15, 0.0, 0.05]),
+        (Sweep(period=0.1, stamped="middle"), [-0.05, -0.025, 0.0, 0.025]),
+    ],
+    ids=["ends at the stamp", "clockwise", "begins behind, at the stamp", "stamped in the middle"],
+)
+def test_the_azimuth_of_a_point_tells_when_it_was_measured(sweep: Sweep, expected: list[float]) -> None:
+    around = np.array([[2, 0, 1], [0, 3, 0], [-1, 0, 0], [0, -4, 2]], np.float32)
+    np.testing.assert_allclose(sweep.offsets(around), expected, atol=1e-7)
+    assert np.isnan(sweep.offsets(np.full((1, 3), np.nan, np.float32))).all()
 
 
 def test_deskewing_undoes_a_motion_during_the_scan() -> None:

@@ -126,5 +126,15 @@ def test_a_reset_clock_begins_a_new_path() -> None:
     assert sent["status"].messages[0].startswith("initialising")
 
 
+def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
+    given = streams(16)
+    known = given["image_info"][0]
+    each = given | {"image_info": [known.replace(stamp=image.stamp) for image in given["image"]]}
+    assert play(MonoVisualOdometry(), each).digests() == run(given).digests()
+    each["image_info"][9] = known.replace(stamp=given["image"][9].stamp, K=np.diag([1.1, 1.1, 1.0]) @ known.K)
+    with pytest.raises(Exception, match="the calibration changed"):
+        play(MonoVisualOdometry(), each)
+
+
 def test_the_same_images_give_the_same_bytes() -> None:
     assert run(streams(12)).digests() == run(streams(12)).digests()

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, DepthImage, Image
 from dataflow.messages.geometry import invert
+from dataflow.testing import play
 from operators.geometry import se3
 from operators.odometry import VisualOdometry
 from operators.odometry.camera import RgbdCamera
@@ -598,6 +599,23 @@ def test_operator_goes_on_alike_from_a_recorded_state() -> None:
         sent, again = one.process(*given(i)), other.process(*given(i))
         assert {port: m.digest() for port, m in sent.items()} == {port: m.digest() for port, m in again.items()}
     assert pack_state(one.snapshot()) == pack_state(other.snapshot())
+
+
+def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
+    frames, _ = sequence(40)
+    stamps = [k * 33_000_000 for k in range(8)]
+    images = [Image(stamp=t, frame="color", data=image) for t, (image, _) in zip(stamps, frames, strict=False)]
+    depths = [DepthImage(stamp=t, frame="depth", data=depth) for t, (_, depth) in zip(stamps, frames, strict=False)]
+    once = {"image": images, "depth": depths, "image_info": [info("color", K_COLOR)]}
+    once |= {"depth_info": [info("depth", K_DEPTH)]}
+    each = once | {
+        name: [once[name][0].replace(stamp=stamp) for stamp in stamps] for name in ("image_info", "depth_info")
+    }
+    expected = play(VisualOdometry(), once, static=["image_info", "depth_info"])
+    assert play(VisualOdometry(), each).digests() == expected.digests()
+    each["depth_info"][5] = info("depth", np.diag([1.1, 1.1, 1.0]) @ K_DEPTH).replace(stamp=stamps[5])
+    with pytest.raises(Exception, match="the calibration changed"):
+        play(VisualOdometry(), each)
 
 
 def test_operator_refuses_an_image_that_its_calibration_does_not_describe() -> None:

@@ -237,6 +237,48 @@ def test_bad_sightings_are_counted_and_survived() -> None:
     assert operator.summary()["ignored, invalid"] == sum(len(m.positions) > 0 for m in broken)
 
 
+def test_bad_odometry_is_counted_and_the_next_tells_of_both_ways() -> None:
+    walk = Walk(1, rounds=1)
+    messages = walk.messages()
+    odometry = list(messages["odometry"])
+    plain = play(LandmarkSlam(), messages)
+    odometry[30] = odometry[30].replace(position=[np.nan, 0, 0])  # type: ignore[attr-defined]
+    for k, C in ((45, np.full((6, 6), np.nan)), (46, -np.eye(6))):
+        odometry[k] = odometry[k].replace(twist_covariance=C)  # type: ignore[attr-defined]
+    operator = LandmarkSlam()
+    result = play(operator, messages | {"odometry": odometry})
+    assert len(result["pose"]) == len(plain["pose"]) - 1
+    assert all(np.isfinite(p.position).all() and np.isfinite(p.pose_covariance).all() for p in result["pose"])  # type: ignore[attr-defined]
+    off = result["pose"][-1].position - plain["pose"][-1].position  # type: ignore[attr-defined]
+    assert np.linalg.norm(off) < 0.1
+    counted = operator.summary()
+    assert counted["ignored, odometry: not finite"] == 1
+    assert counted["ignored, covariance of odometry: not finite or negative"] == 2
+
+
+def test_odometry_that_begins_anew_is_a_jump_and_the_landmarks_place_the_robot_again() -> None:
+    walk = Walk(2)
+    messages = walk.messages()
+    odometry = list(messages["odometry"])
+    for k in range(70, len(odometry)):
+        odometry[k] = odometry[k].replace(position=odometry[k].position + np.array([900.0, -400, 0]))  # type: ignore[attr-defined]
+    operator = LandmarkSlam()
+    result = play(operator, messages | {"odometry": odometry})
+    assert operator.summary()["ignored, step of odometry: a jump"] == 1
+    plain = play(LandmarkSlam(), messages)
+    off = result["pose"][-1].position - plain["pose"][-1].position  # type: ignore[attr-defined]
+    assert np.linalg.norm(off) < 0.1
+
+
+def test_a_landmark_that_is_twice_in_a_message_counts_once() -> None:
+    messages = Walk(1, rounds=1).messages()
+    doubled = [m.replace(ids=np.zeros(m.count, np.int64)) if m.count > 1 else m for m in messages["sightings"]]  # type: ignore[attr-defined]
+    operator = LandmarkSlam()
+    play(operator, messages | {"sightings": doubled})
+    expected = sum(m.count - 1 for m in doubled if m.count > 1)  # type: ignore[attr-defined]
+    assert operator.summary()["ignored, twice in a message"] == expected > 0
+
+
 def test_sightings_without_covariance_are_refused() -> None:
     messages = Walk(1, rounds=1).messages()
     bare = [m.replace(covariances=None) for m in messages["sightings"]]  # type: ignore[attr-defined]

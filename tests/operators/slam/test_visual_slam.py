@@ -222,6 +222,16 @@ def test_blind_frames_are_told_and_survived() -> None:
     assert errors(played["pose"], poses, poses[0])[-1] < 0.05
 
 
+def test_a_calibration_that_comes_with_every_image_is_the_same_and_another_is_refused() -> None:
+    once = streams(frames(on_round(8)))
+    stamps = [image.stamp for image in once["image"]]
+    each = once | {name: [once[name][0].replace(stamp=stamp) for stamp in stamps] for name in STATIC}
+    assert play(VisualSlam(), each).digests() == play(VisualSlam(), once, static=STATIC).digests()
+    each["image_info"][5] = info("color", 0.1).replace(stamp=stamps[5])
+    with pytest.raises(Exception, match="the calibration changed"):
+        play(VisualSlam(), each)
+
+
 def test_the_same_frames_give_the_same_bytes(around: Played) -> None:
     assert run(frames(on_round(ROUND + 6))).digests() == around.digests()
 
