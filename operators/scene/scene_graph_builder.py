@@ -16,6 +16,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES, UNKNOWN
 from operators.scene.bodies import Body
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
+from operators.scene.named_classes import unknown_classes
 from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
@@ -100,6 +101,10 @@ class SceneGraphBuilder(Operator):
             T = robot.matrix()
             if self.robot_frame is not None:
                 T = T @ transform_between(extrinsics, self.robot_frame, robot.child_frame)
+        if "unknown classes" not in self._counts:
+            self._counts["unknown classes"] = unknown_classes(
+                self, ("agents", "containers", "goals"), nodes.class_names
+            )
         bodies, unusable = _bodies(nodes)
         now = self._graph.update(nodes.stamp, bodies, T)
         self._names |= {b.id: _name(b) for b in now.bodies}
