@@ -3,13 +3,16 @@
     python benchmarks/activities.py true FOLDER [--first 600] [--worlds 10]
     python benchmarks/activities.py sensors CACHE [--first 600] [--worlds 10] [--every 1]
     python benchmarks/activities.py arrivals CACHE [--first 600] [--worlds 10]
+    python benchmarks/activities.py sensors CACHE --route watch [--first 600] [--worlds 10]
 
 *true*: the simulator's boxes, 4 times a second for 45 s; FOLDER keeps them, nothing is rendered. *sensors*: the shipped
 detector and segmenter, depth and true camera poses give a map; CACHE keeps what the networks gave (sensed_worlds.py).
 An agent counts while it is in view, and from sensors where it is mapped (IoU 0.25). An activity is right that is true
 within half a second; `unknown` is wrong. A goal counts one second before an agent begins to sit down or to reach.
 Beside the scores: what is true against what is said, and which part of the agents in view was lost where.
-*arrivals*: how many of those the camera could show: its agent in view at that time, and its goal at or before it.
+Goals of two counts of arrivals: of those whose agent and goal are mapped then, and of all that the camera could show:
+the agent is in view at that time, the goal at or before it; what is not mapped is missed.
+*arrivals*: how many the camera could show. *watch*: the robot stands with the people who choose in view, no tour.
 """
 
 from __future__ import annotations
@@ -17,7 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -38,6 +41,7 @@ from operators.training.simulated_people import read_episodes, write_episodes
 
 SECOND = 1_000_000_000
 ARRIVALS, UNDER_WAY = ("sitting_down", "sitting", "reaching"), ("standing", "walking")
+METHODS = ("ours", "nearest", "heading")
 CANDIDATES = ("chair", "table", "mug", "bottle", "door", "shelf")
 
 
@@ -63,7 +67,9 @@ class Figures:
     """
 
     acts: dict[str, Counter[str]] = field(default_factory=dict)
-    goals: dict[str, list[bool]] = field(default_factory=lambda: {"ours": [], "nearest": [], "heading": []})
+    goals: dict[str, list[bool]] = field(default_factory=lambda: {name: [] for name in METHODS})
+    shown: dict[str, list[bool]] = field(default_factory=lambda: {name: [] for name in METHODS})
+    """Of all arrivals that the camera could show."""
     candidates: list[int] = field(default_factory=list)
     leads: list[float] = field(default_factory=list)
     seen: Counter[str] = field(default_factory=Counter)
@@ -192,10 +198,15 @@ def shown(steps: list[Step]) -> Counter[str]:
 
 
 def arrivals(steps: list[Step], graphs: list[SceneGraph], ofs: list[dict[int, int]], found: Figures) -> None:
-    """Scores the goals of every arrival whose agent and goal are nodes a second before."""
+    """Scores the goals of every arrival whose agent is in view a second before."""
     for agent, goal, k, j in arriving(steps):
+        if agent not in steps[j].view:
+            continue
         mine = {t: m for m, t in ofs[j].items()}
-        if agent not in mine or goal not in mine or agent not in steps[j].view:
+        could = any(goal in step.view for step in steps[: j + 1])
+        if agent not in mine or goal not in mine:
+            for missed in found.shown.values() if could else ():
+                missed.append(False)
             continue
         graph, me, aim = graphs[j], mine[agent], mine[goal]
         ids, names = graph.ids.tolist(), [graph.class_names[c] for c in graph.class_ids.tolist()]
@@ -203,12 +214,18 @@ def arrivals(steps: list[Step], graphs: list[SceneGraph], ofs: list[dict[int, in
         offsets = {i: graph.positions[n][:2] - here for n, i in enumerate(ids) if names[n] in CANDIDATES}
         near = {i: o for i, o in offsets.items() if np.hypot(*o) < 5}
         found.candidates.append(len(near))
-        found.goals["ours"].append(first(graph, me) == aim)
-        found.goals["nearest"].append(min(near, key=lambda i: float(np.hypot(*near[i])), default=-1) == aim)
+        right = {
+            "ours": first(graph, me) == aim,
+            "nearest": min(near, key=lambda i: float(np.hypot(*near[i])), default=-1) == aim,
+        }
         old = graphs[max(j - 4, 0)]
         way = here - old.positions[old.ids.tolist().index(me)][:2] if me in old.ids.tolist() else np.zeros(2)
         ahead = {i: float(o @ way) / max(float(np.hypot(*o)), 1e-6) for i, o in near.items()}
-        found.goals["heading"].append(max(ahead, key=lambda i: ahead[i], default=-1) == aim)
+        right["heading"] = max(ahead, key=lambda i: ahead[i], default=-1) == aim
+        for name, value in right.items():
+            found.goals[name].append(value)
+            if could:
+                found.shown[name].append(value)
         since = k
         while since > 0 and first(graphs[since - 1], me) == aim:
             since -= 1
@@ -233,11 +250,16 @@ def report(rows: dict[str, Figures]) -> None:
             print("   by class:", by_class(total), "\n   wrong:", {k: n for k, n in total.most_common() if differ(k)})
     print("agents in view:", dict(sum((found.lost for found in rows.values()), Counter()).most_common()))
     table(sum((found.seen for found in rows.values()), Counter()))
-    for name in ("ours", "nearest", "heading"):
-        right = [x for found in rows.values() for x in found.goals[name]]
-        worlds = [float(np.mean(found.goals[name])) for found in rows.values() if found.goals[name]]
-        if right:
-            print(f"goals, {name}: {np.mean(right):.3f} of {len(right)} arrivals, worst world {min(worlds):.2f}")
+    for of in ("goals", "shown"):
+        for name in METHODS:
+            worlds = [vars(found)[of][name] for found in rows.values() if vars(found)[of][name]]
+            if worlds:
+                right = [x for world in worlds for x in world]
+                each = [float(np.mean(world)) for world in worlds]
+                print(
+                    f"{of}, {name}: {np.mean(right):.3f} of {len(right)} arrivals in {len(worlds)} worlds, "
+                    f"mean over the worlds {np.mean(each):.3f}, worst {min(each):.2f}"
+                )
     leads = [x for found in rows.values() for x in found.leads]
     if leads:
         many = [x for found in rows.values() for x in found.candidates]
@@ -275,32 +297,40 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=600)
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--every", type=int, default=1, help="take every so many frames of the sensors")
+    parser.add_argument("--route", choices=["tour", "watch"], default="tour", help="of the robot with sensors")
+    parser.add_argument("--seeds", type=int, nargs="*", help="in place of --first and --worlds")
     parser.add_argument("--out", type=Path, help="JSON file for all counts")
     options = parser.parse_args()
-    seeds = range(options.first, options.first + options.worlds)
+    seeds = options.seeds or list(range(options.first, options.first + options.worlds))
     if options.fed == "arrivals":
-        report_shown(seeds, options.folder)
+        report_shown(sensed(seeds, options.folder, options.route))
         return
     rows: dict[str, Figures] = {}
-    for name, steps in (true_worlds if options.fed == "true" else sensed_steps)(seeds, options.folder, options.every):
+    true = options.fed == "true"
+    for name, steps in (
+        true_worlds(seeds, options.folder)
+        if true
+        else sensed_steps(sensed(seeds, options.folder, options.route), options.every)
+    ):
         rows[name] = figures_of(steps)
         told = {n: round(macro_f1(c), 3) for n, c in rows[name].acts.items()}
-        print(name, told, {n: f"{sum(x)}/{len(x)}" for n, x in rows[name].goals.items()}, flush=True)
+        goals = {of: {n: f"{sum(x)}/{len(x)}" for n, x in vars(rows[name])[of].items()} for of in ("goals", "shown")}
+        print(name, told, goals, flush=True)
         if options.out is not None:
             options.out.write_text(json.dumps({n: vars(f) for n, f in rows.items()}))
     report(rows)
 
 
-def report_shown(seeds: range, folder: Path) -> None:
+def report_shown(worlds: Iterable[World]) -> None:
     total: Counter[str] = Counter()
-    for world in sensed(seeds, folder):
+    for world in worlds:
         counts = shown(list(steps_of(world, [frame.scene for frame in world.frames])))
         print(world.name, dict(counts), flush=True)
         total.update(counts)
     print("all", dict(total))
 
 
-def true_worlds(seeds: range, folder: Path, _: int) -> Iterator[tuple[str, list[Step]]]:
+def true_worlds(seeds: Sequence[int], folder: Path) -> Iterator[tuple[str, list[Step]]]:
     chosen = [(KINDS[seed % len(KINDS)], seed, 3) for seed in seeds]
     for _made in write_episodes(folder, chosen, 1):
         pass
@@ -308,8 +338,8 @@ def true_worlds(seeds: range, folder: Path, _: int) -> Iterator[tuple[str, list[
         yield episode.name, list(true_steps(episode))
 
 
-def sensed_steps(seeds: range, folder: Path, every: int) -> Iterator[tuple[str, list[Step]]]:
-    for world in sensed(seeds, folder):
+def sensed_steps(worlds: Iterable[World], every: int) -> Iterator[tuple[str, list[Step]]]:
+    for world in worlds:
         thinned = World(world.name, world.image_info, world.extrinsics, world.frames[::every])
         yield world.name, list(sensor_steps(thinned))
 

@@ -1,15 +1,16 @@
 """What the shipped networks and a depth camera make of simulated worlds, with the truth: input of other benchmarks.
 
-Each world is driven through once, at 640x480; what was sensed is kept in a folder, since networks are slow.
+Each world is driven through once, at 640x480, or watched by a robot that stands; what was sensed is kept in a folder,
+since networks are slow.
 """
 
 from __future__ import annotations
 
 import pickle
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,7 @@ from operators.scene import ObjectLifter, SemanticMap
 from operators.segmentation import Segmenter
 from operators.sources.simulated_robot import SimulatedRobot
 
+Route = Literal["tour", "watch"]
 KINDS = ("office", "table_top", "corridor")
 RATE, SECONDS = 4.0, 50
 SEARCH: dict[str, Any] = {"voxel": 0.08, "period": 2.0}
@@ -101,16 +103,23 @@ class Mapper:
         return dict(found), made["nodes"]
 
 
-def sense(kind: str, seed: int) -> World:
+def sense(kind: str, seed: int, route: Route) -> World:
     robot = SimulatedRobot(
         world=kind,
         seed=seed,
         people=3,
-        route="tour",
+        route=route,
         duration=f"{SECONDS}s",
         color_camera={"rate": RATE, "width": 640, "height": 480},
         depth_camera={"rate": RATE},
-        truth={"poses": RATE, "relations": RATE, "activities": RATE, "masks": True, "min_pixels": 50},
+        truth={
+            "poses": RATE,
+            "relations": RATE,
+            "spatial": route == "tour",
+            "activities": RATE,
+            "masks": True,
+            "min_pixels": 50,
+        },
     )
     builder, detector, segmenter = (
         CloudBuilder(stride=3, max_range=6.0),
@@ -140,14 +149,14 @@ def sense(kind: str, seed: int) -> World:
     return World(f"{kind} {seed}", static["image_info"], static["extrinsics"], frames)
 
 
-def sensed(seeds: range, folder: Path) -> Iterator[World]:
+def sensed(seeds: Iterable[int], folder: Path, route: Route = "tour") -> Iterator[World]:
     """Yields a world of each seed, the kinds in turn; those that the folder has are read from it."""
     folder.mkdir(parents=True, exist_ok=True)
     for seed in seeds:
         kind = KINDS[seed % len(KINDS)]
-        file = folder / f"{kind}_{seed}.pickle"
+        file = folder / f"{kind}_{seed}{'' if route == 'tour' else f'_{route}'}.pickle"
         if not file.is_file():
             partial = file.with_suffix(".partial")
-            partial.write_bytes(pickle.dumps(sense(kind, seed)))
+            partial.write_bytes(pickle.dumps(sense(kind, seed, route)))
             partial.replace(file)
         yield pickle.loads(file.read_bytes())

@@ -30,8 +30,8 @@ _PROVIDERS: dict[Provider, str] = {
 def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] = ()) -> onnxruntime.InferenceSession:
     """Opens an ONNX model, for one thread on the CPU. Inner values that `reveal` names follow its own outputs.
 
-    Raises FileNotFoundError, or ModelError for a file that is no model or a provider that is not there: what is asked
-    for is not silently done by the CPU.
+    Raises FileNotFoundError, or ModelError for a file that is no model, or a provider that is not there or finds no
+    device: what is asked for is not silently done by the CPU.
     """
     import onnxruntime  # heavy, and needed only where a network runs
 
@@ -53,14 +53,21 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
     options.log_severity_level = 3
     try:
         model = file.read_bytes() + _outputs(reveal) if reveal else str(file)
-        return onnxruntime.InferenceSession(model, options, providers=_chosen(provider))
+        session = onnxruntime.InferenceSession(model, options, providers=_chosen(provider, available))
     except Exception as error:  # onnxruntime's exception classes share no public base
         raise ModelError(f"{file} cannot be loaded as an ONNX model: {error}") from error
+    if _PROVIDERS[provider] not in session.get_providers():  # it says so in its log alone, and takes the next one
+        raise ModelError(
+            f"onnxruntime's provider {provider!r} could not start: is there such a device, and are its driver and "
+            f"libraries installed? On this machine provider: cpu runs {file}"
+        )
+    return session
 
 
-def _chosen(provider: Provider) -> list[str]:
-    """The provider, and the CPU for the layers that it does not know."""
-    return list(dict.fromkeys((_PROVIDERS[provider], _PROVIDERS["cpu"])))
+def _chosen(provider: Provider, available: Sequence[str]) -> list[str]:
+    """The provider, and others for the layers that it does not know: for TensorRT CUDA first, then the CPU."""
+    cuda = (_PROVIDERS["cuda"],) if provider == "tensorrt" and _PROVIDERS["cuda"] in available else ()
+    return list(dict.fromkeys((_PROVIDERS[provider], *cuda, _PROVIDERS["cpu"])))
 
 
 def _outputs(names: Sequence[str]) -> bytes:

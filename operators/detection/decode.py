@@ -37,11 +37,15 @@ Decode = Callable[[Outputs, Size, float], Candidates]
 
 @dataclass(frozen=True)
 class Layout:
-    """One family of networks. Its input is (pixel - `mean`) / `scale`, pixels from 0 to 255."""
+    """One family of networks. Its input is (pixel - `mean`) / `scale`, pixels from 0 to 255.
+
+    `classes` tells of outputs that were decoded how many classes they have; none where they do not show it.
+    """
 
     decode: Decode
     bgr: bool
     fit: FitMode
+    classes: Callable[[Outputs], int] | None
     mean: float = 0.0
     scale: float = 255.0
 
@@ -130,11 +134,18 @@ def _ssd_pair(a: NDArray[Any], b: NDArray[Any]) -> bool:
 DecoderName = Literal["fastestdet", "yolov5", "yolov8", "ssd", "torchvision"]
 
 LAYOUTS: dict[DecoderName, Layout] = {
-    "fastestdet": Layout(decode_fastestdet, bgr=True, fit="stretch"),
-    "yolov5": Layout(decode_yolov5, bgr=False, fit="letterbox"),
-    "yolov8": Layout(decode_yolov8, bgr=False, fit="letterbox"),
-    "ssd": Layout(decode_ssd, bgr=False, fit="stretch", mean=127.0, scale=128.0),
-    "torchvision": Layout(decode_torchvision, bgr=False, fit="stretch"),
+    "fastestdet": Layout(decode_fastestdet, bgr=True, fit="stretch", classes=lambda o: int(o[0].shape[1]) - 5),
+    "yolov5": Layout(decode_yolov5, bgr=False, fit="letterbox", classes=lambda o: int(o[0].shape[2]) - 5),
+    "yolov8": Layout(decode_yolov8, bgr=False, fit="letterbox", classes=lambda o: int(o[0].shape[1]) - 4),
+    "ssd": Layout(
+        decode_ssd,
+        bgr=False,
+        fit="stretch",
+        classes=lambda o: int(next(a.shape[2] for a in o if a.shape[2] != 4)) - 1,
+        mean=127.0,
+        scale=128.0,
+    ),
+    "torchvision": Layout(decode_torchvision, bgr=False, fit="stretch", classes=None),
 }
 
 

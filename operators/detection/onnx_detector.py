@@ -9,7 +9,7 @@ import numpy as np
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.coco import COCO_CLASSES
-from operators.detection.decode import LAYOUTS, Candidates, DecoderName
+from operators.detection.decode import LAYOUTS, Candidates, DecoderName, Outputs
 from operators.detection.fit import Fit, FitMode
 from operators.detection.nms import class_wise_nms
 from operators.inference import ModelError, Provider, open_session
@@ -58,7 +58,7 @@ class OnnxDetector(Operator):
         self._names = COCO_CLASSES if self.classes is None else read_labels(self.use_file(self.classes)).names
 
     def process(self, image: Image) -> Detections2D:
-        """Raises ModelError where the model's output is not what the decoder reads."""
+        """Raises ModelError where the model's output is not what the decoder reads, or has other classes than names."""
         fit = Fit.plan(self._fit, (image.width, image.height), self._input.size)
         tensor = self._input.tensor(fit.apply(three_channels(image.data)))
         outputs = self._session.run(None, {self._input.name: tensor})
@@ -66,7 +66,7 @@ class OnnxDetector(Operator):
             found = self._layout.decode(outputs, self._input.size, self.score_threshold)
         except ValueError as error:
             raise ModelError(f"OnnxDetector.decoder={self.decoder!r} does not fit {self.model}: {error}") from None
-        self._check_classes(found)
+        self._check_classes(outputs, found)
         found = found.select(class_wise_nms(found.boxes, found.scores, found.classes, self.nms_iou))
         boxes = fit.restore(found.boxes[: self.max_detections])
         return Detections2D(
@@ -80,9 +80,12 @@ class OnnxDetector(Operator):
             class_ids=found.classes[: self.max_detections],
         )
 
-    def _check_classes(self, found: Candidates) -> None:
-        if found.classes.size and found.classes.max() >= len(self._names):
+    def _check_classes(self, outputs: Outputs, found: Candidates) -> None:
+        known = self._layout.classes
+        count = int(found.classes.max(initial=-1)) + 1 if known is None else known(outputs)
+        if count > len(self._names) or (known is not None and count != len(self._names)):
             raise ModelError(
-                f"{self.model} found class {found.classes.max()}, but there are {len(self._names)} class names; "
-                f"give the model's own in OnnxDetector.classes"
+                f"{self.model} tells {count} {'classes' if known is not None else 'or more classes'} apart, but there "
+                f"are {len(self._names)} class names{' (those of COCO)' if self.classes is None else ''}; give the "
+                f"model's own in OnnxDetector.classes, one a line"
             )

@@ -21,6 +21,7 @@ from dataflow.messages.scene_summary import (
     summarize,
 )
 from dataflow.recording import Recording, RecordingError
+from operators.scene.history import Event, history
 from operators.scene.query import QueryError, as_json, ask
 from operators.scene.spark import as_spark_dsg
 
@@ -36,6 +37,9 @@ def show(
     query: Annotated[
         str | None, typer.Option(help="Whatever fits, such as 'mug on table near person'; 'not' denies a relation.")
     ] = None,
+    story: Annotated[
+        str | None, typer.Option("--history", metavar="NODE", help="What happened to a node, such as 'mug 12', so far.")
+    ] = None,
     stream: Annotated[str | None, typer.Option(help="The stream of the graph, where there are several.")] = None,
     nodes: Annotated[bool, typer.Option("--nodes", help="List every node with position, size and relations.")] = False,
     json: Annotated[bool, typer.Option("--json", help="Print nodes, relations and matches as JSON.")] = False,
@@ -44,7 +48,8 @@ def show(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the --export file if it is there.")] = False,
 ) -> None:
-    """Show the scene graph of a recording at a time in short, all its nodes, or what in it a question asks for.
+    """Show the scene graph of a recording at a time in short, all its nodes, what in it a question asks for, or one
+    node's history up to then.
 
     A question names a class and conditions on it: `mug on table near person` is a mug that is on a table and near a
     person. A class may be `anything` or have a number, as in `on table 3`. Exit code 1 where nothing fits.
@@ -54,8 +59,12 @@ def show(
       dataflow scene out/demo.mcap
       dataflow scene out/demo.mcap --at 9.2 --query "book in shelf"
       dataflow scene out/demo.mcap --nodes --json
+      dataflow scene out/demo.mcap --history "person 14"
     """
     try:
+        if story is not None:
+            _told(_history(recording, stream, at, story), json=json)
+            return
         graph, activities, since = _graph(recording, stream, at)
         matches = None if query is None else ask(graph, query)
         if export is not None:
@@ -97,31 +106,65 @@ def _write(graph: SceneGraph, file: Path, *, overwrite: bool) -> None:
 
 def _graph(path: Path, stream: str | None, at: float | None) -> tuple[SceneGraph, Activity | None, float]:
     """Returns the newest graph at a time, its operator's activities then, and its age (s) since the recording began."""
-    if not path.is_file():
-        raise FileNotFoundError(f"there is no file {path}")
-    with Recording(path) as recording:
-        known = [n for n, info in recording.streams.items() if info.message_type is SceneGraph]
-        wanted = [n for n in known if stream is None or n == stream or n.endswith(f"/{stream}")]
-        built = [n for n in wanted if n.endswith("/graph")] or wanted
-        if not known:
-            made = f"dataflow replay {path} --graph perception --record OUT.mcap"
-            raise ValueError(f"{path} holds no scene graph; a graph that makes one, of a robot's camera: {made}")
-        if len(built) != 1:
-            there = ", ".join(known) or "none"
-            raise ValueError(f"{path} has no single scene graph to show; give --stream one of: {there}")
-        first = min(i.first for i in recording.streams.values() if i.first is not None and not i.static)
+    with _opened(path) as recording:
+        built, first = _built(recording, stream)
         end = None if at is None else first + round(at * 1e9)
         graph = None
-        for record in recording.messages(built, end=end):
+        for record in recording.messages([built], end=end):
             graph = record.message
         if not isinstance(graph, SceneGraph):
-            raise ValueError(f"{built[0]} has no graph up to {at} s")
-        beside = f"{built[0].rpartition('/')[0]}/activities"
-        activities = None
-        if beside in recording.streams and recording.streams[beside].message_type is Activity:
-            for record in recording.messages([beside], start=graph.stamp, end=graph.stamp):
-                activities = record.message
-        return graph, activities if isinstance(activities, Activity) else None, (graph.stamp - first) * 1e-9
+            raise ValueError(f"{built} has no graph up to {at} s")
+        activities = _activities(recording, built, start=graph.stamp, end=graph.stamp).get(graph.stamp)
+        return graph, activities, (graph.stamp - first) * 1e-9
+
+
+def _history(path: Path, stream: str | None, at: float | None, node: str) -> list[tuple[float, Event]]:
+    """Returns what happened to a node up to a time, with the seconds since the recording began."""
+    with _opened(path) as recording:
+        built, first = _built(recording, stream)
+        end = None if at is None else first + round(at * 1e9)
+        graphs = (r.message for r in recording.messages([built], end=end) if isinstance(r.message, SceneGraph))
+        found = history(graphs, _activities(recording, built, start=None, end=end), node)
+        return [((event.stamp - first) * 1e-9, event) for event in found]
+
+
+def _opened(path: Path) -> Recording:
+    if not path.is_file():
+        raise FileNotFoundError(f"there is no file {path}")
+    return Recording(path)
+
+
+def _built(recording: Recording, stream: str | None) -> tuple[str, int]:
+    """Returns the stream of scene graphs that is meant, and the first stamp of the recording."""
+    known = [n for n, info in recording.streams.items() if info.message_type is SceneGraph]
+    wanted = [n for n in known if stream is None or n == stream or n.endswith(f"/{stream}")]
+    built = [n for n in wanted if n.endswith("/graph")] or wanted
+    path = recording.path
+    if not known:
+        made = f"dataflow replay {path} --graph perception --record OUT.mcap"
+        raise ValueError(f"{path} holds no scene graph; a graph that makes one, of a robot's camera: {made}")
+    if len(built) != 1:
+        there = ", ".join(known) or "none"
+        raise ValueError(f"{path} has no single scene graph to show; give --stream one of: {there}")
+    return built[0], min(i.first for i in recording.streams.values() if i.first is not None and not i.static)
+
+
+def _activities(recording: Recording, built: str, *, start: int | None, end: int | None) -> dict[int, Activity]:
+    """Returns the activities that the graph's own operator tells, by stamp."""
+    beside = f"{built.rpartition('/')[0]}/activities"
+    if beside not in recording.streams or recording.streams[beside].message_type is not Activity:
+        return {}
+    found = (record.message for record in recording.messages([beside], start=start, end=end))
+    return {message.stamp: message for message in found if isinstance(message, Activity)}
+
+
+def _told(found: list[tuple[float, Event]], *, json: bool) -> None:
+    if json:
+        typer.echo(jsonlib.dumps([{"seconds": s, "stamp": event.stamp, "event": event.text} for s, event in found]))
+        return
+    out = Console(highlight=False)
+    for seconds, event in found:
+        out.print(f"{seconds:8.1f} s  {event.text}", soft_wrap=True)
 
 
 def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since: float) -> None:

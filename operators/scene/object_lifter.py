@@ -30,6 +30,7 @@ from operators.cloud.gravity import gravity, unit
 from operators.geometry.extrinsics import transform_between
 from operators.geometry.pinhole import project
 from operators.scene.lifting import Lifted, LiftSettings, Seen, lift
+from operators.scene.named_classes import unknown_classes
 from operators.status import counted_status
 
 _MOST_GRAIN = 4.0  # pixels
@@ -89,6 +90,8 @@ class ObjectLifter(Operator):
     ) -> dict[str, Any]:
         """Raises ValueError where the calibration is of another image or no transform relates the frames."""
         _check(detections, image_info)
+        if "unknown classes" not in self._counts:
+            self._counts["unknown classes"] = unknown_classes(self, ("bodies",), detections.class_names)
         up, _ = gravity(cloud, pose, extrinsics, self._up)
         usable = np.flatnonzero(in_range(cloud.points, 0.0, self.max_range))
         points = cloud.points[usable].astype(np.float64)

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Any
 
 from dataflow.messages import SceneGraph
+from dataflow.messages.scene_summary import AGENTS
 from operators.scene.map_surface import SURFACES
 from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM
 
 _ANY = ("anything", "something", "thing", "*")
 _LAYERS = {ROOM: "room", FLOOR: "surface", ROBOT: "robot"}
-_AGENTS = ("person", "robot", "ball")
 
 
 class QueryError(ValueError):
@@ -146,7 +146,7 @@ def as_json(graph: SceneGraph) -> dict[str, Any]:
     nodes = []
     for k in range(graph.count):
         id, label = int(graph.ids[k]), graph.class_names[graph.class_ids[k]] if graph.class_names else ""
-        layer = _LAYERS.get(id) or ("surface" if label in SURFACES else "agent" if label in _AGENTS else "object")
+        layer = _LAYERS.get(id) or ("surface" if label in SURFACES else "agent" if label in AGENTS else "object")
         nodes.append(
             {
                 "id": id,

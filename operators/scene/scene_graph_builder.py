@@ -17,6 +17,7 @@ from operators.geometry.extrinsics import transform_between
 from operators.scene.agents import ACTIVITIES, UNKNOWN
 from operators.scene.bodies import Body, BodyMemory
 from operators.scene.layered_graph import Act, GraphSettings, LayeredGraph, Snapshot
+from operators.scene.named_classes import unknown_classes
 from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
@@ -102,6 +103,10 @@ class SceneGraphBuilder(Operator):
             T = robot.matrix()
             if self.robot_frame is not None:
                 T = T @ transform_between(extrinsics, self.robot_frame, robot.child_frame)
+        if "unknown classes" not in self._counts:
+            self._counts["unknown classes"] = unknown_classes(
+                self, ("agents", "containers", "goals"), nodes.class_names
+            )
         usable = _usable(nodes)
         bodies, unusable = self._bodies_of(nodes, usable), nodes.count - len(usable)
         now = self._graph.update(nodes.stamp, bodies, T)

@@ -33,6 +33,7 @@ from operators.scene.map_file import LearnedFile, SavedMap, learned_files, toget
 from operators.scene.map_nodes import nodes_of, seen_surfaces
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings, Observation
+from operators.scene.named_classes import unknown_classes
 from operators.scene.object_map import ObjectMap
 from operators.scene.range_view import RangeView
 from operators.scene.surface_map import SurfaceMap
@@ -219,6 +220,7 @@ class SemanticMap(Operator):
     def _opened(self, boxes: Boxes3D, pose: Pose | Odometry) -> ObjectMap:
         if self._map is None:
             self._classes, self._frame = boxes.class_names, pose.frame
+            self._counts["unknown classes"] = unknown_classes(self, ("movers", "carriers", "portable"), self._classes)
             self._map = self._made()
             if self._known is not None and self._known.objects:
                 self._take_up(self._known, boxes.stamp)

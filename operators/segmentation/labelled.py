@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
@@ -11,8 +11,22 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
 from operators.detection.fit import Fit
+from operators.inference import ModelError
 
 VOID = 255
+
+
+def least_of(
+    names: Sequence[str], threshold: float, by_class: Mapping[str, float], where: str
+) -> NDArray[np.float32] | float:
+    """Returns the least confidence of each class (C,), or of all where no class has one of its own.
+
+    Raises ModelError for a class that the model does not know, and a share that is none.
+    """
+    for name, value in by_class.items():
+        if name not in names or not 0 <= value <= 1:
+            raise ModelError(f"{where} has {name!r}: {value}; it takes shares from 0 to 1 for {', '.join(names)}")
+    return np.array([by_class.get(n, threshold) for n in names], np.float32) if by_class else threshold
 
 
 def labelled(

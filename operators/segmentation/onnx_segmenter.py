@@ -13,9 +13,9 @@ from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.fit import Fit, FitMode
 from operators.inference import ModelError, Provider, open_session
-from operators.network_input import Labels, image_input, read_labels, three_channels
+from operators.network_input import image_input, read_labels, three_channels
 from operators.segmentation.drawing import draw_segmentation
-from operators.segmentation.labelled import labelled
+from operators.segmentation.labelled import labelled, least_of
 from operators.segmentation.onnx_answer import at_image, best_of, classes_of, scores_of, told
 from operators.status import Row, status_of_rows
 
@@ -90,7 +90,7 @@ class OnnxSegmenter(Operator):
                 f"thresholds and with_confidence out, or name an output with scores"
             )
         if self._labels is not None:
-            self._check_thresholds(self._labels)
+            self._least(self._labels.names)
 
     def process(self, image: Image) -> dict[str, Any]:
         """Raises ModelError where the model's output is no scores and no map of classes, or has other classes."""
@@ -107,7 +107,7 @@ class OnnxSegmenter(Operator):
             names,
             classes.astype(np.uint8 if void == 255 else np.uint16),
             confidence,
-            least=np.array([self.class_thresholds.get(n, self.confidence_threshold) for n in names], np.float32),
+            least=self._least(names),
             with_confidence=self.with_confidence,
             void=void,
         )
@@ -128,10 +128,12 @@ class OnnxSegmenter(Operator):
                 f"there are scores of {len(scores)} classes ({output.shape}), but {len(names)} class names; give the "
                 f"model's own in OnnxSegmenter.classes"
             )
-        if self._labels is None:
-            self._check_thresholds(Labels(names, {}))
         planes = np.stack([at_image(plane, fit, cv2.INTER_LINEAR) for plane in scores])
         return *best_of(planes, shares), names
+
+    def _least(self, names: tuple[str, ...]) -> NDArray[np.float32] | float:
+        where = f"{type(self).__name__}.class_thresholds"
+        return least_of(names, self.confidence_threshold, self.class_thresholds, where)
 
     def _mapped(self, output: NDArray[Any], fit: Fit) -> tuple[NDArray[np.intp], None, tuple[str, ...]]:
         classes = at_image(classes_of(output).astype(np.int32), fit, cv2.INTER_NEAREST)
@@ -140,14 +142,6 @@ class OnnxSegmenter(Operator):
         if classes.min(initial=0) < 0 or (names and known.max(initial=0) >= len(names)):
             raise ValueError(f"it has class {classes.min()} to {known.max()}, but there are {len(names)} class names")
         return classes, None, names
-
-    def _check_thresholds(self, labels: Labels) -> None:
-        for name, value in self.class_thresholds.items():
-            if name not in labels.names or not 0 <= value <= 1:
-                raise ModelError(
-                    f"OnnxSegmenter.class_thresholds has {name!r}: {value}; it takes shares from 0 to 1 for "
-                    f"{', '.join(labels.names)}"
-                )
 
 
 def _status(made: SegmentationMap, confidence: NDArray[np.float32] | None) -> Diagnostics:

@@ -13,7 +13,7 @@ from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.fit import Fit
 from operators.network_input import three_channels
-from operators.segmentation.labelled import VOID, enlarged, labelled
+from operators.segmentation.labelled import VOID, enlarged, labelled, least_of
 from operators.segmentation.scores import best_classes, probability
 from operators.weights import NetworkFileError, open_network, shipped
 
@@ -32,10 +32,11 @@ class Segmenter(Operator):
 
     weights: str | None = Param(None, doc="network file of `dataflow train segmenter`; none means the shipped one")
     confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void (255)")
+    class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
     with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
 
     def setup(self) -> None:
-        """Loads the network. Raises FileNotFoundError or NetworkFileError."""
+        """Loads the network. Raises FileNotFoundError, NetworkFileError, or ModelError for unknown classes."""
         file = self.use_file(self.weights if self.weights is not None else shipped("segmenter.onnx"))
         self._network = open_network(file, "segmenter")
         outputs = self._network.session.get_outputs()
@@ -46,20 +47,25 @@ class Segmenter(Operator):
             raise NetworkFileError(f"{file} must have the outputs classes and confidence, or 8-bit scores; has {told}")
         if len(self._network.classes) > VOID:
             raise NetworkFileError(f"{file} has {len(self._network.classes)} classes; at most {VOID} are possible")
+        self._least()
 
     def process(self, image: Image) -> SegmentationMap:
         network = self._network
         fit = Fit.plan("letterbox", (image.width, image.height), network.size)
-        wanted = self.with_confidence or self.confidence_threshold > 0
+        wanted = self.with_confidence or self.confidence_threshold > 0 or bool(self.class_thresholds)
         classes, confidence = self._answered(network.run(fit.apply(three_channels(image.data))), wanted)
         return labelled(
             image,
             network.classes,
             np.asarray(enlarged(classes, fit, cv2.INTER_NEAREST), np.uint8),
             None if confidence is None else np.asarray(enlarged(confidence, fit, cv2.INTER_LINEAR), np.float32),
-            least=self.confidence_threshold,
+            least=self._least(),
             with_confidence=self.with_confidence,
         )
+
+    def _least(self) -> NDArray[np.float32] | float:
+        where = "Segmenter.class_thresholds"
+        return least_of(self._network.classes, self.confidence_threshold, self.class_thresholds, where)
 
     def _answered(
         self, found: Sequence[NDArray[Any]], wanted: bool

@@ -6,12 +6,13 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
 from operators.cameras import Cameras, same_size
 from operators.inference import ModelError
-from operators.segmentation.labelled import VOID, labelled
+from operators.segmentation.labelled import VOID, labelled, least_of
 from operators.torch_models import DEFAULT, Runner, batch_of, load
 
 if TYPE_CHECKING:
@@ -32,20 +33,26 @@ class _Segmentation(Operator, abstract=True):
     half: bool = Param(False, doc="compute in half precision; on a GPU alone")
     side: int = Param(520, ge=0, doc="shorter side of what the network sees; 0 leaves the image as it is", unit="px")
     confidence_threshold: float = Param(0.0, ge=0, le=1, live=True, doc="pixels below become void (255)")
+    class_thresholds: dict[str, float] = Param({}, doc="the same for single classes, by name")
     with_confidence: bool = Param(False, live=True, doc="also give the confidence of every pixel")
 
     def setup(self) -> None:
-        """Loads the model. Raises FileNotFoundError, or ModelError for weights or a device that is not there."""
+        """Loads the model. Raises FileNotFoundError, or ModelError for missing weights, devices or classes."""
         file = None if self.checkpoint is None else self.use_file(self.checkpoint)
         loaded = load("segmentation", self.model, self.weights, file, self.device)
         self._names = tuple("background" if name == "__background__" else name for name in loaded.classes)
         if len(self._names) > VOID:
             raise ModelError(f"{self.model} has {len(self._names)} classes; at most {VOID} are possible")
+        self._least()
         self._run = Runner(loaded.model, loaded.device, half=self.half)
 
     def summary(self) -> Mapping[str, float | int | str]:
         """Counts the images for which the GPU's memory did not suffice."""
         return self._run.summary()
+
+    def _least(self) -> NDArray[np.float32] | float:
+        where = f"{type(self).__name__}.class_thresholds"
+        return least_of(self._names, self.confidence_threshold, self.class_thresholds, where)
 
     def _maps(self, images: Sequence[Image]) -> list[SegmentationMap]:
         """The classes of images of one size, by one call of the network."""
@@ -56,7 +63,7 @@ class _Segmentation(Operator, abstract=True):
                 self._names,
                 classes[k].cpu().numpy().astype(np.uint8),
                 confidence[k].cpu().numpy().astype(np.float32),
-                least=self.confidence_threshold,
+                least=self._least(),
                 with_confidence=self.with_confidence,
             )
             for k, image in enumerate(images)

@@ -113,8 +113,10 @@ class SimulatedRobot(Source):
     duration: Duration = Param("30s", doc="length; stamps lie before first_stamp + duration")
     first_stamp: int = Param(0, ge=0, doc="stamp of the start", unit="ns")
     speed: float = Param(0.5, gt=0.02, le=0.8, doc="of the robot on straights; it slows down in curves", unit="m/s")
-    route: Literal["round", "tour"] = Param(
-        "round", doc="of the robot: a round, or a tour that crosses itself and, but at the table, leads back too"
+    route: Literal["round", "tour", "watch"] = Param(
+        "round",
+        doc="of the robot: a round; a tour that crosses itself and, but at the table, leads back too; or it stands and "
+        "watches people who choose, of which there must be some",
     )
     hold: float = Param(0.0, ge=0, doc="time that the robot stands still at first", unit="s")
     movers: bool = Param(True, doc="people, balls and robots move; otherwise there are none")
@@ -148,6 +150,7 @@ class SimulatedRobot(Source):
         each other.
         """
         from operators.sources.simulator.drive import bumps, sway
+        from operators.sources.simulator.lookout import watching
         from operators.sources.simulator.stage import Stage
         from operators.sources.simulator.truth import TrueGraph
         from operators.sources.simulator.worlds import make_world
@@ -164,6 +167,10 @@ class SimulatedRobot(Source):
             tour=self.route == "tour",
             jumps=tuple((kidnap.at, kidnap.ahead) for kidnap in self.kidnaps),
         )
+        if self.route == "watch":
+            if self.kidnaps:
+                raise ValueError("a robot that stands and watches (route: watch) has no path to be carried along")
+            world = watching(world, self.color_camera)
         shaken = self.motion
         shakes = [bumps(self.seed, shaken.bumps)] if shaken.bumps else []
         shakes += [sway(self.seed, shaken.sway, shaken.turn)] if shaken.sway or shaken.turn else []

@@ -55,10 +55,17 @@ def detector(**params: object) -> OnnxDetector:
     return made
 
 
+def names(folder: Path, *classes: str) -> str:
+    file = folder / "names.txt"
+    file.write_text("\n".join(classes))
+    return str(file)
+
+
 def test_boxes_come_back_in_the_pixels_of_the_image(tmp_path: Path) -> None:
     # The image 200x100 is stretched on 64x64: x by 3.125, y by 1.5625. Two boxes overlap; the weaker one goes.
     rows = yolov8_rows((32, 32, 16, 32, 0.9, 0.1), (33, 32, 16, 32, 0.8, 0.1), (8, 8, 8, 8, 0.1, 0.7))
-    found = detector(model=save_model(tmp_path / "m.onnx", rows), decoder="yolov8", fit="stretch").process(red())
+    options = {"decoder": "yolov8", "fit": "stretch", "classes": names(tmp_path, "person", "bicycle")}
+    found = detector(model=save_model(tmp_path / "m.onnx", rows), **options).process(red())
     np.testing.assert_allclose(found.boxes, [[75, 25, 125, 75], [12.5, 6.25, 37.5, 18.75]], atol=1e-4)
     np.testing.assert_allclose(found.scores, [0.9, 0.7], atol=1e-5)
     assert [found.class_names[i] for i in found.class_ids] == ["person", "bicycle"]
@@ -68,7 +75,7 @@ def test_boxes_come_back_in_the_pixels_of_the_image(tmp_path: Path) -> None:
 def test_yolo_letterboxes_by_default(tmp_path: Path) -> None:
     # 200x100 in 64x64: scaled by 0.32, with 16 rows of grey above; grey dims the mean of red to 0.5 + 0.5 * 114/255.
     model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 32, 16, 0.9)) / (0.5 + 0.5 * 114 / 255))
-    found = detector(model=model, decoder="yolov8").process(red())
+    found = detector(model=model, decoder="yolov8", classes=names(tmp_path, "crate")).process(red())
     np.testing.assert_allclose(found.boxes, [[50, 25, 150, 75]], atol=0.01)
 
 
@@ -83,7 +90,8 @@ def test_fastestdet_is_given_blue_first(tmp_path: Path) -> None:
 
 def test_only_the_best_are_kept(tmp_path: Path) -> None:
     rows = yolov8_rows(*((8 * i + 4, 32, 6, 6, 0.4 + 0.05 * i) for i in range(8)))
-    found = detector(model=save_model(tmp_path / "m.onnx", rows), decoder="yolov8", fit="stretch", max_detections=3)
+    options = {"decoder": "yolov8", "fit": "stretch", "classes": names(tmp_path, "crate")}
+    found = detector(model=save_model(tmp_path / "m.onnx", rows), max_detections=3, **options)
     np.testing.assert_allclose(found.process(red()).scores, [0.75, 0.7, 0.65], atol=1e-5)
 
 
@@ -94,19 +102,35 @@ def test_class_names_come_from_a_file(tmp_path: Path) -> None:
     made = detector(**options, classes=str(tmp_path / "names.txt"))
     assert made.process(red()).class_names == ("crate", "pallet")
     assert set(made.files) == {model, str(tmp_path / "names.txt")}  # both content hashes are on record
-    (tmp_path / "names.txt").write_text("crate\n")
-    with pytest.raises(ModelError, match="found class 1, but there are 1 class names"):
-        detector(**options, classes=str(tmp_path / "names.txt")).process(red())
+
+
+@pytest.mark.parametrize("given", [("crate",), ("crate", "pallet", "forklift")])
+def test_as_many_class_names_are_needed_as_the_model_has_classes(tmp_path: Path, given: tuple[str, ...]) -> None:
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 16, 32, 0.1, 0.9)))
+    made = detector(model=model, decoder="yolov8", classes=names(tmp_path, *given))
+    with pytest.raises(ModelError, match=rf"m\.onnx tells 2 classes apart, but there are {len(given)} class names;"):
+        made.process(red())
+
+
+def test_a_network_of_other_classes_than_cocos_is_not_given_their_names(tmp_path: Path) -> None:
+    output = np.ones((1, 5 + 3, 2, 2))
+    made = detector(model=save_model(tmp_path / "m.onnx", output), decoder="fastestdet")
+    with pytest.raises(
+        ModelError, match=r"3 classes apart, .* 80 class names \(those of COCO\); give the model's own in"
+    ):
+        made.process(red())
 
 
 def test_an_open_input_takes_the_size_of_the_parameter(tmp_path: Path) -> None:
     model = save_model(tmp_path / "m.onnx", yolov8_rows((16, 16, 8, 8, 0.9)), ("H", "W"))
-    found = detector(model=model, decoder="yolov8", fit="stretch", input_size=32).process(red())
+    options = {"decoder": "yolov8", "fit": "stretch", "classes": names(tmp_path, "crate")}
+    found = detector(model=model, input_size=32, **options).process(red())
     np.testing.assert_allclose(found.boxes, [[75, 37.5, 125, 62.5]], atol=1e-4)
 
 
 def test_grey_images_and_images_without_objects_are_fine(tmp_path: Path) -> None:
-    made = detector(model=save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 8, 8, 0.9))), decoder="yolov8")
+    model = save_model(tmp_path / "m.onnx", yolov8_rows((32, 32, 8, 8, 0.9)))
+    made = detector(model=model, decoder="yolov8", classes=names(tmp_path, "crate"))
     white = Image(stamp=1, frame="camera", data=np.full((64, 64), 255, np.uint8))
     black = Image(stamp=1, frame="camera", data=np.zeros((64, 64), np.uint8))
     assert made.process(white).boxes.shape == (1, 4)

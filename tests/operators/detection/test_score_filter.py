@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from dataflow.messages import Detections2D
 from operators.detection import ScoreFilter
@@ -32,3 +33,16 @@ def test_each_detection_keeps_its_row_and_equal_to_the_limit_is_enough() -> None
 
 def test_where_nothing_is_sure_an_empty_message_says_so() -> None:
     assert ScoreFilter(min_score=1.0).process(FOUND).count == 0
+
+
+def test_only_classes_that_are_asked_for_pass() -> None:
+    sure = ScoreFilter(min_score=0.0, classes=("box",)).process(FOUND)
+    assert sure.boxes.tolist() == FOUND.boxes[1:].tolist()
+    assert sure.ids is not None
+    assert sure.ids.tolist() == [4, 5]
+    assert sure.class_names == FOUND.class_names
+
+
+def test_a_class_that_the_detector_does_not_know_is_an_error_with_the_nearest_name() -> None:
+    with pytest.raises(ValueError, match=r"the detector knows no 'cups'; did you mean 'cup'[?] it knows cup, box"):
+        ScoreFilter(classes=("cups",)).process(FOUND)

@@ -213,6 +213,19 @@ def test_nodes_without_a_place_are_counted_and_other_frames_refused() -> None:
     assert built([[]])["graph"][0].stamp == STEP
 
 
+def test_classes_in_parameters_that_no_network_tells_apart_are_counted_and_named(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    operator = SceneGraphBuilder(goals=["tabel", "person"], agents=["person", "robot", "ball"])
+    operator.setup()
+    for k in range(2):
+        operator.process(room(k, [TABLE, person(0, 3)]))
+    assert operator.summary()["unknown classes"] == 1
+    assert [record.getMessage() for record in caplog.records] == [
+        "goals: no class is called 'tabel'; did you mean 'table'?"
+    ]
+
+
 def test_two_plays_are_equal_and_a_restored_graph_goes_on_the_same() -> None:
     rooms = [[TABLE, MUG, CHAIR, person(5 - 0.15 * k, -0.9)] for k in range(20)]
     whole = built(rooms)

@@ -270,6 +270,20 @@ def test_a_provider_that_is_not_there_is_named(tmp_path: Path) -> None:
         made.setup()
 
 
+def test_a_provider_that_finds_no_device_is_not_silently_replaced_by_the_cpu(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An onnxruntime with CUDA on a machine without a card falls back to the CPU and says so in its log alone."""
+    there = onnxruntime.get_available_providers()
+    monkeypatch.setattr(onnxruntime, "get_available_providers", lambda: ["CUDAExecutionProvider", *there])
+    made = OnnxSegmenter(model=save(tmp_path / "m.onnx", WEIGHTS, metadata=NAMED), provider="cuda")
+    with (
+        pytest.warns(UserWarning, match="not in available provider names"),
+        pytest.raises(ModelError, match="provider 'cuda' could not start: is there such a device"),
+    ):
+        made.setup()
+
+
 def test_an_exported_network_of_torchvision_gives_the_map_of_the_operator_for_those(tmp_path: Path) -> None:
     torch = pytest.importorskip("torch")
     models = pytest.importorskip("torchvision.models")

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from dataflow.messages import Image
 from operators.detection.custom.dataset import DataError
+from operators.inference import ModelError
 from operators.segmentation import Segmenter
 from operators.segmentation.dataset import VOID, read_segmentation_data
 from operators.segmentation.score import class_iou, confusion, mean_iou
@@ -93,6 +94,16 @@ def test_a_folder_of_masks_becomes_a_segmenter(tmp_path: Path) -> None:
     doubtful = strict.process(large)
     assert doubtful.confidence is None
     np.testing.assert_array_equal(doubtful.classes == VOID, found.confidence < threshold)
+
+    sure_walls = Segmenter(weights=str(out), class_thresholds={"wall": threshold})
+    sure_walls.setup()
+    np.testing.assert_array_equal(
+        sure_walls.process(large).classes == VOID, (found.confidence < threshold) & (found.classes == 0)
+    )
+    with pytest.raises(
+        ModelError, match=r"class_thresholds has 'walls': 0\.5; it takes shares from 0 to 1 for wall, fl"
+    ):
+        Segmenter(weights=str(out), class_thresholds={"walls": 0.5}).setup()
 
 
 def test_the_file_computes_the_class_and_its_probability(tmp_path: Path) -> None:

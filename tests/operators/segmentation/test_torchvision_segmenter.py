@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dataflow.firing.failure import OperatorFailure
-from dataflow.messages import Image
+from dataflow.messages import Image, SegmentationMap
 from dataflow.testing import play
 from operators.segmentation import TorchvisionSegmenter
 
@@ -58,6 +58,23 @@ def test_unsure_pixels_become_void_and_equal_images_give_equal_maps(checkpoint: 
         return played.digests()["segmentation"]
 
     assert run() == run()
+
+
+def test_a_class_may_have_a_threshold_of_its_own(checkpoint: Path) -> None:
+    def run(**params: object) -> SegmentationMap:
+        operator = TorchvisionSegmenter(model=NAME, checkpoint=str(checkpoint), side=0, with_confidence=True, **params)
+        return play(operator, {"image": [image(1)]})["segmentation"][0]
+
+    plain = run()
+    assert plain.confidence is not None
+    name = plain.class_names[np.bincount(plain.classes.reshape(-1)).argmax()]
+    strict = run(class_thresholds={name: float(np.median(plain.confidence))})
+    own = plain.classes == plain.class_names.index(name)
+    unsure = own & (plain.confidence < np.float32(np.median(plain.confidence)))
+    assert unsure.any()
+    np.testing.assert_array_equal(strict.classes == 255, unsure)
+    with pytest.raises(OperatorFailure, match=r"TorchvisionSegmenter\.class_thresholds has 'sky': 0\.5; it takes"):
+        run(class_thresholds={"sky": 0.5})
 
 
 def test_a_detection_model_is_no_segmentation_model() -> None:
