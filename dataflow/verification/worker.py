@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import faulthandler
+import gc
 import importlib
 import os
 import signal
@@ -39,6 +40,7 @@ def main(slots: Sequence[Slot]) -> int:
     _end_with_parent()
     faulthandler.enable()
     importlib.import_module(PRELOAD)
+    gc.freeze()  # modules live as long as the process: collections need not look at them
     if len(slots) == 1:
         return serve(slots[0])
     parent = os.getppid()

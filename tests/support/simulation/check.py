@@ -149,7 +149,7 @@ def verified(path: Path, *, start: float | None = None, jobs: int = 1) -> Verify
     """Verifies in this process: the workers' functions are called, one after the other."""
     bindings = {
         ("dataflow.verification.verify", "machine_facts"): lambda environment: {"threads": {}},
-        ("dataflow.reexecution.recorded_run", "load_bundle"): _load_bundle,
+        ("dataflow.graph", "load_bundle"): _load_bundle,
     }
     importlib.import_module("dataflow.verification.verify")
     with bound(bindings):
