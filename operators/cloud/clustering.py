@@ -123,12 +123,20 @@ def shape_of(points: Array, up: Array) -> Shape:
     )
 
 
-def upright_box(points: Array, up: Array) -> tuple[Array, Array]:
-    """Returns the axes and place T (4, 4), z along up, and the size (3,) of the upright box of least area."""
+def level_axes(up: Array) -> Array:
+    """Returns two directions (2, 3) across `up`."""
     helper = np.eye(3)[int(np.argmin(np.abs(up)))]
     x = _cross(helper, up)
     x /= np.linalg.norm(x)
-    level = np.stack([x, _cross(up, x)])
+    return np.stack([x, _cross(up, x)])
+
+
+def upright_box(points: Array, up: Array, level: Array | None = None) -> tuple[Array, Array]:
+    """Returns the axes and place T (4, 4), z along up, and the size (3,) of the upright box of least area.
+
+    `level` are the `level_axes` of up, where they are known.
+    """
+    level = level_axes(up) if level is None else level
     origin = points[0]
     flat = ((points - origin) @ level.T).astype(np.float32)
     (u, v), (width, depth), angle = cv2.minAreaRect(flat)

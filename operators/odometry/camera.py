@@ -67,8 +67,10 @@ class RgbdCamera:
         around = np.stack([depth[v + dv, u + du] for dv in (-1, 0, 1) for du in (-1, 0, 1)])
         around = np.where((around >= near) & (around <= far), around, np.nan)
         known &= (np.isfinite(around).sum(axis=0) >= 6) & (centred | settled)
-        around = np.where(known, around, 1.0)
-        low, high = np.nanmin(around, axis=0), np.nanmax(around, axis=0)
+        ranked = np.sort(np.where(known, around, 1.0), axis=0)  # what is no depth comes last
+        count, column = np.isfinite(ranked).sum(axis=0), np.arange(len(known))
+        low, high = ranked[0], ranked[count - 1, column]
         known &= high - low < 0.04 * low + 0.01
-        z = np.nanmedian(around, axis=0) - origin[2]
+        median = (ranked[(count - 1) // 2, column] + ranked[count // 2, column]) / 2
+        z = median - origin[2]
         return origin + rays * (z / rays[:, 2])[:, None], known

@@ -1,5 +1,6 @@
 """Keyframes: views with a known pose that later frames are measured against."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -50,5 +51,6 @@ class Keyframe:
 def view_distance(T_a: Matrix, T_b: Matrix, depth: float) -> float:
     """Returns how differently two cameras see a scene at a depth: baseline / depth + angle between them, radians."""
     T = invert(T_a) @ T_b
-    cosine = np.clip((np.trace(T[:3, :3]) - 1.0) / 2.0, -1.0, 1.0)
-    return float(np.linalg.norm(T[:3, 3]) / depth + np.arccos(cosine))
+    way, trace = T[:3, 3].copy(), float(T[0, 0]) + float(T[1, 1]) + float(T[2, 2])
+    cosine = min(max((trace - 1.0) / 2.0, -1.0), 1.0)
+    return float(math.sqrt(way.dot(way)) / depth + np.arccos(cosine))

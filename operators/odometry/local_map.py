@@ -66,7 +66,7 @@ class LocalMap:
     def nearby(self, T_world_camera: Matrix, count: int, segment: int, reach: float = REACH) -> list[Keyframe]:
         """Returns a segment's newest keyframe, then those whose views are nearest to a pose's."""
         *older, newest = (k for k in self.keyframes if k.segment == segment)
-        depth = typical_depth(newest.surface)
+        depth = newest.surface.typical_depth
         distances = [view_distance(k.T_world_camera, T_world_camera, depth) for k in older]
         ranked = sorted(range(len(older)), key=distances.__getitem__)
         return [newest, *(older[i] for i in ranked[: count - 1] if distances[i] < reach)]
@@ -104,9 +104,3 @@ class LocalMap:
             for i in range(1, len(old))
         ]
         return 1 + int(np.argmin(gaps)) if gaps else 0
-
-
-def typical_depth(surface: Surface) -> float:
-    """Returns the median depth of a view, metres; 2 m where nothing is known."""
-    known = surface.inverse_depth[surface.inverse_depth > 0]
-    return float(1.0 / np.median(known)) if known.size else 2.0

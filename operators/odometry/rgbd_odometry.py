@@ -20,7 +20,7 @@ from operators.odometry.features import track_corners, with_exposure_of
 from operators.odometry.fitting import Fit, Fitter, Sighting
 from operators.odometry.frame import Frame, observe
 from operators.odometry.keyframe import Keyframe, view_distance
-from operators.odometry.local_map import LocalMap, typical_depth
+from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
 from operators.odometry.movers import Movers
 from operators.odometry.noise import Noise
@@ -221,7 +221,7 @@ class RgbdOdometry:
     def _new_keyframe(self, frame: Frame, fit: Fit) -> bool:
         """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
         newest, surface = self._map.newest, fit.movers.left_out_of(frame.surface)
-        baseline = view_distance(newest.T_world_camera, fit.T_world_camera, typical_depth(surface))
+        baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
         moved = baseline > self.config.keyframe_distance or (fit.compared > 0 and fit.compared < 0.5 * fit.offered)
         starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
         better = frame.depth_flaw is None and newest.surface.coverage < 0.5 * surface.coverage

@@ -127,6 +127,12 @@ class Surface:
         """Depth of the patches (h, w), metres; 0 where there is none."""
         return np.where(self.inverse_depth > 0, 1.0 / np.maximum(self.inverse_depth, 1e-6), 0).astype(np.float32)
 
+    @cached_property
+    def typical_depth(self) -> float:
+        """Median depth of the patches, metres; 2 m where there is none."""
+        known = self.inverse_depth[self.inverse_depth > 0]
+        return float(1.0 / np.median(known)) if known.size else 2.0
+
     @property
     def coverage(self) -> float:
         """Share of the grid that has a patch."""

@@ -11,7 +11,6 @@ from dataflow.messages.geometry import invert
 from operators.geometry.se3 import Matrix
 from operators.odometry.fitting import Fitter
 from operators.odometry.keyframe import Keyframe, view_distance
-from operators.odometry.local_map import typical_depth
 from operators.odometry.tracking import moved_covariance
 from operators.slam.keyframe_graph import Node
 from operators.slam.local_bundle import adjust_newest
@@ -94,7 +93,7 @@ class VisualGraph(PlaceGraph[View]):
         """
         return self.grow(
             keyframe.stamp, keyframe.T_world_camera, keyframe.covariance, keyframe.segment, found_again,
-            CameraEyes(fitter, self._judge, typical_depth(keyframe.surface)),
+            CameraEyes(fitter, self._judge, keyframe.surface.typical_depth),
             lambda: View.of(keyframe, fitter.camera),
         )  # fmt: skip
 
