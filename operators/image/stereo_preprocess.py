@@ -121,7 +121,7 @@ class StereoPreprocess(Operator):
         if made is None or not (
             told_again(made.infos[0], left)
             and told_again(made.infos[1], right)
-            and np.array_equal(made.T_left_right, T_left_right)
+            and _equal(made.T_left_right, T_left_right)
         ):
             made = self._pair = self._worked_out(left, right, T_left_right)
         return made
@@ -152,6 +152,10 @@ class StereoPreprocess(Operator):
         baseline = float((projections[0][0, 3] - projections[1][0, 3]) / projections[1][0, 0])
         frames = _turned((left, right), turns, self.suffix)
         return _Pair((left, right), T_left_right, prepared[0], prepared[1], baseline, frames)
+
+
+def _equal(one: Matrix | None, other: Matrix | None) -> bool:
+    return one is other if one is None or other is None else np.array_equal(one, other)
 
 
 def _rotation(info: CameraInfo) -> Matrix:

@@ -111,7 +111,7 @@ def _landmarks(name: str, sightings: LandmarkSightings, around: Surroundings) ->
         raise ValueError(f"{name}: sightings have no covariances: how well a landmark was seen must be known")
     seen, spread = cartesian(sightings)
     flat = np.asarray(around.landmarks.positions[:, :2])
-    placed = (np.abs(flat) < _FARTHEST).all(axis=1)  # not where a coordinate is not finite
+    placed = np.asarray((np.abs(flat) < _FARTHEST).all(axis=1))  # not where a coordinate is not finite
     everywhere = flat[placed]
     known = {i: flat[k : k + 1] for k, i in enumerate(around.landmarks.ids.tolist()) if placed[k]}
     places = [known.get(i) if i >= 0 else everywhere for i in sightings.ids.tolist()]

@@ -32,11 +32,11 @@ class FieldSettings:
     most_blocks: int
 
 
-def keys_of(blocks: NDArray[np.int64]) -> Keys:
+def keys_of(blocks: NDArray[np.int64] | NDArray[np.float64]) -> Keys:
     """Returns one number (N,) for each block (N, 3), ordered by x, y, z. Raises ValueError if too far."""
-    if len(blocks) and np.abs(blocks).max() >= _OFFSET:
+    if len(blocks) and not np.abs(blocks).max() < _OFFSET:
         raise ValueError("the field reaches farther than a million blocks from the origin")
-    return np.asarray((blocks + _OFFSET) @ np.array([1 << 42, 1 << 21, 1], np.int64))
+    return np.asarray((blocks.astype(np.int64) + _OFFSET) @ np.array([1 << 42, 1 << 21, 1], np.int64))
 
 
 def blocks_of(keys: Keys) -> NDArray[np.int64]:
@@ -139,7 +139,7 @@ class DistanceField:
         found = []
         for off in np.linspace(-s.truncation, s.truncation, max(3, int(np.ceil(4 * s.truncation / block)) + 1)):
             points = ray * (z[v, u].astype(np.float64) + off)[:, None] + T_map_camera[:3, 3]
-            found.append(np.unique(keys_of(np.floor(points / block).astype(np.int64))))
+            found.append(np.unique(keys_of(np.floor(points / block))))
         return np.unique(np.concatenate(found)) if found else np.zeros(0, np.int64)
 
     def _before(self, z: NDArray[np.float32], K: Matrix, T_camera_map: Matrix) -> Keys:

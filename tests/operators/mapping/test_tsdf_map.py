@@ -127,6 +127,9 @@ def test_what_does_not_fit_is_an_error() -> None:
     small = Image(stamp=1, frame="camera", data=np.zeros((10, 10, 3), np.uint8))
     with pytest.raises(ValueError, match="registered to the depth"):
         operator.process(depth(sphere()), pose(), INFO, small)
+    for far in (1e6, 1e30):
+        with pytest.raises(ValueError, match="farther than a million blocks"):
+            operator.process(depth(sphere()), pose((far, 0.0, 0.0)), INFO)
     with pytest.raises(ValueError, match="more than most_blocks"):
         operator.process(depth(sphere()), pose(), INFO)
     with pytest.raises(ValueError, match="must be below far"):
