@@ -45,6 +45,20 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
 
     if not file.is_file():
         raise FileNotFoundError(f"no ONNX model {str(file)!r} (looked for {file.absolute()})")
+    return _opened(file.read_bytes() + _outputs(reveal) if reveal else str(file), str(file), provider)
+
+
+def open_content(content: bytes, told: str) -> onnxruntime.InferenceSession:
+    """Opens an ONNX model that is a part of a file, for one thread on the CPU.
+
+    Raises ModelError, which says where it was (`told`), for one that is no model.
+    """
+    return _opened(content, told, "cpu")
+
+
+def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.InferenceSession:
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -52,10 +66,9 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
     options.use_deterministic_compute = True
     options.log_severity_level = 3
     try:
-        model = file.read_bytes() + _outputs(reveal) if reveal else str(file)
         return onnxruntime.InferenceSession(model, options, providers=_chosen(provider))
     except Exception as error:  # onnxruntime's exception classes share no public base
-        raise ModelError(f"{file} cannot be loaded as an ONNX model: {error}") from error
+        raise ModelError(f"{told} cannot be loaded as an ONNX model: {error}") from error
 
 
 def _chosen(provider: Provider) -> list[str]:
