@@ -45,6 +45,20 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
 
     if not file.is_file():
         raise FileNotFoundError(f"no ONNX model {str(file)!r} (looked for {file.absolute()})")
+    return _opened(file.read_bytes() + _outputs(reveal) if reveal else str(file), str(file), provider)
+
+
+def open_content(content: bytes, told: str) -> onnxruntime.InferenceSession:
+    """Opens an ONNX model that is a part of a file, for one thread on the CPU.
+
+    Raises ModelError, which says where it was (`told`), for one that is no model.
+    """
+    return _opened(content, told, "cpu")
+
+
+def _opened(model: bytes | str, told: str, provider: Provider) -> onnxruntime.InferenceSession:
+    import onnxruntime
+
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
@@ -52,14 +66,14 @@ def open_session(file: Path, provider: Provider = "cpu", reveal: Sequence[str] =
     options.use_deterministic_compute = True
     options.log_severity_level = 3
     try:
-        model = file.read_bytes() + _outputs(reveal) if reveal else str(file)
-        session = onnxruntime.InferenceSession(model, options, providers=_chosen(provider, available))
+        chosen = _chosen(provider, onnxruntime.get_available_providers())
+        session = onnxruntime.InferenceSession(model, options, providers=chosen)
     except Exception as error:  # onnxruntime's exception classes share no public base
-        raise ModelError(f"{file} cannot be loaded as an ONNX model: {error}") from error
+        raise ModelError(f"{told} cannot be loaded as an ONNX model: {error}") from error
     if _PROVIDERS[provider] not in session.get_providers():  # it says so in its log alone, and takes the next one
         raise ModelError(
             f"onnxruntime's provider {provider!r} could not start: is there such a device, and are its driver and "
-            f"libraries installed? On this machine provider: cpu runs {file}"
+            f"libraries installed? On this machine provider: cpu runs {told}"
         )
     return session
 

@@ -6,16 +6,19 @@ import numpy as np
 
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
-from operators.detection.custom.decode import find_boxes
-from operators.detection.fit import Fit
-from operators.weights import NetworkFileError, open_network, shipped
+from operators.detection.custom.first_look import FirstLook
+from operators.detection.custom.refiner import Refiner
+from operators.network_input import three_channels
+from operators.weights import shipped
 
 
 class CustomDetector(Operator):
     """Finds objects with a grid detector on one CPU thread, so equal images give equal boxes.
 
-    The file tells classes, input size and anchors. Without one, the network that comes with the project is used; it
-    knows the objects of the simulated worlds. To find your own objects: `dataflow train detector DATA`.
+    The file tells classes, input size and anchors. Where it has a refiner (training adds one), each box is looked at
+    once more, at the image's full resolution, and its sides move to the object's. Without a file, the network that
+    comes with the project is used; it knows the objects of the simulated worlds. To find your own objects: `dataflow
+    train detector DATA`.
     """
 
     stateless = True
@@ -33,40 +36,24 @@ class CustomDetector(Operator):
     def setup(self) -> None:
         """Loads the network. Raises FileNotFoundError or NetworkFileError."""
         file = self.use_file(self.weights if self.weights is not None else shipped("detector.onnx"))
-        self._network = open_network(file, "detector")
-        facts = self._network.facts
-        self._anchors = np.array(facts.get("anchors", []), np.float32)
-        self._strides = [int(s) for s in facts.get("strides", [])]
-        if self._anchors.ndim != 3 or self._anchors.shape[::2] != (len(self._strides), 2) or not self._strides:
-            raise NetworkFileError(
-                f"{file}: its metadata must hold anchors (levels, anchors, 2) and a stride for each level, "
-                f"has anchors {self._anchors.shape} and strides {self._strides}"
-            )
+        self._look = FirstLook(file)
+        self._refiner = Refiner.within(self._look.network)
+        if self._refiner is not None:
+            self._look.reveal(self._refiner.maps)
 
     def process(self, image: Image) -> Detections2D:
         """Raises NetworkFileError where the network's output is not what its metadata say."""
-        network = self._network
-        pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
-        fit = Fit.plan("letterbox", (image.width, image.height), network.size)
-        try:
-            found = find_boxes(
-                network.run(fit.apply(pixels)),
-                self._anchors,
-                self._strides,
-                len(network.classes),
-                self.score_threshold,
-                self.nms_iou,
-                self.max_detections,
-            )
-        except ValueError as error:
-            raise NetworkFileError(f"{network.file} does not fit its metadata: {error}") from None
+        pixels = three_channels(image.data)
+        looked = self._look.look(pixels, self.score_threshold, self.nms_iou, self.max_detections)
+        refiner = self._refiner
+        found = looked.found if refiner is None else refiner.refined(pixels, looked, self.nms_iou)
         return Detections2D(
             stamp=image.stamp,
             frame=image.frame,
             width=image.width,
             height=image.height,
-            class_names=network.classes,
-            boxes=fit.restore(found.boxes),
+            class_names=self._look.network.classes,
+            boxes=found.boxes,
             scores=np.minimum(found.scores, np.float32(1)),
             class_ids=found.classes,
         )

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.custom.decode import find_boxes
+from operators.detection.custom.first_look import Looked
+from operators.detection.custom.refiner import Refiner
 from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms, intersection_over_union
 from operators.recognition.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
 from operators.recognition.proposals import F32, Glance, Trunk
 from operators.scene.map_file import learned_files, together
-from operators.weights import shipped
+from operators.weights import open_network, shipped
 
 _MAYBE, _STEPS = 0.003, 2  # probability from which a box is drawn to the outline, and how often that is repeated
 
@@ -57,24 +61,15 @@ class LearnedDetector(Operator):
         for name, each in zip((each.name for each in learned), self._learned, strict=True):
             if each.detector != self.files[given] or each.inner != inner:
                 raise LearnedObjectError(f"{name} was learned with another detector than {given}: learn it again")
-        self._trunk = Trunk(file, inner)
+        self._refiner = Refiner.within(open_network(file, "detector"))
+        self._trunk = Trunk(file, inner, () if self._refiner is None else self._refiner.maps)
         self._names = tuple(dict.fromkeys((*self._trunk.classes, *(each.name for each in self._learned))))
         self._counts = {"images": 0, "learned objects": 0, "known boxes replaced": 0}
 
     def process(self, image: Image) -> Detections2D:
         pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
-        trunk = self._trunk
-        glance = trunk.look(pixels)
-        known = find_boxes(
-            glance.maps,
-            trunk.anchors,
-            trunk.strides,
-            len(trunk.classes),
-            self.score_threshold,
-            self.nms_iou,
-            self.max_detections,
-        )
-        learned = self._found(glance)
+        glance = self._trunk.look(pixels)
+        known, learned = self._known(glance, pixels), self._found(glance)
         known = known.select(self._staying(known, learned))
         boxes = np.concatenate([known.boxes, learned.boxes])
         scores = np.concatenate([np.minimum(known.scores, np.float32(1)), learned.scores])
@@ -88,7 +83,7 @@ class LearnedDetector(Operator):
             width=image.width,
             height=image.height,
             class_names=self._names,
-            boxes=glance.fit.restore(boxes)[order],
+            boxes=boxes[order],
             scores=scores[order],
             class_ids=classes[order],
         )
@@ -97,8 +92,25 @@ class LearnedDetector(Operator):
         """Counts images, learned objects found, and boxes of known classes that gave way to them."""
         return dict(self._counts)
 
+    def _known(self, glance: Glance, pixels: NDArray[np.uint8]) -> Candidates:
+        """Returns the objects of known classes in an image, in its pixels, as CustomDetector finds them."""
+        trunk, refiner = self._trunk, self._refiner
+        found = find_boxes(
+            glance.maps,
+            trunk.anchors,
+            trunk.strides,
+            len(trunk.classes),
+            self.score_threshold,
+            self.nms_iou,
+            self.max_detections,
+        )
+        found = replace(found, boxes=glance.fit.restore(found.boxes))
+        if refiner is None:
+            return found
+        return refiner.refined(pixels, Looked(found, glance.more, glance.fit), self.nms_iou)
+
     def _found(self, glance: Glance) -> Candidates:
-        """Returns the learned objects in an image: for each class the surest of the boxes that overlap."""
+        """Returns the learned objects in an image, in its pixels: for each class the surest of boxes that overlap."""
         proposed = self._trunk.propose(glance, LEAST, PROPOSALS)
         described = self._trunk.describe(glance, proposed)
         boxes, scores, classes = [proposed[:0]], [np.zeros(0, np.float32)], [np.zeros(0, np.int32)]
@@ -109,7 +121,8 @@ class LearnedDetector(Operator):
             boxes.append(np.array([_settled(drawn[k], drawn, sure) for k in kept], np.float32).reshape(-1, 4))
             scores.append(sure[kept])
             classes.append(np.full(len(kept), self._names.index(each.name), np.int32))
-        return Candidates(np.concatenate(boxes), np.concatenate(scores), np.concatenate(classes))
+        restored = glance.fit.restore(np.concatenate(boxes))
+        return Candidates(restored, np.concatenate(scores), np.concatenate(classes))
 
     def _drawn(self, glance: Glance, each: LearnedObject, boxes: F32, described: F32) -> tuple[F32, F32]:
         """Moves the boxes that may show a learned object to its outline, and tells how surely they show it there."""

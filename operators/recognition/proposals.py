@@ -29,21 +29,24 @@ _HUES, _GREYS, _CELL = 8, 4, 4  # colours, and shades without one; pixels along 
 
 @dataclass(frozen=True, eq=False)
 class Glance:
-    """An image as the network sees it: the grid's raw maps, the inner maps (C, H, W), and how it was fitted in."""
+    """An image as the network sees it: the grid's raw maps, the inner maps (C, H, W), how it was fitted in, and the
+    maps (1, C, H, W) that a refiner asks for."""
 
     maps: Sequence[F32]
     trunk: Sequence[F32]
     fit: Fit
+    more: Sequence[F32] = ()
 
 
 class Trunk:
     """A detector's network whose inner maps are given as well; on one CPU thread.
 
     `inner` names the values that come out beside the detector's outputs (`inner_maps` finds them), and `COLOR` for the
-    image's colours, of which a trunk keeps little. Raises FileNotFoundError or NetworkFileError.
+    image's colours, of which a trunk keeps little; `more` names what a refiner asks for. Raises FileNotFoundError or
+    NetworkFileError.
     """
 
-    def __init__(self, file: Path, inner: Sequence[str]) -> None:
+    def __init__(self, file: Path, inner: Sequence[str], more: Sequence[str] = ()) -> None:
         network = open_network(file, "detector")
         self.classes, self.size, self.inner = network.classes, network.size, tuple(inner)
         self.anchors = np.array(network.facts.get("anchors", []), np.float32)
@@ -51,7 +54,7 @@ class Trunk:
         if self.anchors.ndim != 3 or len(self.anchors) != len(self.strides):
             raise NetworkFileError(f"{file}: its metadata must hold anchors (levels, anchors, 2) and their strides")
         self._session: onnxruntime.InferenceSession = open_session(
-            file, reveal=[name for name in self.inner if name != COLOR]
+            file, reveal=[*(name for name in self.inner if name != COLOR), *more]
         )
 
     def look(self, pixels: NDArray[np.uint8]) -> Glance:
@@ -62,9 +65,10 @@ class Trunk:
         tensor /= np.float32(255)
         found = self._session.run(None, {self._session.get_inputs()[0].name: tensor})
         known = len(self.strides)
-        maps = dict(zip((name for name in self.inner if name != COLOR), found[known:], strict=True))
+        shown = [name for name in self.inner if name != COLOR]
+        maps = dict(zip(shown, found[known : known + len(shown)], strict=True))
         inner = [color_map(fitted) if name == COLOR else maps[name][0] for name in self.inner]
-        return Glance(found[:known], inner, fit)
+        return Glance(found[:known], inner, fit, found[known + len(shown) :])
 
     def propose(self, glance: Glance, threshold: float, most: int) -> F32:
         """Returns boxes (N, 4) in the network's pixels around anything, whatever its class, by falling score."""

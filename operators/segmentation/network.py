@@ -13,6 +13,8 @@ from operators.training.backbone import Backbone, ConvNorm, MobileNetV2, Separab
 _LEVELS = ((16, 64, 64), (8, 48, 48), (4, 32, 24), (2, 16, 24))
 """(stride, channels taken from the backbone, channels after merging) on the way back."""
 _DETAIL = 32
+WIDEST = 0.06
+"""The largest step of scores in 8 bits: 255 are a factor of four million between the probabilities of two classes."""
 
 
 class ClassDecoder(nn.Module):
@@ -76,8 +78,25 @@ class SegmentationNetwork(nn.Module):
         return scores
 
 
+class ScoringSegmenter(nn.Module):
+    """Images (1, 3, H, W) → scores (1, C, H / 2, W / 2) uint8: what the network file computes.
+
+    They count in steps of so much below 255, the best of their cell; what is too far below it is 0.
+    """
+
+    def __init__(self, network: nn.Module, step: float) -> None:
+        super().__init__()
+        self.network, self.step = network, step
+
+    def forward(self, images: Tensor) -> Tensor:
+        scores = self.network(images)
+        # No sum and no clipping, which `operators.training.quantization` would take for parts of the network.
+        steps = (scores - scores.amax(dim=1, keepdim=True)) / self.step - (-255.0)
+        return torch.maximum(steps, torch.zeros_like(steps[:, :1])).round().to(torch.uint8)
+
+
 class DeployedSegmenter(nn.Module):
-    """Images (1, 3, H, W) → class (1, H, W) int32 and its probability (1, H, W): what the network file computes.
+    """Images (1, 3, H, W) → class (1, H, W) int32 and its probability (1, H, W): the file of more than 32 classes.
 
     `size` is (H, W), both even. The scores are enlarged before a class is chosen, for smooth borders; the probability,
     which needs more arithmetic, is enlarged after.

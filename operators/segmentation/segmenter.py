@@ -13,6 +13,7 @@ from dataflow.messages import Image, SegmentationMap
 from dataflow.operator import In, Operator, Out, Param
 from operators.detection.fit import Fit
 from operators.network_input import three_channels
+from operators.segmentation.borders import Borders, scored
 from operators.segmentation.labelled import VOID, enlarged, labelled, least_of
 from operators.segmentation.scores import best_classes, probability
 from operators.weights import NetworkFileError, open_network, shipped
@@ -21,8 +22,9 @@ from operators.weights import NetworkFileError, open_network, shipped
 class Segmenter(Operator):
     """Gives every pixel a class on one CPU thread, so equal images give equal maps.
 
-    The network works on its own input size; its answer is enlarged to the image without inventing classes. Without a
-    file, the network that comes with the project is used; it knows the simulated worlds.
+    The network works on its own input size; its answer is enlarged to the image without inventing classes. Where the
+    file has a second network (training adds one), the borders between classes are looked at once more, in the image's
+    own pixels. Without a file, the network that comes with the project is used; it knows the simulated worlds.
     """
 
     stateless = True
@@ -39,25 +41,27 @@ class Segmenter(Operator):
         """Loads the network. Raises FileNotFoundError, NetworkFileError, or ModelError for unknown classes."""
         file = self.use_file(self.weights if self.weights is not None else shipped("segmenter.onnx"))
         self._network = open_network(file, "segmenter")
+        self._scored, self._borders = scored(self._network), None
         outputs = self._network.session.get_outputs()
-        names = [output.name for output in outputs]
-        self._scored = names == ["scores"] and outputs[0].type == "tensor(uint8)"
-        if names != ["classes", "confidence"] and not self._scored:
+        if [output.name for output in outputs] != ["classes", "confidence"] and not self._scored:
             told = ", ".join(f"{output.name} {output.type}" for output in outputs)
             raise NetworkFileError(f"{file} must have the outputs classes and confidence, or 8-bit scores; has {told}")
+        if self._scored:
+            self._borders = Borders.within(self._network)
         if len(self._network.classes) > VOID:
             raise NetworkFileError(f"{file} has {len(self._network.classes)} classes; at most {VOID} are possible")
         self._least()
 
     def process(self, image: Image) -> SegmentationMap:
-        network = self._network
+        network, pixels = self._network, three_channels(image.data)
         fit = Fit.plan("letterbox", (image.width, image.height), network.size)
+        found = network.run(fit.apply(pixels))
         wanted = self.with_confidence or self.confidence_threshold > 0 or bool(self.class_thresholds)
-        classes, confidence = self._answered(network.run(fit.apply(three_channels(image.data))), wanted)
+        classes, confidence = self._answered(found, pixels, fit, wanted)
         return labelled(
             image,
             network.classes,
-            np.asarray(enlarged(classes, fit, cv2.INTER_NEAREST), np.uint8),
+            classes,
             None if confidence is None else np.asarray(enlarged(confidence, fit, cv2.INTER_LINEAR), np.float32),
             least=self._least(),
             with_confidence=self.with_confidence,
@@ -68,11 +72,15 @@ class Segmenter(Operator):
         return least_of(self._network.classes, self.confidence_threshold, self.class_thresholds, where)
 
     def _answered(
-        self, found: Sequence[NDArray[Any]], wanted: bool
+        self, found: Sequence[NDArray[Any]], pixels: NDArray[np.uint8], fit: Fit, wanted: bool
     ) -> tuple[NDArray[np.uint8], NDArray[np.float32] | None]:
-        """Classes (H, W) and, where wanted, their probability (H, W), of what the network gave."""
-        if self._scored:
-            step = float(self._network.facts["score_step"])
-            return best_classes(found[0][0]), probability(found[0][0], step) if wanted else None
-        classes, confidence = found
-        return classes[0].astype(np.uint8), confidence[0] if wanted else None
+        """Classes (H, W) of the image's pixels and, where wanted, their probability in the network's input."""
+        if not self._scored:
+            classes, confidence = found
+            own = classes[0].astype(np.uint8)
+            return np.asarray(enlarged(own, fit, cv2.INTER_NEAREST), np.uint8), confidence[0] if wanted else None
+        scores, step = found[0][0], float(self._network.facts["score_step"])
+        sure = probability(scores, step) if wanted else None
+        if self._borders is not None:
+            return self._borders.classes(scores, step, pixels, fit), sure
+        return np.asarray(enlarged(best_classes(scores), fit, cv2.INTER_NEAREST), np.uint8), sure

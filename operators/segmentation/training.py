@@ -13,15 +13,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from operators.segmentation.dataset import VOID, MaskedImage, SegmentationData
-from operators.segmentation.network import DeployedSegmenter, SegmentationNetwork, enlarged
+from operators.segmentation.network import WIDEST, DeployedSegmenter, ScoringSegmenter, SegmentationNetwork, enlarged
 from operators.segmentation.score import confusion, mean_iou
+from operators.segmentation.scores import MOST_CLASSES
 from operators.training.augmentation import NONE, Variation, fitted, recolored, tensor_of, varied, warp
 from operators.training.backbone import BACKBONES, Backbone, load_backbone
 from operators.training.export import export_network
 from operators.training.network_weights import begin_with, fitting_facts, sample_images
 
 KIND = "segmenter"
-STEP = 16
+MULTIPLE = 16
+_MEASURED = 4  # images
 
 
 class SegmenterTask:
@@ -40,8 +42,8 @@ class SegmenterTask:
         architecture: str = "mobilenetv2",
         backbone: Path | None = None,
     ) -> None:
-        if any(extent % STEP or extent <= 0 for extent in size):
-            raise ValueError(f"the input's width and height must be multiples of {STEP}, got {size[0]}x{size[1]}")
+        if any(extent % MULTIPLE or extent <= 0 for extent in size):
+            raise ValueError(f"the input's width and height must be multiples of {MULTIPLE}, got {size[0]}x{size[1]}")
         torch.manual_seed(seed)
         self.data, self.size, self.width, self.architecture = data, size, width, architecture
         self.variation = Variation() if variation is None else variation
@@ -124,8 +126,24 @@ class SegmenterTask:
             "training_images": self.samples,
             **facts,
         }
+        if len(self.data.classes) <= MOST_CLASSES:
+            step = self._step(network)
+            export_network(
+                ScoringSegmenter(network, step), self.size, ["scores"], {**described, "score_step": step}, file
+            )
+            return
         deployed = DeployedSegmenter(network, (self.size[1], self.size[0]))
         export_network(deployed, self.size, ["classes", "confidence"], described, file)
+
+    def _step(self, network: nn.Module) -> float:
+        """A step of scores in 8 bits such that the widest gap in a few images takes 255, but not beyond `WIDEST`."""
+        device, widest = next(network.parameters()).device, 0.0
+        for image in self.data.validation[:_MEASURED]:
+            pixels, _ = self._view(image, None)
+            with torch.inference_mode():
+                scores = network(torch.from_numpy(tensor_of(pixels))[None].to(device))
+            widest = max(widest, float((scores.amax(dim=1) - scores.amin(dim=1)).max()))
+        return min(WIDEST, max(widest, 1e-3) / 255)
 
     def _view(self, image: MaskedImage, rng: np.random.Generator | None) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """A random view of an image and its mask; as it is, fitted into the input, without `rng`."""

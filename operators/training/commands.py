@@ -39,6 +39,7 @@ from operators.training.options import (
     Workers,
 )
 from operators.training.people_commands import train_activity
+from operators.training.refining import BorderEpochs, RefinerEpochs, bordered, refined, train_borders, train_refiner
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data
 from operators.training.torchvision_command import train_torchvision
 
@@ -58,6 +59,8 @@ train = typer.Typer(
 )
 train.command("activity")(train_activity)
 train.command("torchvision")(train_torchvision)
+train.command("refiner")(train_refiner)
+train.command("borders")(train_borders)
 
 
 @train.command("detector")
@@ -80,6 +83,7 @@ def train_detector(
     initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
     variation: Strength = 1.0,
+    refiner_epochs: RefinerEpochs = 8,
     evaluate_every: Every = 1,
     workers: Workers = 2,
     threads: Threads = None,
@@ -90,7 +94,7 @@ def train_detector(
     """Train a grid detector on a folder in COCO or YOLO format.
 
     Writes the best epoch's network (.onnx), which the operator `operators.detection:CustomDetector` takes as `weights`,
-    and a checkpoint (.pt) to resume from.
+    and a checkpoint (.pt) to resume from. Then a refiner is trained on what it finds, and put into the file.
 
     Examples:
 
@@ -122,7 +126,8 @@ def train_detector(
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = run_task(task, settings, out, resume, json)
-    report(outcome, "operators.detection:CustomDetector", json)
+        second = refined(read, out, settings, refiner_epochs, task.variation, resume, json)
+    report(outcome, "operators.detection:CustomDetector", json, seconds={"refiner": second})
 
 
 @train.command("segmenter")
@@ -142,6 +147,7 @@ def train_segmenter(
     initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
     variation: Strength = 1.0,
+    border_epochs: BorderEpochs = 10,
     evaluate_every: Every = 1,
     workers: Workers = 2,
     threads: Threads = None,
@@ -150,6 +156,8 @@ def train_segmenter(
     json: Json = False,
 ) -> None:
     """Train a segmenter on a folder with images/, masks/ (PNGs of class ids, 255 void) and classes.txt.
+
+    Then a second look at the borders of classes is trained on what it answers, and put into the file.
 
     Examples:
 
@@ -178,7 +186,8 @@ def train_segmenter(
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = run_task(task, settings, out, resume, json)
-    report(outcome, "operators.segmentation:Segmenter", json)
+        second = bordered(read, out, settings, border_epochs, task.variation, resume, json)
+    report(outcome, "operators.segmentation:Segmenter", json, seconds={"borders": second})
 
 
 @train.command("classifier")
@@ -255,6 +264,8 @@ def train_pair(
     initial: Initial = None,
     flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
     variation: Strength = 1.0,
+    refiner_epochs: RefinerEpochs = 8,
+    border_epochs: BorderEpochs = 10,
     evaluate_every: Every = 1,
     workers: Workers = 2,
     threads: Threads = None,
@@ -264,7 +275,8 @@ def train_pair(
 ) -> None:
     """Train a detector and a segmenter that learn together, on a folder with both boxes (COCO) and masks.
 
-    Writes detector.onnx and segmenter.onnx of the best epoch, and a checkpoint (pair.pt) to resume from.
+    Writes detector.onnx and segmenter.onnx of the best epoch, and a checkpoint (pair.pt) to resume from. Both
+    get second networks, as by `dataflow train detector` and `segmenter`.
     `python -m operators.training.simulated_worlds DATA` renders such a folder.
 
     Examples:
@@ -278,7 +290,7 @@ def train_pair(
         from operators.segmentation.dataset import read_segmentation_data
         from operators.training.augmentation import Variation
         from operators.training.loop import Settings
-        from operators.training.pair import PairTask
+        from operators.training.pair import DETECTOR, SEGMENTER, PairTask
 
         boxes, masks = read_detection_data(data, seed), read_segmentation_data(data, seed)
         task = PairTask(
@@ -296,7 +308,14 @@ def train_pair(
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = run_task(task, settings, file, resume, json)
-    report(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json)
+        refiner = refined(boxes, out / DETECTOR, settings, refiner_epochs, task.variation, resume, json)
+        borders = bordered(masks, out / SEGMENTER, settings, border_epochs, task.variation, resume, json)
+    report(
+        outcome,
+        "operators.detection:CustomDetector and operators.segmentation:Segmenter",
+        json,
+        seconds={"refiner": refiner, "borders": borders},
+    )
 
 
 @train.command("quantize")

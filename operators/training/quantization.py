@@ -28,7 +28,7 @@ from operators.segmentation.scores import MOST_CLASSES
 from operators.segmentation.training import KIND as SEGMENTER
 from operators.training.augmentation import fitted, tensor_of, warp
 from operators.training.files import whole
-from operators.weights.network_file import KEY, NetworkFileError, read_facts, training_seed
+from operators.weights.network_file import KEY, SECOND, NetworkFileError, read_facts, training_seed
 
 INT8 = "int8"
 _QUANTIZED = ("Conv", "Add", "Relu", "Clip", "Concat", "Resize")
@@ -39,9 +39,10 @@ Pixels = NDArray[np.uint8]
 def quantize_network(file: Path, images: Iterable[Pixels], out: Path) -> None:
     """Writes `file` in 8 bits to `out`, with ranges measured on `images` ((H, W, 3) RGB of any size).
 
-    Its metadata gain `arithmetic` and `calibration_images`; a segmenter ends with its scores, and gains `score_step`.
-    The file appears whole or not at all. The same images give the same bytes. Raises FileNotFoundError, or
-    NetworkFileError where the file is not a network of ours or is in 8 bits already, and ValueError without an image.
+    Its metadata gain `arithmetic` and `calibration_images`; a segmenter ends with its scores, and gains `score_step`. A
+    second network in the file stays as it is. The file appears whole or not at all. The same images give the same
+    bytes. Raises FileNotFoundError, or NetworkFileError where the file is not a network of ours or is in 8 bits
+    already, and ValueError without an image.
     """
     import onnx
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
@@ -72,7 +73,8 @@ def quantize_network(file: Path, images: Iterable[Pixels], out: Path) -> None:
         model, facts["score_step"] = of_scores(model)
     model.producer_name = "dataflow"
     facts |= {"arithmetic": INT8, "calibration_images": reader.count}
-    onnx.helper.set_model_props(model, {KEY: json.dumps(facts, sort_keys=True)})
+    second = {each.key: each.value for each in onnx.load(file).metadata_props if each.key == SECOND}
+    onnx.helper.set_model_props(model, {KEY: json.dumps(facts, sort_keys=True), **second})
     onnx.checker.check_model(model)
     with whole(out) as place:
         place.write_bytes(model.SerializeToString())
@@ -140,7 +142,7 @@ def of_scores(model: Any) -> tuple[Any, float]:
     from onnx.utils import Extractor
 
     made = {name: node for node in model.graph.node for name in node.output}
-    node = next(each for each in model.graph.node if each.op_type == "ArgMax")
+    node = next(each for each in model.graph.node if each.op_type in ("ArgMax", "ReduceMax"))
     while node.op_type != "DequantizeLinear":
         node = made[node.input[0]]
     scores, step = node.input[0], node.input[1]
@@ -149,6 +151,10 @@ def of_scores(model: Any) -> tuple[Any, float]:
     shaped = onnx.shape_inference.infer_shapes(model)
     found = next(each for each in shaped.graph.value_info if each.name == last.input[0])
     shape = [each.dim_value for each in found.type.tensor_type.shape.dim]
+    for output in model.graph.output:  # of the float file's own scores, which are left out
+        made[output.name].output[list(made[output.name].output).index(output.name)] = f"{output.name} before"
+    for each in model.graph.node:
+        each.input[:] = ["scores" if name == scores else name for name in each.input]
     last.output[0] = "scores"
     del model.graph.output[:]
     model.graph.output.append(onnx.helper.make_tensor_value_info("scores", onnx.TensorProto.UINT8, shape))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as jsonlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -68,28 +68,45 @@ def tell_data(
     err_console.print(told, highlight=False, markup=False, soft_wrap=True)
 
 
-def report(outcome: Outcome, operator: str, json: bool, params: str = "weights: {file}") -> None:
-    """Prints the score, the file and the operator that takes it, with these parameters; or one JSON object."""
+def report(
+    outcome: Outcome,
+    operator: str,
+    json: bool,
+    params: str = "weights: {file}",
+    seconds: Mapping[str, Outcome | None] | None = None,
+) -> None:
+    """Prints the score, the file and the operator that takes it, with these parameters; or one JSON object.
+
+    `seconds` are the outcomes of second networks, by kind; None for one that was left away.
+    """
+    trained = {kind: second for kind, second in (seconds or {}).items() if second is not None}
     if json:
-        typer.echo(
-            jsonlib.dumps(
-                {
-                    "weights": str(outcome.file),
-                    "checkpoint": str(outcome.checkpoint),
-                    "scores": outcome.best,
-                    "epoch": outcome.best_epoch,
-                    "epochs": len(outcome.history),
-                    "seconds": round(outcome.seconds, 1),
-                    "history": outcome.history,
-                }
-            )
-        )
+        told = {"weights": str(outcome.file), "checkpoint": str(outcome.checkpoint), **told_of(outcome)}
+        typer.echo(jsonlib.dumps(told | {kind: told_of(second) for kind, second in trained.items()}))
         return
-    scores = score_words(outcome.best, [name for name in outcome.best if name != "score"])
     file = escape(str(outcome.file))
-    out_console.print(f"[green]{file}[/green]: {scores} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True)
+    out_console.print(
+        f"[green]{file}[/green]: {_scores(outcome)} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True
+    )
+    for kind, second in trained.items():
+        out_console.print(f"with its {kind}: {_scores(second)}", highlight=False, soft_wrap=True)
     given = params.format(file=file)
     out_console.print(f"use it: `use: {operator}` with `params: {{{given}}}`", highlight=False, soft_wrap=True)
+
+
+def told_of(outcome: Outcome) -> dict[str, object]:
+    """The outcome of a training as plain values."""
+    return {
+        "scores": outcome.best,
+        "epoch": outcome.best_epoch,
+        "epochs": len(outcome.history),
+        "seconds": round(outcome.seconds, 1),
+        "history": outcome.history,
+    }
+
+
+def _scores(outcome: Outcome) -> str:
+    return score_words(outcome.best, [name for name in outcome.best if name != "score"])
 
 
 def input_size(text: str | None, files: Sequence[Path]) -> tuple[int, int]:

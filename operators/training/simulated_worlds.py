@@ -2,7 +2,8 @@
 
 Each world is drawn from a seed of its own; a few images are taken from each, far apart in time, with varied cameras.
 
-python -m operators.training.simulated_worlds DATA [--worlds 480] [--validation 10] [--frames 10] [--processes 1]
+python -m operators.training.simulated_worlds DATA [--worlds 480] [--first-seed 10000] [--validation 10] [--frames 10]
+                                             [--processes 1]
 """
 
 from __future__ import annotations
@@ -207,12 +208,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
         description="Render a data folder for `dataflow train pair`, `detector` and `segmenter`.",
     )
     parser.add_argument("data", type=Path, help="the folder to write")
-    parser.add_argument("--worlds", type=int, default=480, help=f"worlds to train on, of seeds from {TRAINING}")
+    parser.add_argument("--worlds", type=int, default=480, help="worlds to train on")
+    parser.add_argument(
+        "--first-seed",
+        type=int,
+        default=TRAINING,
+        help="seed of the first world to train on; the others have the next ones",
+    )
     parser.add_argument("--validation", type=int, default=10, help=f"worlds to score on, of seeds from {VALIDATION}")
     parser.add_argument("--frames", type=int, default=10, help="images of each world")
     parser.add_argument("--processes", type=int, default=1, help="worlds rendered at once")
     options = parser.parse_args(arguments)
-    chosen = worlds(TRAINING, options.worlds, KINDS), worlds(VALIDATION, options.validation, KINDS)
+    if not TRAINING <= options.first_seed <= VALIDATION - options.worlds:
+        parser.error(f"--first-seed: worlds to train on have seeds from {TRAINING} to {VALIDATION - 1}")
+    chosen = worlds(options.first_seed, options.worlds, KINDS), worlds(VALIDATION, options.validation, KINDS)
     rendered = write_data(options.data, *chosen, options.frames, options.processes)
     total = options.worlds + options.validation
     for _ in track(rendered, total=total, description="worlds", console=Console(stderr=True)):

@@ -5,9 +5,19 @@ from operators.weights.network_file import (
     NetworkFileError,
     facts_of,
     open_network,
+    open_second,
     read_facts,
     shipped,
     training_seed,
 )
 
-__all__ = ["Network", "NetworkFileError", "facts_of", "open_network", "read_facts", "shipped", "training_seed"]
+__all__ = [
+    "Network",
+    "NetworkFileError",
+    "facts_of",
+    "open_network",
+    "open_second",
+    "read_facts",
+    "shipped",
+    "training_seed",
+]

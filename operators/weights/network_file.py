@@ -1,10 +1,14 @@
 """Network files: ONNX models that carry, as metadata, all that is needed to use them (classes, input size, anchors).
 
-The metadata entry `dataflow.network` holds a JSON object with at least `kind`, `classes`, `width` and `height`.
+The metadata entry `dataflow.network` holds a JSON object with at least `kind`, `classes`, `width` and `height`. A
+second network, which looks again at what the first one answered, lies in the entry `dataflow.second`: an ONNX model of
+its own with such metadata, in base64. A file without one is used without.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,12 +18,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.inference import ModelError, open_session
+from operators.inference import ModelError, open_content, open_session
 
 if TYPE_CHECKING:
     import onnxruntime
 
-KEY = "dataflow.network"
+KEY, SECOND = "dataflow.network", "dataflow.second"
 _FOLDER = Path(__file__).parent
 
 
@@ -69,6 +73,23 @@ def open_network(file: Path, kind: str) -> Network:
     return Network(file, size, tuple(map(str, facts["classes"])), facts, session)
 
 
+def open_second(network: Network) -> tuple[dict[str, Any], onnxruntime.InferenceSession] | None:
+    """The metadata and the session of the second network in a file; None where it has none.
+
+    Raises NetworkFileError for one that cannot be read.
+    """
+    text = network.session.get_modelmeta().custom_metadata_map.get(SECOND)
+    if text is None:
+        return None
+    told = f"the second network in {network.file}"
+    try:
+        content = base64.b64decode(text, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise NetworkFileError(f"{told} (metadata {SECOND!r}) is not base64: {error}") from None
+    session = open_content(content, told)
+    return _facts_of(told, session, ("kind", "classes")), session
+
+
 def read_facts(file: Path) -> dict[str, Any]:
     """The metadata of a network file. Raises NetworkFileError."""
     return facts_of(file, open_session(file))
@@ -87,6 +108,10 @@ _IMAGES = ("kind", "classes", "width", "height")
 
 def facts_of(file: Path, session: onnxruntime.InferenceSession, needed: Sequence[str] = _IMAGES) -> dict[str, Any]:
     """Returns the metadata of an opened network file. Raises NetworkFileError where it lacks what is needed."""
+    return _facts_of(str(file), session, needed)
+
+
+def _facts_of(file: str, session: onnxruntime.InferenceSession, needed: Sequence[str]) -> dict[str, Any]:
     text = session.get_modelmeta().custom_metadata_map.get(KEY)
     if text is None:
         raise NetworkFileError(

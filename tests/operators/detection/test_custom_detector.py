@@ -25,7 +25,7 @@ from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
 from operators.training.augmentation import NONE, Variation, fitted, tensor_of, warp
-from operators.weights import NetworkFileError
+from operators.weights import NetworkFileError, open_network, open_second
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
@@ -112,7 +112,11 @@ def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path
     options += ["--learning-rate", "0.005", "--evaluate-every", "12", "--json"]
     trained = dataflow_command("train", "detector", str(data), "--out", str(out), *options)
     assert trained.returncode == 0, trained.stderr
-    assert json.loads(trained.stdout)["scores"]["ap50"] > 0.5
+    told = json.loads(trained.stdout)
+    assert told["scores"]["ap50"] > 0.5
+    assert told["refiner"]["epochs"] == 8
+    assert open_second(open_network(out, "detector")) is not None
+    assert sorted(file.name for file in tmp_path.glob("mine.*")) == ["mine.onnx", "mine.pt", "mine.refiner.pt"]
 
     unseen = write_coco(tmp_path / "unseen", 30, seed=1000)
     scored = dataflow_command("evaluate", "detector", str(unseen), "--weights", str(out), "--all", "--json")
@@ -629,8 +633,6 @@ def exported(tmp_path: Path, classes: int = 3, more: dict[str, object] | None = 
 
 
 def test_the_file_computes_what_the_trained_network_computes(tmp_path: Path) -> None:
-    from operators.weights import open_network
-
     file, network = exported(tmp_path)
     pixels = scene(4)[0]
     with torch.inference_mode():

@@ -1,0 +1,255 @@
+"""Training of a refiner on the boxes that a trained detector finds, as a task for the training loop."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from operators.detection.custom.closeup import MARGIN, PIXELS, closeups, numbers, places, windows
+from operators.detection.custom.dataset import DetectionData, LabelledImage
+from operators.detection.custom.evaluation import ScoredImage, score_detections
+from operators.detection.custom.first_look import FirstLook
+from operators.detection.custom.loss import complete_iou
+from operators.detection.custom.refiner import DEQUANTIZED, KIND, Look, inner_names, look_again
+from operators.detection.custom.refiner_network import RefinerNetwork
+from operators.detection.custom.surroundings import surroundings
+from operators.detection.nms import intersection_over_union
+from operators.training.augmentation import Variation, recolored
+from operators.training.export import export_rows, without_second
+from operators.training.files import TrainingFileError
+from operators.weights import open_network
+
+SIDE = 48
+LEAST, MOST = 0.08, 64
+_SCORING = (0.01, 0.5, 100)  # least score, overlap for suppression, most boxes
+_SAME = 0.4
+"""Overlap from which a box is of an object."""
+_JITTER, _ASTRAY = 0.05, 0.12
+"""Standard deviations by which sides of found boxes and of true ones are moved, as shares of the box's size."""
+_ROWS, _SHOWN = 100_000, 150
+"""Boxes that are kept to learn from, of all images and of one, at most: they stay in memory, 17 kB each."""
+_CHUNK = 32
+"""Boxes that are varied alike and stay together: one sample of the training loop."""
+_STRIDES = (8, 16)
+_HEAD = re.compile(r"/heads\.(\d+)/")
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """What is seen of N boxes, the `boxes` themselves and those of their objects, `wanted`, in pixels of the image."""
+
+    seed: int
+    closeups: Tensor
+    surroundings: Tensor
+    places: Tensor
+    boxes: Tensor
+    wanted: Tensor
+
+
+class RefinerTask:
+    """Trains a refiner for the detector in `file` on labelled images."""
+
+    kind = KIND
+
+    def __init__(
+        self, data: DetectionData, file: Path, *, seed: int = 0, variation: Variation | None = None, side: int = SIDE
+    ) -> None:
+        torch.manual_seed(seed)
+        self.data, self.file, self.side = data, file, side
+        self.variation = Variation() if variation is None else variation
+        self._first = FirstLook(file)
+        network = self._first.network
+        if network.classes != data.classes:
+            raise TrainingFileError(
+                f"{file} finds {', '.join(network.classes)}; the data have {', '.join(data.classes)}"
+            )
+        self._maps = maps_of(file)
+        self._first.reveal(inner_names(network, self._maps))
+        self._again = Look(len(data.classes), side, LEAST, MOST)
+        self._rows = self._gathered(np.random.default_rng(seed))
+        self.refiner = RefinerNetwork(len(data.classes), side, self._rows[1].shape[1])
+
+    @property
+    def network(self) -> nn.Module:
+        return self.refiner
+
+    @property
+    def samples(self) -> int:
+        return max(1, len(self._rows[0]) // _CHUNK)
+
+    def description(self) -> dict[str, Any]:
+        return {
+            "classes": list(self.data.classes),
+            "side": self.side,
+            "images": len(self.data.training),
+            "detector": hashlib.sha256(without_second(self.file)).hexdigest(),
+        }
+
+    def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> Batch:
+        parts = []
+        for k, rng in zip(samples, rngs, strict=True):
+            seen, *others = (column[k * _CHUNK : (k + 1) * _CHUNK] for column in self._rows)
+            varied = recolored(seen.reshape(-1, self.side, 3), self.variation, rng).reshape(seen.shape)
+            parts.append((varied, *others))
+        seed = int(rngs[0].integers(1 << 31))
+        columns = [torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)]
+        return Batch(seed, *columns)
+
+    def loss(self, batch: Batch, device: torch.device) -> dict[str, Tensor]:
+        torch.manual_seed(batch.seed)  # of what is left out
+        given = (batch.closeups, batch.surroundings.float(), batch.places)
+        sides = self.refiner(*(each.to(device) for each in given)).float()
+        boxes, wanted = batch.boxes.to(device), batch.wanted.to(device)
+        extent = _twice((boxes[:, 2:] - boxes[:, :2]) * (1 + 2 * MARGIN) + 2 * PIXELS)
+        overlap = complete_iou(boxes + sides * extent, wanted)
+        apart = ((wanted - boxes) / extent - sides).abs().sum(dim=1)
+        return {"overlap": (1 - overlap).mean(), "sides": 2 * apart.mean()}
+
+    def evaluate(self, network: nn.Module) -> dict[str, float]:
+        device = next(network.parameters()).device
+
+        def answer(*given: NDArray[Any]) -> NDArray[np.float32]:
+            with torch.inference_mode():
+                found: NDArray[np.float32] = (
+                    network(*(torch.from_numpy(each).to(device) for each in given)).cpu().numpy()
+                )
+            return found
+
+        before, after = [], []
+        for image in self.data.validation:
+            pixels = image.read()
+            truth = (image.boxes * _extent(pixels), image.classes, image.ignored)
+            looked = self._first.look(pixels, *_SCORING)
+            before.append(ScoredImage(*truth, looked.found))
+            after.append(ScoredImage(*truth, look_again(answer, pixels, looked, self._again, _SCORING[1])))
+        first, second = (score_detections(each, self.data.classes) for each in (before, after))
+        return {
+            "score": second.ap,
+            "ap50": second.ap50,
+            "ap": second.ap,
+            "ap50_before": first.ap50,
+            "ap_before": first.ap,
+        }
+
+    def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
+        """Writes the refiner alone; `attach_second` puts it into the detector's file."""
+        classes = list(self.data.classes)
+        described = {
+            "kind": KIND,
+            "classes": classes,
+            "side": self.side,
+            "least_score": LEAST,
+            "most_boxes": MOST,
+            "maps": list(self._maps),
+            "training_images": len(self.data.training),
+            **facts,
+        }
+        examples = {
+            "closeups": torch.zeros(2, self.side, self.side, 3, dtype=torch.uint8),
+            "surroundings": torch.zeros(2, self._rows[1].shape[1]),
+            "places": torch.zeros(2, numbers(len(classes))),
+        }
+        export_rows(network, examples, ["sides"], described, file)
+
+    def _gathered(self, rng: np.random.Generator) -> tuple[NDArray[Any], ...]:
+        """Rows of all images, some of them mirrored, in random order, by column."""
+        images = self.data.training
+        most = max(1, min(_SHOWN, _ROWS // len(images)))
+        parts = [self._shown(image, most, rng) for image in images]
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        if not len(columns[0]):
+            raise TrainingFileError(f"none of {len(images)} images shows an object to learn from")
+        order = rng.permutation(len(columns[0]))
+        return tuple(column[order] for column in columns)
+
+    def _shown(self, image: LabelledImage, most: int, rng: np.random.Generator) -> tuple[NDArray[Any], ...]:
+        """A row for each of some boxes of an image that have an object: found ones, as they are and led astray, and
+        true ones led astray."""
+        pixels = image.read()
+        size, truth = (pixels.shape[1], pixels.shape[0]), image.boxes * _extent(pixels)
+        if rng.random() < self.variation.flip:
+            pixels, truth = np.ascontiguousarray(pixels[:, ::-1]), mirror_image(truth, size[0])
+        looked = self._first.look(pixels, *_SCORING)
+        found = looked.found.select(looked.found.scores >= LEAST / 2)
+        counted = np.flatnonzero(~image.ignored)
+        boxes = np.concatenate([found.boxes, astray(found.boxes, _JITTER, rng), astray(truth[counted], _ASTRAY, rng)])
+        sure = rng.uniform(0.2, 0.95, len(counted)).astype(np.float32)
+        scores = np.concatenate([found.scores, found.scores, sure])
+        classes = np.concatenate([found.classes, found.classes, image.classes[counted]])
+        wanted, known = matched(boxes, classes, truth, image.classes, image.ignored)
+        chosen = np.sort(rng.permutation(np.flatnonzero(known))[:most])
+        boxes, scores, classes = boxes[chosen], scores[chosen], classes[chosen]
+        window = windows(boxes)
+        return (
+            closeups(pixels, window, self.side),
+            surroundings(looked.inner, window, looked.fit).astype(np.float16),
+            places(boxes, scores, classes, len(self.data.classes), size),
+            boxes,
+            wanted[chosen],
+        )
+
+
+def maps_of(file: Path) -> list[str]:
+    """The inner maps of a detector that its heads of strides 8 and 16 see, by their names in a file that is not in 8
+    bits. Raises TrainingFileError where the file has no such heads."""
+    import onnx
+
+    strides = [int(stride) for stride in open_network(file, "detector").facts["strides"]]
+    first: dict[int, str] = {}
+    for node in onnx.load(file).graph.node:
+        found = _HEAD.search(node.name) if node.op_type == "Conv" else None
+        if found is not None:
+            first.setdefault(int(found[1]), node.input[0].removesuffix(DEQUANTIZED))
+    names = [first[k] for k, stride in enumerate(strides) if stride in _STRIDES and k in first]
+    if not names:
+        raise TrainingFileError(f"{file} has no heads of strides {_STRIDES}; `dataflow train` wrote no such file")
+    return names
+
+
+def matched(
+    boxes: NDArray[np.float32],
+    classes: NDArray[np.int32],
+    truth: NDArray[np.float32],
+    true_classes: NDArray[np.int32],
+    ignored: NDArray[np.bool_],
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """The object's box (N, 4) of each box, and whether it has one.
+
+    A box is of the object of its class that it overlaps most, if enough, and if that is not an ignored one.
+    """
+    wanted, best, known = boxes.copy(), np.full(len(boxes), _SAME, np.float32), np.zeros(len(boxes), np.bool_)
+    for box, label, aside in zip(truth, true_classes, ignored, strict=True):
+        overlap = np.where(classes == label, intersection_over_union(box, boxes), 0)
+        better = overlap > best
+        wanted[better], best[better], known[better] = box, overlap[better], not aside
+    return wanted, known
+
+
+def astray(boxes: NDArray[np.float32], deviation: float, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Boxes (N, 4) whose sides are moved at random by so large a share of their size."""
+    extent = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
+    moved_boxes = boxes + rng.normal(0, deviation, boxes.shape) * extent
+    low, high = np.minimum(moved_boxes[:, :2], moved_boxes[:, 2:]), np.maximum(moved_boxes[:, :2], moved_boxes[:, 2:])
+    return np.concatenate([low, high], axis=1).astype(np.float32)
+
+
+def mirror_image(boxes: NDArray[np.float32], width: int) -> NDArray[np.float32]:
+    """Boxes (N, 4) in the mirror image."""
+    return np.stack([width - boxes[:, 2], boxes[:, 1], width - boxes[:, 0], boxes[:, 3]], axis=1)
+
+
+def _twice(values: Tensor) -> Tensor:
+    return torch.cat([values, values], dim=1)
+
+
+def _extent(pixels: NDArray[np.uint8]) -> NDArray[np.float32]:
+    return np.array([pixels.shape[1], pixels.shape[0]] * 2, np.float32)
