@@ -35,7 +35,8 @@ from operators.sources.simulated_robot import SimulatedRobot
 
 Route = Literal["tour", "watch"]
 KINDS = ("office", "table_top", "corridor")
-RATE, SECONDS = 4.0, 50
+RATE = 4.0
+SECONDS: dict[Route, int] = {"tour": 50, "watch": 30}
 SEARCH: dict[str, Any] = {"voxel": 0.08, "period": 2.0}
 """Parameters of PlaneSegmenter, as in graphs/core/perception.yaml."""
 
@@ -109,7 +110,7 @@ def sense(kind: str, seed: int, route: Route) -> World:
         seed=seed,
         people=3,
         route=route,
-        duration=f"{SECONDS}s",
+        duration=f"{SECONDS[route]}s",
         color_camera={"rate": RATE, "width": 640, "height": 480},
         depth_camera={"rate": RATE},
         truth={

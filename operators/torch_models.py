@@ -245,7 +245,9 @@ def _read_checkpoint(file: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
     try:
         read = torch.load(file, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError) as error:
-        raise WeightsError(f"{file} is no checkpoint of torch.save: {_first_lines(str(error))}") from None
+        advice = "weights_only" in str(error)  # torch's, to run whatever code the file holds
+        why = "it is of another kind, or holds objects, which are not read" if advice else _first_lines(str(error))
+        raise WeightsError(f"{file} is no checkpoint of torch.save with tensors, names and numbers: {why}") from None
     if isinstance(read, dict) and isinstance(read.get("model"), dict):
         names = read.get("classes", ())
         if not isinstance(names, Sequence) or isinstance(names, str):

@@ -60,9 +60,11 @@ def open_network(file: Path, kind: str) -> Network:
     Raises NetworkFileError where the file is no network of this `kind` (`detector`, `segmenter`, `classifier`).
     """
     session = open_session(file)
+    found = facts_of(file, session, ("kind",))["kind"]
+    if found != kind:
+        other = "an activity network" if found == "activity" else f"a {found}"
+        raise NetworkFileError(f"{file} is {other}; a {kind} is needed: `dataflow train {kind} DATA`")
     facts = facts_of(file, session)
-    if facts.get("kind") != kind:
-        raise NetworkFileError(f"{file} is a {facts.get('kind')}; a {kind} is needed: `dataflow train {kind} DATA`")
     inputs = session.get_inputs()
     size = (int(facts["width"]), int(facts["height"]))
     if len(inputs) != 1 or inputs[0].type != "tensor(float)" or list(inputs[0].shape) != [1, 3, size[1], size[0]]:

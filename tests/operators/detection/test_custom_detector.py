@@ -25,7 +25,7 @@ from operators.detection.custom.yolo_folder import read_yolo
 from operators.detection.decode import Candidates
 from operators.detection.nms import intersection_over_union
 from operators.training.augmentation import NONE, Variation, fitted, tensor_of, warp
-from operators.weights import NetworkFileError, open_network, open_second
+from operators.weights import NetworkFileError, open_network, open_second, shipped
 
 torch = pytest.importorskip("torch", reason="training needs the extra [train]")
 
@@ -660,6 +660,8 @@ def test_a_file_of_another_kind_or_origin_is_refused_by_name(tmp_path: Path) -> 
         onnx.save(changed, str(tmp_path / "changed.onnx"))
         with pytest.raises(NetworkFileError, match=fault):
             CustomDetector(weights=str(tmp_path / "changed.onnx")).setup()
+    with pytest.raises(NetworkFileError, match=r"activity\.onnx is an activity network; a detector is needed"):
+        CustomDetector(weights=str(shipped("activity.onnx"))).setup()
     del model.metadata_props[:]
     onnx.save(model, str(tmp_path / "bare.onnx"))
     with pytest.raises(NetworkFileError, match=r"no metadata .*OnnxDetector"):

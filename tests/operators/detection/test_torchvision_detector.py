@@ -116,8 +116,9 @@ def test_weights_of_another_model_or_no_weights_at_all_are_refused(checkpoint: P
     with pytest.raises(OperatorFailure, match=r"mine\.pt do not fit ssd300_vgg16"):
         play(TorchvisionDetector(model="ssd300_vgg16", checkpoint=str(checkpoint)), {"image": [image()]})
     (tmp_path / "text.pt").write_text("no checkpoint")
-    with pytest.raises(OperatorFailure, match=r"no checkpoint of torch\.save"):
+    with pytest.raises(OperatorFailure, match=r"no checkpoint of torch\.save .* which are not read") as told:
         play(TorchvisionDetector(model=NAME, checkpoint=str(tmp_path / "text.pt")), {"image": [image()]})
+    assert "arbitrary code" not in str(told.value), "nobody is told how to run it"
 
 
 def test_half_precision_needs_a_gpu(checkpoint: Path) -> None:
