@@ -6,7 +6,6 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -173,17 +172,10 @@ def _seen(
     if masks is not None:
         classes = np.full(len(points), -1, np.int32)
         column, row = np.rint(pixels[inside]).astype(np.int64).T
-        classes[inside] = np.where(_brink(masks.classes), -1, masks.classes.astype(np.int32))[row, column]
+        classes[inside] = masks.classes.astype(np.int32)[row, column]
     spacing = np.sqrt(info.width * info.height / max(int(inside.sum()), 1))
     grain = min(0.5 * float(spacing) + (masks is not None), _MOST_GRAIN)
     return Seen(points, pixels + 0.5, inside, up, classes, grain)  # boxes count from the image's edge
-
-
-def _brink(classes: NDArray[Any]) -> NDArray[np.bool_]:
-    """Returns which pixels have a neighbour of another class: there masks stray."""
-    kernel = np.ones((3, 3), np.uint8)
-    pixels = classes.astype(np.uint16)
-    return np.asarray(cv2.erode(pixels, kernel) != cv2.dilate(pixels, kernel))
 
 
 def _boxes(cloud: PointCloud, detections: Detections2D, rows: NDArray[np.intp], found: list[Lifted]) -> Boxes3D:

@@ -37,7 +37,7 @@ class BorderNetwork(nn.Module):
         )
 
     def decide(self, seen: Tensor, preferences: Tensor, first: Tensor, second: Tensor) -> Tensor:
-        """What follows the first layer's answer (N, H) to the pixels."""
+        """Goes on from the first layer's answer (N, H) to the pixels."""
         rough = (preferences / _SURE).flatten(1)
         x = seen + self.preferred(torch.cat([rough.clamp(-1, 1), rough / 4], dim=1))
         answer: Tensor = self.mixed(x + self.first(first) + self.second(second))
@@ -45,7 +45,7 @@ class BorderNetwork(nn.Module):
 
 
 class DeployedBorders(nn.Module):
-    """What the file computes: the same, the first layer in integers.
+    """Computes the same as the file does, the first layer in integers.
 
     That layer takes pixels of 8 bits as they are: taking off the mean is a part of its weights. These are rounded to 7
     bits, by output, so that no sum overflows on processors without VNNI instructions.

@@ -122,7 +122,7 @@ def look_again(
 
 @dataclass(frozen=True)
 class Placed:
-    """Where pixels lie among the cells: pixel x of the image lies at the cell x * scale + offset, along both axes."""
+    """Places pixels among the cells: pixel x of the image lies at the cell x * scale + offset, along both axes."""
 
     scale: tuple[float, float]
     offset: tuple[float, float]

@@ -310,12 +310,8 @@ def train_pair(
         outcome = run_task(task, settings, file, resume, json)
         refiner = refined(boxes, out / DETECTOR, settings, refiner_epochs, task.variation, resume, json)
         borders = bordered(masks, out / SEGMENTER, settings, border_epochs, task.variation, resume, json)
-    report(
-        outcome,
-        "operators.detection:CustomDetector and operators.segmentation:Segmenter",
-        json,
-        seconds={"refiner": refiner, "borders": borders},
-    )
+    seconds = {"refiner": refiner, "borders": borders}
+    report(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json, seconds=seconds)
 
 
 @train.command("quantize")

@@ -189,7 +189,7 @@ def train_borders(
 
 
 def _place(weights: Path, out: Path | None, kind: str, resume: bool, overwrite: bool) -> Path:
-    """Where to write. Keeps an earlier training from being lost."""
+    """Tells the file to write. Keeps an earlier training from being lost."""
     out = weights if out is None else out
     there = [str(file) for file in (out, out.with_suffix(f".{kind}.pt")) if file.exists() and file != weights]
     if there and not (resume or overwrite):

@@ -1,4 +1,4 @@
-"""What a refiner sees of each box: a close-up of the image around it, and numbers that say where and what it is."""
+"""The view that a refiner has of each box: a close-up of the image around it, and numbers that tell place and kind."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def places(boxes: F32, scores: F32, classes: NDArray[np.int32], count: int, size
 
 
 def numbers(classes: int) -> int:
-    """How many numbers `places` gives for each box."""
+    """Counts the numbers that `places` gives for each box."""
     return _PLACES + classes
 
 

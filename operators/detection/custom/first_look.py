@@ -18,7 +18,7 @@ from operators.weights import NetworkFileError, open_network
 
 @dataclass(frozen=True, eq=False)
 class Looked:
-    """What was found in an image, in its pixels, by falling score; the revealed inner maps (1, C, h, w) of the
+    """Holds what was found in an image, in its pixels, by falling score; the revealed inner maps (1, C, h, w) of the
     network; and how the image was fitted into its input."""
 
     found: Candidates

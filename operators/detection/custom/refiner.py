@@ -21,15 +21,15 @@ if TYPE_CHECKING:
 
 KIND = "refiner"
 INT8, DEQUANTIZED = "int8", "_DequantizeLinear_Output"
-"""What the metadata of a network in 8 bits say, and what its inner values' names end in."""
+"""The word for 8 bits in a network's metadata, and the ending of its inner values' names."""
 Answer = Callable[[NDArray[np.uint8], NDArray[np.float32], NDArray[np.float32]], NDArray[np.float32]]
 """(close-ups, surroundings, places) → by which shares of the windows the sides move (N, 4)."""
 
 
 @dataclass(frozen=True)
 class Look:
-    """How a refiner looks: at boxes of `classes` classes that score at least `least`, the best `most`, in close-ups of
-    `side` pixels."""
+    """Settings of a second look, at the best `most` boxes of `classes` classes that score at least `least`: close-ups
+    have `side` pixels along a side."""
 
     classes: int
     side: int

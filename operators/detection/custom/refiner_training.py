@@ -45,7 +45,7 @@ _HEAD = re.compile(r"/heads\.(\d+)/")
 
 @dataclass(frozen=True, eq=False)
 class Batch:
-    """What is seen of N boxes, the `boxes` themselves and those of their objects, `wanted`, in pixels of the image."""
+    """Holds the views of N boxes, the boxes themselves and those of their objects, `wanted`, in the image's pixels."""
 
     seed: int
     closeups: Tensor

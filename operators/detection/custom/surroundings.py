@@ -1,4 +1,4 @@
-"""What a detector's own inner maps tell of the surroundings of a box: samples on a grid over its window."""
+"""Samples of a detector's own inner maps on a grid over the window of a box: they tell of its surroundings."""
 
 from __future__ import annotations
 
