@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +22,13 @@ _PROBES = np.concatenate([np.zeros((1, 7)), np.diag(_STEPS)])
 _NEAREST = 0.1  # metres before the camera from which a corner has a place in the image
 _PIXELS, _SHARE = 1.5, 0.06  # an edge of an image box strays so much, and by such a share of the box
 _INSIDE = 0.02  # metres by which points stray from a box that they are of
-_TAIL = 0.8  # standard deviations of noise by which the outermost points are beyond a side
+_TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
+_TAIL_FLAT, _TAIL_ROUND = 2.3, 1.4  # and those of single views, on flat sides and on round ones, which recede
 _ASKEW = 8.0  # cost of lying otherwise than most things around
 _TURN = 0.1  # radians by which the heading that points show strays
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
 _SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
+_ALIKE = 6  # views that tell as much as more do, since their errors are alike
 _ROUNDS, _CHOICE = 5, 2  # steps, and after how many the two best ways go on alone
 
 
@@ -35,13 +37,14 @@ class ImageView:
     """One view of an object: `P` (3, 4) maps the world to pixels; `box` (4,) is the object's in the image.
 
     `edges` (4,) are those of the box, left, upper, right, lower, that are the object's and not the image's; `eye` (3,)
-    is where the camera was.
+    is where the camera was. `points` (N, 3) are some of those that the view shows of it.
     """
 
     P: Array
     box: Array
     edges: NDArray[np.bool_]
     eye: Array
+    points: Array = field(default_factory=lambda: np.zeros((0, 3)))
 
 
 def fit_cuboid(
@@ -52,16 +55,19 @@ def fit_cuboid(
     before: tuple[int, Box] | None = None,
     heading: float | None = None,
     noise: float = 0.0,
-) -> tuple[int, Box]:
+    *,
+    raw: bool = False,
+) -> tuple[int, Box, Array]:
     """Returns the upright box that agrees best with image boxes, with points (N, 3) of its surface, and with its class.
 
     Least squares over centre, sizes and heading, by Gauss and Newton with differences: edges of the box's image against
     those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
     where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
     which such things stand is tried, along the heading of `start` and along `heading`, that of most things around, and
-    the best is returned with its number; with `before`, an earlier result, only that one.
+    the best is returned with its number; with `before`, an earlier result, only that one. Last comes by how many
+    standard deviations each view's edges stray from that box (V,).
 
-    `noise` is that of ranges at one metre, m; it grows by the square.
+    `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
     logs, spreads = _priors(usual)
@@ -80,10 +86,11 @@ def fit_cuboid(
         headings = np.array([_nearest_turn(box[2], towards)])
     outline = _ELLIPSE if usual and usual[0].round else _SIGNS
     inset = usual[0].inset if usual else 0.0
+    noise *= (_TAIL_ROUND if outline is _ELLIPSE else _TAIL_FLAT) if raw else _TAIL
     P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / 4))
+    weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
 
     def residuals(rows: Array) -> Array:
         """Returns the residuals (A, K, R) of boxes (A, K, 7)."""
@@ -110,8 +117,11 @@ def fit_cuboid(
         x = x + step
         if (np.abs(step) < 0.1 * _STEPS).all():
             break
-    best = 0 if len(x) == 1 else int(np.argmin(_cost(residuals(x[:, None])[:, 0]) + askew))
-    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6]))
+    last = residuals(x[:, None])[:, 0]
+    best = int(np.argmin(_cost(last) + askew))
+    off = np.abs(last[best, : 4 * len(views)]).reshape(-1, 2, 2).sum(axis=1) * np.sqrt(max(1.0, len(views) / _ALIKE))
+    strays = off.max(axis=1) / np.maximum(edges.reshape(-1, 2, 2).sum(axis=1).max(axis=1), 1)
+    return int(forms[best]), (x[best, :3].copy(), np.exp(x[best, 3:6]), float(x[best, 6])), strays
 
 
 def _cost(r: Array) -> Array:
@@ -220,8 +230,7 @@ def _surface(rows: Array, points: Array, eyes: Array, noise: float, inset: float
     residual = np.concatenate([low + half, half - high], axis=1)
     eye = local[..., count:]
     way = np.abs(eye).sum(axis=2) / len(eyes)
-    distance = np.sqrt((way * way).sum(axis=1, keepdims=True))
-    stray = _TAIL * noise * distance * way  # along each axis: noise * distance², in the direction of the view
+    stray = noise * way * way  # along each axis, by how much of the distance lies along it
     residual[:, :3] += stray
     residual[:, 3:] += stray
     if inset:

@@ -14,6 +14,7 @@ from operators.scene.matching import LARGE
 
 Array = NDArray[np.float64]
 _SMALL, _STILL = 0.5, 0.2  # metres, and metres a second
+_ODD = 4.0  # spreads from the usual size, beyond which nothing of a class is
 
 
 class Kinds:
@@ -55,9 +56,17 @@ class Kinds:
     def is_round(self, object: MapObject) -> bool:
         return any(u.round for u in self.usual.get(object.class_id, ()))
 
-    def is_on_floor(self, object: MapObject) -> bool:
-        """Tells whether an object is of a class that stands on the floor."""
-        return any(u.on_floor for u in self.usual.get(object.class_id, ()))
+    def foot(self, object: MapObject) -> float:
+        """Returns how much of an object's foot may be hidden, metres; 0 where its class does not stand on the floor."""
+        return max((u.foot for u in self.usual.get(object.class_id, ())), default=0.0)
+
+    def may_be_so_large(self, object: MapObject) -> bool:
+        """Tells whether an object has a size that things of its class may have, seen in part or whole."""
+        usual = self.usual.get(object.class_id)
+        if not usual or object.class_id in self.movers:
+            return True
+        size = np.log(np.maximum([*np.sort(object.size[:2]), object.size[2]], 1e-3))
+        return any((size - np.log(u.size) <= _ODD * np.array(u.spread)).all() for u in usual)
 
     def near_side(self, points: Array, class_id: int, eye: Array, noise: float) -> Array:
         """Returns one view's points (N, 3) without those that are farther behind most than such a thing is deep.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -19,11 +19,15 @@ Array = NDArray[np.float64]
 
 MOST_EVIDENCE = 6.0
 _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
-_KEPT = 10  # views of an object
-_APART = 0.05  # angle, rad, and a third of the change of the distance, from which two views tell different things
-_SETTLED = 5  # views after which the way in which it stands is settled
+_KEPT = 16  # views of an object
+_FAR, _ENOUGH = 1.6, 5  # times as far as the third nearest of so many views, and one tells nothing more
+_SAMPLE = 16  # points of a view that are kept
+_SMALL = 0.5  # metres up to which things are seen whole, so that the kept views have points enough
+_STRAYS = 2.5  # standard deviations by which the edges of a view stray that is of something else
+_APART = 0.02  # angle, rad, and a third of the change of the distance, from which two views tell different things
+_AGAIN = 0.25  # share of the views that are new, from which the box is fitted again
+_SETTLED = 9  # views after which the way in which it stands is settled
 _POINTS = 45  # points of an object that a fit uses
-_FOOT = 1.0  # metres above the floor up to which what stands on it may be hidden
 _PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most", "form")
 _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 
@@ -34,7 +38,8 @@ class MapObject:
 
     `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
     of voxels that it had; `images` are the views that its box is fitted to, `form` which of the ways in which its class
-    stands, -1 while that is open; `held` whether it was last seen in a hand. `beside` counts by id in how many views
+    stands, -1 while that is open, `fresh` how many of them are new since the last fit; `held` whether it
+    was last seen in a hand. `beside` counts by id in how many views
     another one was seen too, in a place of its own in the image.
     """
 
@@ -56,6 +61,7 @@ class MapObject:
     form: int = -1
     beside: Counter[int] = field(default_factory=Counter)
     held: bool = False
+    fresh: int = 0
 
     def __post_init__(self) -> None:
         self.class_id = int(self.votes.argmax())
@@ -79,22 +85,32 @@ class MapObject:
     def box(self) -> tuple[Array, Array, float]:
         return self.center, self.size, self.yaw
 
-    def look(self, view: ImageView) -> bool:
-        """Keeps a view that tells something new; returns whether it does."""
+    def look(self, view: ImageView, points: Array | None = None) -> bool:
+        """Keeps a view that tells something new, with some of its points (N, 3).
+
+        Of things that are seen whole from near, views from afar are dropped. Returns whether to fit the box again.
+        """
         if not view.edges.any():
             return False
+        if points is not None:
+            view = replace(view, points=points[:: -(-len(points) // _SAMPLE)])
         way = view.eye - self.center
         if len(self.images) >= 3:
             ways = np.array([v.eye for v in self.images]) - self.center
             lengths, length = np.sqrt((ways * ways).sum(axis=1)), float(np.sqrt(way @ way))
-            apart = _APART * (1 + len(ways) / 4)  # the more are known, the less do others tell
-            turned = ways @ way < np.cos(apart) * lengths * length
-            if not (turned | (np.abs(lengths - length) > 3 * apart * lengths)).all():
+            turned = ways @ way < np.cos(_APART) * lengths * length
+            if not (turned | (np.abs(lengths - length) > 3 * _APART * lengths)).all():
                 return False
         self.images.append(view)
+        if len(self.images) >= _ENOUGH:
+            lengths = np.sqrt(((np.stack([v.eye for v in self.images]) - self.center) ** 2).sum(axis=1))
+            whole = np.sort(lengths[[bool(v.edges.all()) for v in self.images]])
+            limit = _FAR * whole[2] if len(whole) >= 3 else np.inf
+            self.images = [v for v, far in zip(self.images, (lengths > limit).tolist(), strict=True) if not far]
         if len(self.images) > _KEPT:
             self.images.pop(_most_alike([v.eye - self.center for v in self.images]))
-        return True
+        self.fresh += 1
+        return self.fresh >= _AGAIN * len(self.images)
 
     def fit(
         self,
@@ -108,27 +124,39 @@ class MapObject:
         `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square. How high
         it reaches over the `floor`, if that is known, tells which of the ways in which its class stands is its own.
         """
+        self.fresh = 0
         sure = self.cells.sure()
         if not len(sure):
             return
+        sizes = [max(u.size) for u in usual.get(self.class_id, ())]
+        raw = bool(self.images) and max(sizes, default=1.0) <= _SMALL
+        if raw:
+            own = np.concatenate([v.points for v in self.images])
+            raw = len(own) >= _POINTS // 3
+            sure = own if raw else sure
         center, size, yaw = standing_box(sure)
         box = (center, size + 2 * _BRINK, yaw)
         known = usual.get(self.class_id, ())
         if self.images:
             before = (self.form, self.box) if self.form >= 0 else None
-            form, box = fit_cuboid(box, self.images, sure[:: -(-len(sure) // _POINTS)], known, before, heading, noise)
+            some = sure[:: -(-len(sure) // _POINTS)]
+            form, box, strays = fit_cuboid(box, self.images, some, known, before, heading, noise, raw=raw)
+            of_others = strays > _STRAYS
+            if len(self.images) >= _ENOUGH and of_others.any() and of_others.sum() <= len(of_others) // 3:
+                self.images = [v for v, other in zip(self.images, of_others.tolist(), strict=True) if not other]
+                form, box, _ = fit_cuboid(box, self.images, some, known, None, heading, noise, raw=raw)
             self.form = form if len(self.images) >= _SETTLED else -1
         elif known:
-            stands = floor is not None and any(u.on_floor for u in known)
+            stands = floor is not None and all(u.foot > 0 for u in known)
             height = float(box[0][2] + box[1][2] / 2) - floor if stands and floor is not None else float(box[1][2])
             usually = min(known, key=lambda u: abs(math.log(u.size[2] / max(height, 0.01)))) if stands else known[0]
             box = completed(box, self.view / max(self.views, 1), usually)
         self.center, self.size, self.yaw = box
 
-    def stand_on(self, floor: float) -> None:
-        """Lets the box reach down to a floor that is not far below it."""
+    def stand_on(self, floor: float, foot: float) -> None:
+        """Lets the box reach down to a floor that is not farther below it than a `foot` may be hidden, metres."""
         bottom, top = float(self.center[2] - self.size[2] / 2), float(self.center[2] + self.size[2] / 2)
-        if bottom - floor <= _FOOT and top > floor + _FOOT / 2:
+        if bottom - floor <= foot and top > floor + foot / 2:
             self.center, self.size = self.center.copy(), self.size.copy()
             self.center[2], self.size[2] = (top + floor) / 2, top - floor
 
@@ -138,7 +166,8 @@ class MapObject:
         plain = {name: getattr(self, name) for name in (*_PLAIN, *_ARRAYS)}
         beside = sorted(self.beside.items())
         rest = {"cells": self.cells.snapshot(), "images": images, "beside": [list(each) for each in beside]}
-        return plain | rest | {"held": self.held}
+        points = [np.concatenate([v.points for v in rows]), np.array([len(v.points) for v in rows])] if rows else []
+        return plain | rest | {"held": self.held, "fresh": self.fresh, "points": points}
 
     @classmethod
     def restored(cls, state: Mapping[str, Any], side: float) -> MapObject:
@@ -151,6 +180,10 @@ class MapObject:
         for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():
             view = ImageView(np.array(P), np.array(box), np.array(edges, np.bool_), np.array(eye))
             made.images.append(view)
+        if len(state.get("points", ())):  # earlier versions have none
+            parts = np.split(np.array(state["points"][0]), np.cumsum(state["points"][1])[:-1])
+            made.images = [replace(v, points=own) for v, own in zip(made.images, parts, strict=True)]
+        made.fresh = int(state.get("fresh", 0))
         return made
 
 

@@ -112,7 +112,8 @@ class ObjectMap:
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that are surely there, by rising id."""
         s = self._settings
-        return [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
+        there = (o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views)
+        return [o for o in there if self._kinds.may_be_so_large(o)]
 
     def _joined(
         self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
@@ -175,7 +176,7 @@ class ObjectMap:
             return
         object.cells.add(cells)
         object.velocity = np.zeros(3)
-        new = each.image is not None and object.look(each.image) and len(object.images) not in (2, 4)
+        new = each.image is not None and object.look(each.image, cells.points) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
@@ -183,8 +184,8 @@ class ObjectMap:
 
     def _fit(self, object: MapObject) -> None:
         object.fit(self._kinds.usual, self._heading, self._settings.range_noise, self.floor)
-        if self.floor is not None and self._kinds.is_on_floor(object):
-            object.stand_on(self.floor)
+        if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
+            object.stand_on(self.floor, foot)
 
     def _has_left(self, object: MapObject, view: RangeView) -> bool:
         """Tells whether a view looks through the place of an object."""
@@ -201,7 +202,7 @@ class ObjectMap:
         made.view = _direction(eye, cells)
         made.center = cells.middle
         if each.image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
-            made.look(each.image)
+            made.look(each.image, cells.points)
         self._fit(made)
         self.objects[made.id] = made
         self._next += 1

@@ -79,3 +79,24 @@ def test_leaves_inside_their_box_do_not_push_it_away_from_the_viewer() -> None:
         standing_box(leaves), [view_of(plant, y) for y in SIDEWAYS], leaves, CLASS_SIZES["plant"], noise=0.0012
     )[1]
     assert abs(center[0] - 2.5) < 0.02
+
+
+def test_points_that_stray_by_the_noise_of_their_ranges_do_not_draw_a_box_towards_the_viewer() -> None:
+    far: Box = (np.array([4.7, 0.1, 1.0]), np.array([0.16, 0.04, 0.23]), 0.0)
+    points = np.concatenate([spine(far)] * 3)
+    points[:, 0] += np.random.default_rng(7).normal(0, 0.0012 * 4.4**2, len(points))
+    views = [view_of(far, y) for y in SIDEWAYS]
+    start, usual = standing_box(points), CLASS_SIZES["book"]
+    single, accumulated = (
+        fit_cuboid(start, views, points, usual, noise=0.0012, raw=raw)[1][0] for raw in (True, False)
+    )
+    assert abs(single[0] - 4.7) < 0.015 < 4.7 - accumulated[0]
+
+
+def test_a_fit_tells_which_view_is_of_another_thing() -> None:
+    beside: Box = (BOOK[0] + [0, 0.06, 0], BOOK[1], BOOK[2])
+    views = [view_of(beside if k == 2 else BOOK, y, 0.5) for k, y in enumerate(SIDEWAYS)]
+    points = spine(BOOK)
+    strays = fit_cuboid(standing_box(points), views, points, CLASS_SIZES["book"])[2]
+    assert np.argmax(strays) == 2
+    assert strays[2] > 2.5 > np.delete(strays, 2).max()

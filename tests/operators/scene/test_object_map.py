@@ -88,7 +88,7 @@ def test_a_label_that_is_seldom_said_of_other_things_counts_more(mugs: int, ball
 
 @pytest.mark.parametrize(("bottom", "reaches_down"), [(0.7, True), (1.6, False)])
 def test_a_person_whose_feet_are_hidden_stands_on_the_floor(bottom: float, reaches_down: bool) -> None:
-    size = {BOX: (Usual((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), on_floor=True),)}
+    size = {BOX: (Usual((0.5, 0.59, 1.6), (0.2, 0.2, 0.2), foot=1.0),)}
     known = ObjectMap(3, [BOX], MapSettings(), size)
     known.floor = -0.4
     T = looking(0.0)
@@ -138,7 +138,7 @@ def test_background_that_shows_through_a_small_thing_is_not_taken_for_a_large_on
 
 def carrying(*, portable: bool, lifted: int = 5) -> ObjectMap:
     """The map after a mug stood beside somebody, who then has it before the mouth."""
-    body = Usual((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), on_floor=True)
+    body = Usual((0.4, 0.5, 1.6), (0.2, 0.2, 0.2), foot=1.0)
     mug = Usual((0.1, 0.1, 0.1), (0.2, 0.2, 0.2), True)
     known = ObjectMap(3, [BOX], MapSettings(), {BOX: (body,), MUG: (mug,)}, None, [BOX], [MUG] if portable else [])
     somebody: Solid = ((2.0, 0.0, 0.4), (0.4, 0.5, 1.6))
@@ -186,8 +186,8 @@ def test_a_mug_farther_away_than_an_arm_reaches_is_another() -> None:
 
 
 def test_how_high_somebody_is_over_the_floor_tells_how_deep() -> None:
-    standing = Usual((0.4, 0.57, 1.64), (0.3, 0.2, 0.1), True, on_floor=True)
-    sitting = Usual((0.56, 0.7, 1.38), (0.2, 0.2, 0.1), True, on_floor=True)
+    standing = Usual((0.4, 0.57, 1.64), (0.3, 0.2, 0.1), True, foot=1.0)
+    sitting = Usual((0.56, 0.7, 1.38), (0.2, 0.2, 0.1), True, foot=1.0)
 
     def depth(top: float) -> float:
         known = ObjectMap(1, [BOX], MapSettings(), {BOX: (standing, sitting)})
@@ -218,3 +218,43 @@ def test_a_snapshot_from_before_that_was_counted_is_taken_up() -> None:
     again = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE)
     again.restore(earlier)
     assert list(again.objects) == list(known.objects)
+
+
+@pytest.mark.parametrize(("length", "given"), [(0.14, 1), (0.8, 0)])
+def test_a_thing_larger_than_any_of_its_class_is_not_given(length: float, given: int) -> None:
+    size = {BOX: (Usual((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}
+    known = ObjectMap(3, [], MapSettings(), size)
+    T = looking(0.0)
+    for k in range(6):
+        eye = looking(0.2 * k)
+        seen = [observation(((2.0, 0.0, 0.1), (0.12, length, 0.12)), BOX, eye)]
+        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
+    assert len(known.objects) == 1
+    assert len(known.confirmed()) == given
+
+
+@pytest.mark.parametrize(("foot", "reaches_down"), [(0.2, True), (0.0, False)])
+def test_furniture_reaches_down_to_the_floor_where_its_class_stands_there(foot: float, reaches_down: bool) -> None:
+    known = ObjectMap(3, [], MapSettings(), {BOX: (Usual((0.5, 0.5, 0.8), (0.3, 0.3, 0.3), foot=foot),)})
+    known.floor = -0.4
+    for k in range(6):
+        seen = [observation(((2.5, 0.0, 0.12), (0.5, 0.5, 0.8)), BOX, looking(0.3 * np.sin(k)))]
+        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), looking(0.0), 0.012))
+    center, box, _ = only(known).box
+    assert (abs(float(center[2] - box[2] / 2) + 0.4) < 1e-9) == reaches_down
+
+
+def test_views_from_afar_are_dropped_for_near_ones_and_a_snapshot_holds_those_kept() -> None:
+    known = ObjectMap(3, [], MapSettings(), {BOX: (Usual((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)})
+    for k, back in enumerate([3.0, 2.8, 2.6, 2.4, 0.6, 0.5, 0.4, 0.3]):
+        T = looking(0.1 * k)
+        T[0, 3] = -back
+        known.update((k + 1) * SECOND // 4, [observation(THING, BOX, T)], RangeView(np.zeros((0, 3)), T, 0.012))
+    object = only(known)
+    assert len(object.images) == 4
+    assert max(float(np.linalg.norm(v.eye - object.center)) for v in object.images) < 3.0
+    again = MapObject.restored(object.snapshot(), 0.03)
+    assert again.fresh == object.fresh
+    for one, other in zip(object.images, again.images, strict=True):
+        assert len(one.points) > 0
+        assert (one.points == other.points).all()
