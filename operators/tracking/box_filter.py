@@ -63,7 +63,8 @@ class BoxFilter:
     @property
     def box(self) -> Array:
         """The box (4,) as (x1, y1, x2, y2)."""
-        return boxes_of([self])[0]
+        box: Array = boxes_of([self])[0]
+        return box
 
     def snapshot(self) -> dict[str, Any]:
         return {"mean": self.mean, "covariance": self.covariance}
