@@ -32,7 +32,7 @@ def keyframe(number: int) -> Keyframe:
 def held(surface: Surface) -> int:
     """Bytes that a surface keeps, what it has made of its grid included."""
     values = [each for value in vars(surface).values() for each in (value if isinstance(value, tuple) else (value,))]
-    return sum(value.nbytes for value in values)
+    return sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
 
 def test_only_the_newest_keyframes_keep_what_frames_are_compared_with() -> None:
