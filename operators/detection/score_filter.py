@@ -40,7 +40,7 @@ class ScoreFilter(Operator):
         return detections.replace(**rows)
 
     def _wanted(self, names: tuple[str, ...]) -> NDArray[np.bool_]:
-        """Which class ids (C,) are asked for."""
+        """Returns the class ids (C,) that are asked for."""
         for name in self.classes:
             if name not in names:
                 near = get_close_matches(name, names, 1)

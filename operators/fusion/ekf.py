@@ -308,7 +308,7 @@ class EkfFusion(Operator):
             self._ignored[f"{name}: {reason}"] += 1
 
     def _clock(self, name: str) -> tuple[int, int]:
-        """Which clock of the filter is a sensor's, -1 for none, and the offset (ns) that it is believed to have."""
+        """Returns a sensor's clock in the filter, -1 for none, and the offset (ns) that it is believed to have."""
         assert self._filter is not None
         offsets = self._filter.offsets()
         return (list(offsets).index(name), round(offsets[name][0] * 1e9)) if name in offsets else (-1, 0)

@@ -304,7 +304,7 @@ class LateFilter:
         return self._config.errors.taken_off(entry.sensor, entry.model, state, residual, J), J
 
     def _change(self, entry: Measurement, state: State, node: Node) -> Array:
-        """How fast the prediction of a measurement changes (M,), its unit a second."""
+        """Returns how fast the prediction of a measurement changes (M,), its unit a second."""
         acceleration = np.zeros(3)
         if self._config.inertial:
             acceleration = state.rotation @ (node.accel - state.accel_bias) + self._down

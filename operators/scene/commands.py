@@ -168,7 +168,7 @@ def _told(found: list[tuple[float, Event]], *, json: bool) -> None:
 
 
 def _tell(recording: Path, graph: SceneGraph, activities: Activity | None, since: float) -> None:
-    """Who does what, what carries what, the strongest other relations, and what to ask next."""
+    """Prints who does what, what carries what, the strongest other relations, and what to ask next."""
     told, names = summarize(graph, most=8), graph.names()
     out = Console(highlight=False)
     out.print(
