@@ -103,6 +103,7 @@ def _one(seed: int) -> dict[str, Any]:
     scenario = scenario_of(seed)
     if seed % COLLECT_EVERY == 0:
         gc.collect()
+        gc.freeze()  # what is left are modules and caches: not looked through again
     gc.disable()
     with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
         try:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import pkgutil
 import sys
 import time
 from collections.abc import Iterator
 from typing import Any
-
-import dataflow
 
 ENGINE = ("chaos", "feeds", "firing", "process", "records", "recording", "reexecution", "supervision", "transport")
 
@@ -26,20 +25,16 @@ def _load() -> None:
                 importlib.import_module(f"{package.__name__}.{module.name}")
 
 
-def clocks() -> list[tuple[str, str]]:
+@functools.cache
+def clocks() -> tuple[tuple[str, str], ...]:
     """Every module of the engine that reads the clock, with the name under which it does."""
-    if not _LOADED:
-        _load()
-        _LOADED.append(dataflow)
+    _load()
     prefixes = tuple(f"dataflow.{name}." for name in ENGINE)
-    return [
+    return tuple(
         (name, "time")
         for name, module in sorted(sys.modules.items())
         if name.startswith(prefixes) and getattr(module, "time", None) is time
-    ]
-
-
-_LOADED: list[Any] = []
+    )
 
 
 @contextlib.contextmanager
