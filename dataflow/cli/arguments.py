@@ -105,6 +105,10 @@ Every = Annotated[
         "Default: what the graph says (`view: every`), else 200ms.",
     ),
 ]
+Streams = Annotated[
+    list[str] | None,
+    typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
+]
 Without = Annotated[
     list[str] | None, typer.Option("--without", metavar="STREAM", help="Leave these streams out. May be repeated.")
 ]

@@ -21,6 +21,7 @@ from dataflow.cli.arguments import (
     OutInstead,
     Overwrite,
     Start,
+    Streams,
     Without,
     chosen_streams,
     existing_recording,
@@ -61,10 +62,7 @@ def convert(
         Path | None, typer.Argument(metavar="OUTPUT", help="The file or folder to write; or name it with --out.")
     ] = None,
     out_option: OutInstead = None,
-    streams: Annotated[
-        list[str] | None,
-        typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
-    ] = None,
+    streams: Streams = None,
     without: Without = None,
     start: Start = None,
     end: End = None,

@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.text import Text
 
-from dataflow.cli.arguments import Clock, End, Start, chosen_streams, existing_recording, number, span, window
+from dataflow.cli.arguments import Clock, End, Start, Streams, chosen_streams, existing_recording, number, span, window
 from dataflow.cli.live import GraphName, Wait, running_graph
 from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
 
@@ -35,10 +35,7 @@ def foxglove(
     host: Annotated[
         str, typer.Option("--host", metavar="ADDRESS", help="The address to listen on; other machines need another.")
     ] = "127.0.0.1",
-    streams: Annotated[
-        list[str] | None,
-        typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
-    ] = None,
+    streams: Streams = None,
     speed: Annotated[
         float,
         typer.Option("--speed", metavar="FACTOR", parser=number(0.01, 100, "a factor of real time"), help="At first."),
@@ -175,7 +172,7 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
 
 
 def _bar(steering: Steering) -> ReplayBar | None:
-    """What a playback bar moves, where a recording is played through the graph; None elsewhere."""
+    """Finds what a playback bar moves, where a recording is played through the graph; None elsewhere."""
     from dataflow.client.attach import NotRunning
     from dataflow.client.replay_bar import ReplayBar
 

@@ -11,7 +11,8 @@ from rich.padding import Padding
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, GraphFile, Json, ModuleFolders, Settings, find_modules_in, graph_file
-from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say, visible
+from dataflow.cli.output import DIFFERENT, fail, friendly_errors, out, plural, print_json, say
+from dataflow.text import visible_lines
 
 if TYPE_CHECKING:
     from dataflow.graph.catalogue import Catalogue
@@ -91,7 +92,7 @@ def show(
         if json:
             print_json(loaded.to_json())
         elif mermaid:
-            print(visible(draw.mermaid(loaded)))
+            print(visible_lines(draw.mermaid(loaded)))
         else:
             out.print(draw.tree(loaded))
 

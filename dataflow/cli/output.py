@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import re
 import sys
 import traceback
 from collections.abc import Iterable, Iterator
@@ -18,6 +17,8 @@ from rich.console import Console, ConsoleOptions, RenderableType
 from rich.markup import escape
 from rich.segment import Segment
 from rich.text import Text
+
+from dataflow.text import visible_json, visible_lines
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -40,27 +41,14 @@ LONGEST = 10_000
 recording may have millions, and breaking those into lines takes minutes."""
 
 
-_INVISIBLE = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-"""Characters that move the cursor, change the terminal or turn the direction of text; all but tab and line feed."""
-
-
-def visible(text: str) -> str:
-    """`text` with control characters written out: names in recordings and graphs may hold anything."""
-    return _INVISIBLE.sub(lambda match: f"\\x{ord(match[0]):02x}" if ord(match[0]) < 256 else _escaped(match), text)
-
-
-def _escaped(match: re.Match[str]) -> str:
-    return f"\\u{ord(match[0]):04x}"
-
-
 class _VisibleConsole(Console):
-    """Passes everything that is printed through `visible`; styles and cursor movements of its own stay."""
+    """Passes everything that is printed through `visible_lines`; styles and cursor movements of its own stay."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
         if isinstance(renderable, Text) and len(renderable) > LONGEST and not (options or self.options).no_wrap:
             renderable = renderable[:LONGEST] + f"… ({len(renderable) - LONGEST:,} more characters)"
         for segment in super().render(renderable, options):
-            yield segment if segment.control else segment._replace(text=visible(segment.text))
+            yield segment if segment.control else segment._replace(text=visible_lines(segment.text))
 
 
 def _console(*, stderr: bool) -> Console:
@@ -84,8 +72,7 @@ def print_json_line(value: Any) -> None:
 
 
 def _json(value: Any, indent: int | None = None) -> str:
-    text = json.dumps(jsonable(value), indent=indent, ensure_ascii=False, allow_nan=False)
-    return _INVISIBLE.sub(_escaped, text)
+    return visible_json(json.dumps(jsonable(value), indent=indent, ensure_ascii=False, allow_nan=False))
 
 
 def jsonable(value: Any) -> Any:

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.cli.arguments import FLAG, AnyRecording, Json, existing, existing_recording
+from dataflow.cli.arguments import FLAG, AnyRecording, Json, Streams, existing, existing_recording
 from dataflow.cli.output import (
     DIFFERENT,
     count,
@@ -190,10 +190,7 @@ def _mapping(title: str, values: Mapping[str, Any]) -> Table:
 def diff(
     a: Annotated[Path, typer.Argument(metavar="A", help="A recording.")],
     b: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
-    streams: Annotated[
-        list[str] | None,
-        typer.Option("--stream", metavar="STREAM", help="Only these streams; wildcards work. May be repeated."),
-    ] = None,
+    streams: Streams = None,
     tolerance: Annotated[
         float | None,
         typer.Option("--tolerance", metavar="X", help="Decimal numbers may differ by so much. Default: bit for bit."),

@@ -9,7 +9,6 @@ from dataflow.recording.info import Description, describe
 from dataflow.recording.logs import LogLine
 from dataflow.recording.reader import Recording
 from dataflow.recording.streams import StreamInfo
-from dataflow.recording.text import visible
 from dataflow.recording.writer import RecordingWriter
 
 __all__ = [
@@ -29,5 +28,4 @@ __all__ = [
     "diff",
     "machine_facts",
     "register_decoder",
-    "visible",
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from dataflow.recording.text import visible
+from dataflow.text import visible
 
 
 class RecordingError(Exception):

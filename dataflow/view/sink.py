@@ -318,7 +318,7 @@ class ViewerSink:
 
 
 def _options(target: Target, graph: Graph | None) -> ViewOptions:
-    """What a file holds, by the graph's wish too; anything else shows all."""
+    """Tells what a file holds, by the graph's wish too; anything else shows all."""
     if not isinstance(target, Save):
         return ViewOptions()
     every = graph.view.every if graph is not None else None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class _Detection(Operator, abstract=True):
-    """What both operators share: the model, its parameters, and boxes of images of one size."""
+    """Holds what both operators share: the model, its parameters, and boxes of images of one size."""
 
     stateless = True
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,87 +32,47 @@ from operators.segmentation.labelled import enlarged
 from operators.segmentation.score import confusion, mean_iou
 from operators.segmentation.scores import best_classes
 from operators.training.augmentation import Variation, recolored
-from operators.training.export import export_rows, without_second
 from operators.training.files import TrainingFileError
+from operators.training.second import Columns, SecondTask, answered
 from operators.weights import open_network
 
 _ROWS, _KEPT = 900_000, 1500
 """Blocks that are kept to learn from, of all images and of one, at most: they stay in memory, 0.6 kB each."""
-_CHUNK = 64
-"""Blocks that are varied alike and stay together: one sample of the training loop."""
 
 Batch = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """Pixels, preferences, first and second class, and the true class of each pixel, of N blocks."""
 
 
-class BorderTask:
+class BorderTask(SecondTask[MaskedImage, Batch]):
     """Trains the network that looks again at the borders of what the segmenter in `file` answers."""
 
-    kind = KIND
+    kind, first, chunk = KIND, "segmenter", 64
 
     def __init__(
         self, data: SegmentationData, file: Path, *, seed: int = 0, variation: Variation | None = None
     ) -> None:
-        torch.manual_seed(seed)
-        self.data, self.file = data, file
-        self.variation = Variation() if variation is None else variation
         self._first = open_network(file, "segmenter")
-        if self._first.classes != data.classes:
-            raise TrainingFileError(
-                f"{file} knows {', '.join(self._first.classes)}; the data have {', '.join(data.classes)}"
-            )
+        super().__init__(data, file, self._first.classes, seed, variation)
         if not scored(self._first):
             raise TrainingFileError(f"{file} gives no scores to look at again: it has more than 32 classes, or is old")
         self._step = float(self._first.facts["score_step"])
-        self.borders = BorderNetwork(len(data.classes))
-        self._rows = self._gathered(np.random.default_rng(seed))
-
-    @property
-    def network(self) -> nn.Module:
-        return self.borders
-
-    @property
-    def samples(self) -> int:
-        return max(1, len(self._rows[0]) // _CHUNK)
-
-    def description(self) -> dict[str, Any]:
-        return {
-            "classes": list(self.data.classes),
-            "images": len(self.data.training),
-            "segmenter": hashlib.sha256(without_second(self.file)).hexdigest(),
-        }
-
-    def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> Batch:
-        parts = []
-        for k, rng in zip(samples, rngs, strict=True):
-            rows = slice(k * _CHUNK, (k + 1) * _CHUNK)
-            pixels, preferences, first, second, truth = (column[rows] for column in self._rows)
-            if rng.random() < self.variation.flip:
-                pixels, preferences, truth = pixels[:, :, ::-1], preferences[:, :, ::-1], truth[:, :, ::-1]
-            seen = recolored(np.ascontiguousarray(pixels).reshape(-1, SEEN, 3), self.variation, rng)
-            parts.append((seen.reshape(-1, SEEN, SEEN, 3), preferences, first, second, truth))
-        columns = [
-            torch.from_numpy(np.ascontiguousarray(np.concatenate(column))) for column in zip(*parts, strict=True)
-        ]
-        return columns[0], columns[1].float(), columns[2].long(), columns[3].long(), columns[4].flatten(1)
+        self.network = BorderNetwork(len(data.classes))
+        self._gather(max(self.chunk, min(_KEPT, _ROWS // len(data.training))), seed)
 
     def loss(self, batch: Batch, device: torch.device) -> dict[str, Tensor]:
         pixels, preferences, first, second, truth = (each.to(device) for each in batch)
-        sides = self.borders(pixels, preferences, first, second).float()
+        sides = self.network(pixels, preferences, first, second).float()
         own, other = truth == first[:, None], truth == second[:, None]
         entropy = functional.binary_cross_entropy_with_logits(sides, own.to(sides.dtype), reduction="none")
         known = own | other
         return {"side": (entropy * known).sum() / known.sum().clamp(min=1)}
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:
-        device, count = next(network.parameters()).device, len(self.data.classes)
+        count = len(self.data.classes)
 
         def answer(blocks: Blocks) -> NDArray[np.float32]:
-            given = (torch.from_numpy(np.array(blocks.pixels)), torch.from_numpy(blocks.preferences))
-            classes = (torch.from_numpy(each.astype(np.int64)) for each in (blocks.first, blocks.second))
-            with torch.inference_mode():
-                found: NDArray[np.float32] = network(*(each.to(device) for each in (*given, *classes))).cpu().numpy()
-            return found
+            first, second = (each.astype(np.int64) for each in (blocks.first, blocks.second))
+            return answered(network, np.array(blocks.pixels), blocks.preferences, first, second)
 
         before, after = (np.zeros((count, count + 1), np.int64) for _ in range(2))
         for image in self.data.validation:
@@ -127,13 +86,6 @@ class BorderTask:
         return {"score": score, "miou": score, "miou_before": mean_iou(before)}
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
-        """Writes this network alone; `attach_second` puts it into the segmenter's file."""
-        described = {
-            "kind": KIND,
-            "classes": list(self.data.classes),
-            "training_images": len(self.data.training),
-            **facts,
-        }
         examples = {
             "pixels": torch.zeros(2, SEEN, SEEN, 3, dtype=torch.uint8),
             "preferences": torch.zeros(2, SEEN // GRAIN, SEEN // GRAIN),
@@ -141,24 +93,25 @@ class BorderTask:
             "second": torch.zeros(2, dtype=torch.int64),
         }
         assert isinstance(network, BorderNetwork)
-        export_rows(DeployedBorders(network), examples, ["sides"], described, file)
+        self._write(DeployedBorders(network), examples, {}, facts, file)
+
+    def _varied(self, rows: Columns, rng: np.random.Generator) -> Columns:
+        pixels, preferences, first, second, truth = rows
+        if rng.random() < self.variation.flip:
+            pixels, preferences, truth = pixels[:, :, ::-1], preferences[:, :, ::-1], truth[:, :, ::-1]
+        seen = recolored(np.ascontiguousarray(pixels).reshape(-1, SEEN, 3), self.variation, rng)
+        return seen.reshape(-1, SEEN, SEEN, 3), preferences, first, second, truth
+
+    def _batch(self, columns: list[Tensor], rngs: list[np.random.Generator]) -> Batch:
+        pixels, preferences, first, second, truth = columns
+        return pixels, preferences.float(), first.long(), second.long(), truth.flatten(1)
 
     def _scores(self, pixels: NDArray[np.uint8]) -> tuple[Fit, NDArray[np.uint8]]:
         fit = Fit.plan("letterbox", (pixels.shape[1], pixels.shape[0]), self._first.size)
         return fit, self._first.run(fit.apply(pixels))[0][0]
 
-    def _gathered(self, rng: np.random.Generator) -> tuple[NDArray[Any], ...]:
-        """Blocks of all images in random order, by column, with the true class (4, 4) of each."""
-        images = self.data.training
-        most = max(_CHUNK, min(_KEPT, _ROWS // len(images)))
-        parts = [self._of_image(image, most, rng) for image in images]
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        if not len(columns[0]):
-            raise TrainingFileError(f"{self.file} sees no border between two classes in any of {len(images)} images")
-        order = rng.permutation(len(columns[0]))
-        return tuple(column[order] for column in columns)
-
-    def _of_image(self, image: MaskedImage, most: int, rng: np.random.Generator) -> Sequence[NDArray[Any]]:
+    def _of_image(self, image: MaskedImage, most: int, rng: np.random.Generator) -> Columns:
+        """Blocks of an image, with the true class (4, 4) of each pixel."""
         pixels, mask = image.read(len(self.data.classes))
         fit, scores = self._scores(pixels)
         shown, placed = worked(pixels, fit)

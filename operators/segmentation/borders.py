@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -16,10 +15,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from operators.detection.fit import Fit
-from operators.weights import Network, NetworkFileError, open_second
-
-if TYPE_CHECKING:
-    import onnxruntime
+from operators.weights import Network, SecondNetwork, open_second
 
 KIND = "borders"
 BLOCK, AROUND = 4, 4
@@ -53,39 +49,29 @@ class Blocks:
 
 
 class Borders:
-    """The network that looks again. Raises NetworkFileError where its file has other inputs.
+    """The network that looks again. Raises NetworkFileError where it has other inputs.
 
     Method: decide again only where the answer is unsure, at the image's resolution: Kirillov et al., "PointRend:
     Image segmentation as rendering", 2020; here for blocks, and between two classes.
     """
 
-    def __init__(self, session: onnxruntime.InferenceSession, told: str) -> None:
-        self._session = session
-        shapes = {each.name: (each.type, list(each.shape[1:])) for each in session.get_inputs()}
+    def __init__(self, second: SecondNetwork) -> None:
         count = SEEN // GRAIN
-        wanted = {
-            "pixels": ("tensor(uint8)", [SEEN, SEEN, 3]),
-            "preferences": ("tensor(float)", [count, count]),
-            "first": ("tensor(int64)", []),
-            "second": ("tensor(int64)", []),
-        }
-        if shapes != wanted:
-            raise NetworkFileError(f"{told} must have the inputs {wanted}, has {shapes}")
+        second.expect(
+            {
+                "pixels": ("tensor(uint8)", [SEEN, SEEN, 3]),
+                "preferences": ("tensor(float)", [count, count]),
+                "first": ("tensor(int64)", []),
+                "second": ("tensor(int64)", []),
+            }
+        )
+        self._second = second
 
     @classmethod
     def within(cls, network: Network) -> Borders | None:
         """The second network in a segmenter's file; None where it has none. Raises NetworkFileError."""
-        second = open_second(network)
-        if second is None:
-            return None
-        facts, session = second
-        told = f"the second network in {network.file}"
-        if facts["kind"] != KIND or tuple(facts["classes"]) != network.classes:
-            raise NetworkFileError(
-                f"{told} must be one for borders of the classes {network.classes}; it is a {facts['kind']} of "
-                f"{facts['classes']}"
-            )
-        return cls(session, told)
+        second = open_second(network, KIND)
+        return None if second is None else cls(second)
 
     def classes(self, scores: Pixels, step: float, pixels: Pixels, fit: Fit) -> Pixels:
         """The class (H, W) of each pixel of an image (H, W, 3), RGB, by the scores (C, h, w), of so much each, that the
@@ -93,14 +79,14 @@ class Borders:
         return look_again(self._answer, scores, step, pixels, fit)
 
     def _answer(self, blocks: Blocks) -> NDArray[np.float32]:
-        given = {
-            "pixels": blocks.pixels,
-            "preferences": blocks.preferences,
-            "first": blocks.first.astype(np.int64),
-            "second": blocks.second.astype(np.int64),
-        }
-        found: NDArray[np.float32] = self._session.run(["sides"], given)[0]
-        return found
+        return self._second.sides(
+            {
+                "pixels": blocks.pixels,
+                "preferences": blocks.preferences,
+                "first": blocks.first.astype(np.int64),
+                "second": blocks.second.astype(np.int64),
+            }
+        )
 
 
 def look_again(

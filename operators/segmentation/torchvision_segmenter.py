@@ -22,7 +22,7 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
 class _Segmentation(Operator, abstract=True):
-    """What both operators share: the model, its parameters, and maps of images of one size."""
+    """Holds what both operators share: the model, its parameters, and maps of images of one size."""
 
     stateless = True
 

@@ -26,6 +26,7 @@ from operators.training.options import (
     Device,
     Epochs,
     Every,
+    Flip,
     Frozen,
     Initial,
     Overwrite,
@@ -39,8 +40,8 @@ from operators.training.options import (
     Workers,
 )
 from operators.training.people_commands import train_activity
-from operators.training.refining import BorderEpochs, RefinerEpochs, bordered, refined, train_borders, train_refiner
-from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data
+from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerEpochs, command_of, train_second
+from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
 from operators.training.torchvision_command import train_torchvision
 
 __all__ = ["evaluate", "train"]
@@ -59,8 +60,8 @@ train = typer.Typer(
 )
 train.command("activity")(train_activity)
 train.command("torchvision")(train_torchvision)
-train.command("refiner")(train_refiner)
-train.command("borders")(train_borders)
+for each in (REFINER, BORDERS):
+    train.command(each.kind)(command_of(each))
 
 
 @train.command("detector")
@@ -81,7 +82,7 @@ def train_detector(
     backbone_weights: Backbone = None,
     frozen_stride: Frozen = None,
     initial: Initial = None,
-    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    flip: Flip = True,
     variation: Strength = 1.0,
     refiner_epochs: RefinerEpochs = 8,
     evaluate_every: Every = 1,
@@ -106,7 +107,6 @@ def train_detector(
         keep_earlier(out, resume, overwrite)
         from operators.detection.custom.folder import read_detection_data
         from operators.detection.custom.training import DetectorTask
-        from operators.training.augmentation import Variation
         from operators.training.loop import Settings
 
         read = read_detection_data(data, seed)
@@ -116,7 +116,7 @@ def train_detector(
             input_size(size, [image.file for image in read.training[:20]]),
             seed=seed,
             width=width,
-            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
+            variation=variation_of(flip, variation),
             backbone=backbone_weights,
         )
         prepare(task, backbone_weights, frozen_stride, initial)
@@ -126,7 +126,7 @@ def train_detector(
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = run_task(task, settings, out, resume, json)
-        second = refined(read, out, settings, refiner_epochs, task.variation, resume, json)
+        second = train_second(REFINER, read, out, settings, refiner_epochs, task.variation, resume, json)
     report(outcome, "operators.detection:CustomDetector", json, seconds={"refiner": second})
 
 
@@ -145,7 +145,7 @@ def train_segmenter(
     backbone_weights: Backbone = None,
     frozen_stride: Frozen = None,
     initial: Initial = None,
-    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    flip: Flip = True,
     variation: Strength = 1.0,
     border_epochs: BorderEpochs = 10,
     evaluate_every: Every = 1,
@@ -167,7 +167,6 @@ def train_segmenter(
         keep_earlier(out, resume, overwrite)
         from operators.segmentation.dataset import read_segmentation_data
         from operators.segmentation.training import SegmenterTask
-        from operators.training.augmentation import Variation
         from operators.training.loop import Settings
 
         read = read_segmentation_data(data, seed)
@@ -176,7 +175,7 @@ def train_segmenter(
             input_size(size, [image.image for image in read.training[:20]]),
             seed=seed,
             width=width,
-            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
+            variation=variation_of(flip, variation),
             backbone=backbone_weights,
         )
         prepare(task, backbone_weights, frozen_stride, initial)
@@ -186,7 +185,7 @@ def train_segmenter(
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = run_task(task, settings, out, resume, json)
-        second = bordered(read, out, settings, border_epochs, task.variation, resume, json)
+        second = train_second(BORDERS, read, out, settings, border_epochs, task.variation, resume, json)
     report(outcome, "operators.segmentation:Segmenter", json, seconds={"borders": second})
 
 
@@ -203,7 +202,7 @@ def train_classifier(
     learning_rate: Rate = 1e-3,
     seed: Seed = 0,
     initial: Initial = None,
-    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    flip: Flip = True,
     variation: Strength = 1.0,
     evaluate_every: Every = 1,
     workers: Workers = 2,
@@ -226,7 +225,6 @@ def train_classifier(
         keep_earlier(out, resume, overwrite)
         from operators.recognition.dataset import read_classification_data
         from operators.recognition.training import ClassifierTask
-        from operators.training.augmentation import Variation
         from operators.training.backbone import start_from
         from operators.training.loop import Settings
 
@@ -235,7 +233,7 @@ def train_classifier(
             read,
             input_size(size, ()),
             seed=seed,
-            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
+            variation=variation_of(flip, variation),
             architecture="residual" if residual else "plain",
         )
         if initial is not None:
@@ -262,7 +260,7 @@ def train_pair(
     seed: Seed = 0,
     width: Width = 1.0,
     initial: Initial = None,
-    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    flip: Flip = True,
     variation: Strength = 1.0,
     refiner_epochs: RefinerEpochs = 8,
     border_epochs: BorderEpochs = 10,
@@ -288,7 +286,6 @@ def train_pair(
         keep_earlier(file, resume, overwrite)
         from operators.detection.custom.folder import read_detection_data
         from operators.segmentation.dataset import read_segmentation_data
-        from operators.training.augmentation import Variation
         from operators.training.loop import Settings
         from operators.training.pair import DETECTOR, SEGMENTER, PairTask
 
@@ -299,7 +296,7 @@ def train_pair(
             input_size(size, [image.file for image in boxes.training[:20]]),
             seed=seed,
             width=width,
-            variation=Variation(flip=0.5 if flip else 0.0).times(variation),
+            variation=variation_of(flip, variation),
         )
         prepare(task, None, 0, initial)
         tell_data(boxes.notes, len(boxes.training), len(boxes.validation), masks.classes, task.size, json)
@@ -308,8 +305,8 @@ def train_pair(
             device=device, bfloat16=bfloat16,
         )  # fmt: skip
         outcome = run_task(task, settings, file, resume, json)
-        refiner = refined(boxes, out / DETECTOR, settings, refiner_epochs, task.variation, resume, json)
-        borders = bordered(masks, out / SEGMENTER, settings, border_epochs, task.variation, resume, json)
+        refiner = train_second(REFINER, boxes, out / DETECTOR, settings, refiner_epochs, task.variation, resume, json)
+        borders = train_second(BORDERS, masks, out / SEGMENTER, settings, border_epochs, task.variation, resume, json)
     seconds = {"refiner": refiner, "borders": borders}
     report(outcome, "operators.detection:CustomDetector and operators.segmentation:Segmenter", json, seconds=seconds)
 

@@ -14,6 +14,7 @@ from operators.training.console import Data, Json, SplitSeed, Weights, friendly,
 from operators.training.graph_evaluation import evaluate_graph
 
 Sample = TypeVar("Sample")
+Everything = Annotated[bool, typer.Option("--all", help="Score on all images, not only those for validation.")]
 
 evaluate = typer.Typer(
     name="evaluate",
@@ -34,9 +35,7 @@ evaluate.command("graph")(evaluate_graph)
 def evaluate_detector(
     data: Data,
     weights: Weights,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Score on all images, not only those for validation.")
-    ] = False,
+    everything: Everything = False,
     seed: SplitSeed = None,
     json: Json = False,
 ) -> None:
@@ -74,9 +73,7 @@ def evaluate_detector(
 def evaluate_segmenter(
     data: Data,
     weights: Weights,
-    everything: Annotated[
-        bool, typer.Option("--all", help="Score on all images, not only those for validation.")
-    ] = False,
+    everything: Everything = False,
     seed: SplitSeed = None,
     json: Json = False,
 ) -> None:

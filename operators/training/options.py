@@ -38,6 +38,7 @@ Initial = Annotated[
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Go on from the checkpoint beside --out.")]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the files of an earlier training.")]
+Flip = Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")]
 Strength = Annotated[
     float, typer.Option("--variation", min=0, max=2, help="Strength of the random changes of training images.")
 ]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json as jsonlib
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -16,6 +16,7 @@ from operators.training.console import err_console, out_console, print_notes, sc
 if TYPE_CHECKING:
     from torch import nn
 
+    from operators.training.augmentation import Variation
     from operators.training.backbone import Backbone as Extractor
     from operators.training.loop import Outcome, Settings, Task
 
@@ -41,6 +42,13 @@ class FineTuned(Protocol):
     @property
     def backbone(self) -> Extractor: ...
     def begin_with(self, file: Path) -> None: ...
+
+
+def variation_of(flip: bool, strength: float) -> Variation:
+    """The random changes of training images, of so much strength."""
+    from operators.training.augmentation import Variation
+
+    return Variation(flip=0.5 if flip else 0.0).times(strength)
 
 
 def prepare(task: FineTuned, weights: Path | None, frozen_stride: int | None, initial: Path | None) -> None:
@@ -84,14 +92,17 @@ def report(
         told = {"weights": str(outcome.file), "checkpoint": str(outcome.checkpoint), **told_of(outcome)}
         typer.echo(jsonlib.dumps(told | {kind: told_of(second) for kind, second in trained.items()}))
         return
-    file = escape(str(outcome.file))
-    out_console.print(
-        f"[green]{file}[/green]: {_scores(outcome)} in epoch {outcome.best_epoch}", highlight=False, soft_wrap=True
-    )
+    tell_scores(outcome.file, outcome)
     for kind, second in trained.items():
         out_console.print(f"with its {kind}: {_scores(second)}", highlight=False, soft_wrap=True)
-    given = params.format(file=file)
+    given = params.format(file=escape(str(outcome.file)))
     out_console.print(f"use it: `use: {operator}` with `params: {{{given}}}`", highlight=False, soft_wrap=True)
+
+
+def tell_scores(file: Path, outcome: Outcome) -> None:
+    """Prints the file that was written, and how well its best epoch did."""
+    told = f"[green]{escape(str(file))}[/green]: {_scores(outcome)} in epoch {outcome.best_epoch}"
+    out_console.print(told, highlight=False, soft_wrap=True)
 
 
 def told_of(outcome: Outcome) -> dict[str, object]:
@@ -130,7 +141,11 @@ def keep_earlier(out: Path, resume: bool, overwrite: bool, suffix: str = ".onnx"
     """Keeps an earlier training from being lost."""
     if out.suffix != suffix:
         raise ValueError(f"--out {str(out)!r} should end in {suffix}")
-    checkpoint = out.with_suffix(".pt")
-    there = [str(file) for file in (out, checkpoint) if file.exists()]
+    keep_files((out, out.with_suffix(".pt")), resume, overwrite)
+
+
+def keep_files(files: Iterable[Path], resume: bool, overwrite: bool) -> None:
+    """Raises FileExistsError where files of an earlier training would be lost."""
+    there = [str(file) for file in files if file.exists()]
     if there and not (resume or overwrite):
         raise FileExistsError(f"{' and '.join(there)} exist already: give --resume, --overwrite or another --out")

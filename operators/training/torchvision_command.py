@@ -13,6 +13,7 @@ from operators.training.options import (
     Bfloat16,
     Device,
     Every,
+    Flip,
     Overwrite,
     Rate,
     Resume,
@@ -21,7 +22,7 @@ from operators.training.options import (
     Threads,
     Workers,
 )
-from operators.training.running import input_size, keep_earlier, report, run_task, tell_data
+from operators.training.running import input_size, keep_earlier, report, run_task, tell_data, variation_of
 
 if TYPE_CHECKING:
     from operators.training.augmentation import Variation
@@ -48,7 +49,7 @@ def train_torchvision(
     batch: Batch = 16,
     learning_rate: Rate = 1e-3,
     seed: Seed = 0,
-    flip: Annotated[bool, typer.Option(help="Mirror images: not where left and right differ, as in text.")] = True,
+    flip: Flip = True,
     variation: Strength = 1.0,
     evaluate_every: Every = 1,
     workers: Workers = 2,
@@ -75,11 +76,10 @@ def train_torchvision(
         if weights is not None and initial is not None:
             raise ValueError("give either --weights or --from: both are what to begin with")
         from operators.torch_models import cached_weights, family_of
-        from operators.training.augmentation import Variation
         from operators.training.loop import Settings
         from operators.training.torchvision_tasks import weights_in
 
-        changes = Variation(flip=0.5 if flip else 0.0).times(variation)
+        changes = variation_of(flip, variation)
         detects = family_of(name) == "detection"
         task = (_detector if detects else _segmenter)(name, data, size, seed, changes, json)
         if weights is not None or initial is not None:

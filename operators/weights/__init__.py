@@ -3,6 +3,7 @@
 from operators.weights.network_file import (
     Network,
     NetworkFileError,
+    SecondNetwork,
     facts_of,
     open_network,
     open_second,
@@ -14,6 +15,7 @@ from operators.weights.network_file import (
 __all__ = [
     "Network",
     "NetworkFileError",
+    "SecondNetwork",
     "facts_of",
     "open_network",
     "open_second",

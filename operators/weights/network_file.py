@@ -10,7 +10,7 @@ from __future__ import annotations
 import base64
 import binascii
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -75,10 +75,35 @@ def open_network(file: Path, kind: str) -> Network:
     return Network(file, size, tuple(map(str, facts["classes"])), facts, session)
 
 
-def open_second(network: Network) -> tuple[dict[str, Any], onnxruntime.InferenceSession] | None:
-    """The metadata and the session of the second network in a file; None where it has none.
+@dataclass(frozen=True, eq=False)
+class SecondNetwork:
+    """An opened second network. `told` says where it lies, `facts` is its whole metadata."""
 
-    Raises NetworkFileError for one that cannot be read.
+    told: str
+    facts: dict[str, Any]
+    session: onnxruntime.InferenceSession
+
+    @property
+    def inputs(self) -> dict[str, tuple[str, list[int]]]:
+        """The type and the shape of a row of each input, by name."""
+        return {each.name: (each.type, list(each.shape[1:])) for each in self.session.get_inputs()}
+
+    def expect(self, inputs: Mapping[str, tuple[str, list[int]]]) -> None:
+        """Raises NetworkFileError where it has other inputs."""
+        if self.inputs != inputs:
+            raise NetworkFileError(f"{self.told} must have the inputs {inputs}, has {self.inputs}")
+
+    def sides(self, given: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+        """The answer (N, ...) to N rows of each input."""
+        found: NDArray[np.float32] = self.session.run(["sides"], dict(given))[0]
+        return found
+
+
+def open_second(network: Network, kind: str, needed: Sequence[str] = ()) -> SecondNetwork | None:
+    """Opens the second network in a file; None where it has none.
+
+    Raises NetworkFileError for one that cannot be read, is of another kind or of other classes than the first, or whose
+    metadata lack what is needed.
     """
     text = network.session.get_modelmeta().custom_metadata_map.get(SECOND)
     if text is None:
@@ -89,7 +114,13 @@ def open_second(network: Network) -> tuple[dict[str, Any], onnxruntime.Inference
     except (binascii.Error, ValueError) as error:
         raise NetworkFileError(f"{told} (metadata {SECOND!r}) is not base64: {error}") from None
     session = open_content(content, told)
-    return _facts_of(told, session, ("kind", "classes")), session
+    facts = _facts_of(told, session, ("kind", "classes"))
+    if facts["kind"] != kind or tuple(facts["classes"]) != network.classes:
+        raise NetworkFileError(
+            f"{told} must be of the kind {kind} and of the classes {', '.join(network.classes)}; it is of the kind "
+            f"{facts['kind']} and of the classes {', '.join(map(str, facts['classes']))}"
+        )
+    return SecondNetwork(told, _facts_of(told, session, needed), session)
 
 
 def read_facts(file: Path) -> dict[str, Any]:

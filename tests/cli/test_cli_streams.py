@@ -10,12 +10,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from rich.text import Text
 
 from dataflow.cli import output
-from dataflow.cli.output import print_json, visible
+from dataflow.cli.output import print_json
 
 PACKAGE = Path(__file__).resolve().parents[2]
 START = [sys.executable, "-P", "-m", "dataflow.cli.start"]
@@ -121,16 +119,6 @@ def test_control_characters_never_reach_a_terminal(monkeypatch: pytest.MonkeyPat
     assert not any(ord(c) < 32 and c != "\n" for c in told)
     assert not set(told) & {"\x9b", "\u202e", "\udc80"}
     assert told.count("\\x1b[2J") >= 2
-
-
-@given(st.text())
-def test_what_can_be_seen_is_left_as_it_is(text: str) -> None:
-    seen = visible(text)
-
-    assert visible(seen) == seen
-    assert seen.encode().decode() == seen
-    if text.isprintable():
-        assert seen == text
 
 
 def test_names_in_a_recording_are_shown_without_their_escapes(dataflow, tmp_path: Path) -> None:

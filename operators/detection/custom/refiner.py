@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +13,7 @@ from operators.detection.custom.first_look import Looked
 from operators.detection.custom.surroundings import surroundings
 from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms
-from operators.weights import Network, NetworkFileError, open_second
-
-if TYPE_CHECKING:
-    import onnxruntime
+from operators.weights import Network, SecondNetwork, open_second
 
 KIND = "refiner"
 INT8, DEQUANTIZED = "int8", "_DequantizeLinear_Output"
@@ -45,35 +41,25 @@ class Refiner:
     Vasconcelos, "Cascade R-CNN", 2018: a second regression, from the boxes of the first.
     """
 
-    def __init__(self, facts: dict[str, Any], session: onnxruntime.InferenceSession, network: Network) -> None:
-        classes, side = len(facts["classes"]), int(facts["side"])
-        self.look = Look(classes, side, float(facts["least_score"]), int(facts["most_boxes"]))
+    def __init__(self, second: SecondNetwork, network: Network) -> None:
+        facts, side = second.facts, int(second.facts["side"])
+        self.look = Look(len(facts["classes"]), side, float(facts["least_score"]), int(facts["most_boxes"]))
         self.maps = inner_names(network, facts["maps"])
-        self._session = session
-        shapes = {each.name: (each.type, list(each.shape[1:])) for each in session.get_inputs()}
-        self._surroundings = shapes.get("surroundings", ("", [0]))[1]
-        wanted = {
-            "closeups": ("tensor(uint8)", [side, side, 3]),
-            "surroundings": ("tensor(float)", self._surroundings),
-            "places": ("tensor(float)", [numbers(classes)]),
-        }
-        if shapes != wanted:
-            raise NetworkFileError(f"the second network in {network.file} must have the inputs {wanted}, has {shapes}")
+        self._second = second
+        around = second.inputs.get("surroundings", ("", [0]))[1]
+        second.expect(
+            {
+                "closeups": ("tensor(uint8)", [side, side, 3]),
+                "surroundings": ("tensor(float)", around),
+                "places": ("tensor(float)", [numbers(self.look.classes)]),
+            }
+        )
 
     @classmethod
     def within(cls, network: Network) -> Refiner | None:
         """The refiner in a detector's file; None where it has none. Raises NetworkFileError."""
-        second = open_second(network)
-        if second is None:
-            return None
-        facts, session = second
-        lacking = [name for name in ("side", "least_score", "most_boxes", "maps") if name not in facts]
-        if facts["kind"] != KIND or lacking or tuple(facts["classes"]) != network.classes:
-            raise NetworkFileError(
-                f"the second network in {network.file} must be a refiner of the classes {network.classes}; it is a "
-                f"{facts['kind']} of {facts['classes']}" + (f" without {', '.join(lacking)}" if lacking else "")
-            )
-        return cls(facts, session, network)
+        second = open_second(network, KIND, ("side", "least_score", "most_boxes", "maps"))
+        return None if second is None else cls(second, network)
 
     def refined(self, pixels: NDArray[np.uint8], looked: Looked, nms_iou: float) -> Candidates:
         """The boxes in the pixels of an image (H, W, 3), RGB, after a second look, by falling score.
@@ -87,9 +73,7 @@ class Refiner:
     def _answer(
         self, seen: NDArray[np.uint8], around: NDArray[np.float32], known: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        given = {"closeups": seen, "surroundings": around, "places": known}
-        sides: NDArray[np.float32] = self._session.run(["sides"], given)[0]
-        return sides
+        return self._second.sides({"closeups": seen, "surroundings": around, "places": known})
 
 
 def inner_names(network: Network, names: Sequence[str]) -> list[str]:

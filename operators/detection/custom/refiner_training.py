@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,8 @@ from operators.detection.custom.refiner_network import RefinerNetwork
 from operators.detection.custom.surroundings import surroundings
 from operators.detection.nms import intersection_over_union
 from operators.training.augmentation import Variation, recolored
-from operators.training.export import export_rows, without_second
 from operators.training.files import TrainingFileError
+from operators.training.second import Columns, SecondTask, answered
 from operators.weights import open_network
 
 SIDE = 48
@@ -37,8 +37,6 @@ _JITTER, _ASTRAY = 0.05, 0.12
 """Standard deviations by which sides of found boxes and of true ones are moved, as shares of the box's size."""
 _ROWS, _SHOWN = 100_000, 150
 """Boxes that are kept to learn from, of all images and of one, at most: they stay in memory, 17 kB each."""
-_CHUNK = 32
-"""Boxes that are varied alike and stay together: one sample of the training loop."""
 _STRIDES = (8, 16)
 _HEAD = re.compile(r"/heads\.(\d+)/")
 
@@ -55,59 +53,32 @@ class Batch:
     wanted: Tensor
 
 
-class RefinerTask:
+class RefinerTask(SecondTask[LabelledImage, Batch]):
     """Trains a refiner for the detector in `file` on labelled images."""
 
-    kind = KIND
+    kind, first, chunk = KIND, "detector", 32
 
     def __init__(
         self, data: DetectionData, file: Path, *, seed: int = 0, variation: Variation | None = None, side: int = SIDE
     ) -> None:
-        torch.manual_seed(seed)
-        self.data, self.file, self.side = data, file, side
-        self.variation = Variation() if variation is None else variation
         self._first = FirstLook(file)
         network = self._first.network
-        if network.classes != data.classes:
-            raise TrainingFileError(
-                f"{file} finds {', '.join(network.classes)}; the data have {', '.join(data.classes)}"
-            )
+        super().__init__(data, file, network.classes, seed, variation)
+        self.side = side
         self._maps = maps_of(file)
         self._first.reveal(inner_names(network, self._maps))
         self._again = Look(len(data.classes), side, LEAST, MOST)
-        self._rows = self._gathered(np.random.default_rng(seed))
-        self.refiner = RefinerNetwork(len(data.classes), side, self._rows[1].shape[1])
-
-    @property
-    def network(self) -> nn.Module:
-        return self.refiner
-
-    @property
-    def samples(self) -> int:
-        return max(1, len(self._rows[0]) // _CHUNK)
+        self._gather(max(1, min(_SHOWN, _ROWS // len(data.training))), seed)
+        self._around = self._rows[1].shape[1]
+        self.network = RefinerNetwork(len(data.classes), side, self._around)
 
     def description(self) -> dict[str, Any]:
-        return {
-            "classes": list(self.data.classes),
-            "side": self.side,
-            "images": len(self.data.training),
-            "detector": hashlib.sha256(without_second(self.file)).hexdigest(),
-        }
-
-    def batch(self, samples: list[int], rngs: list[np.random.Generator]) -> Batch:
-        parts = []
-        for k, rng in zip(samples, rngs, strict=True):
-            seen, *others = (column[k * _CHUNK : (k + 1) * _CHUNK] for column in self._rows)
-            varied = recolored(seen.reshape(-1, self.side, 3), self.variation, rng).reshape(seen.shape)
-            parts.append((varied, *others))
-        seed = int(rngs[0].integers(1 << 31))
-        columns = [torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)]
-        return Batch(seed, *columns)
+        return {**super().description(), "side": self.side}
 
     def loss(self, batch: Batch, device: torch.device) -> dict[str, Tensor]:
         torch.manual_seed(batch.seed)  # of what is left out
         given = (batch.closeups, batch.surroundings.float(), batch.places)
-        sides = self.refiner(*(each.to(device) for each in given)).float()
+        sides = self.network(*(each.to(device) for each in given)).float()
         boxes, wanted = batch.boxes.to(device), batch.wanted.to(device)
         extent = _twice((boxes[:, 2:] - boxes[:, :2]) * (1 + 2 * MARGIN) + 2 * PIXELS)
         overlap = complete_iou(boxes + sides * extent, wanted)
@@ -115,22 +86,15 @@ class RefinerTask:
         return {"overlap": (1 - overlap).mean(), "sides": 2 * apart.mean()}
 
     def evaluate(self, network: nn.Module) -> dict[str, float]:
-        device = next(network.parameters()).device
-
-        def answer(*given: NDArray[Any]) -> NDArray[np.float32]:
-            with torch.inference_mode():
-                found: NDArray[np.float32] = (
-                    network(*(torch.from_numpy(each).to(device) for each in given)).cpu().numpy()
-                )
-            return found
-
         before, after = [], []
         for image in self.data.validation:
             pixels = image.read()
             truth = (image.boxes * _extent(pixels), image.classes, image.ignored)
             looked = self._first.look(pixels, *_SCORING)
             before.append(ScoredImage(*truth, looked.found))
-            after.append(ScoredImage(*truth, look_again(answer, pixels, looked, self._again, _SCORING[1])))
+            after.append(
+                ScoredImage(*truth, look_again(partial(answered, network), pixels, looked, self._again, _SCORING[1]))
+            )
         first, second = (score_detections(each, self.data.classes) for each in (before, after))
         return {
             "score": second.ap,
@@ -141,37 +105,22 @@ class RefinerTask:
         }
 
     def export(self, network: nn.Module, facts: Mapping[str, Any], file: Path) -> None:
-        """Writes the refiner alone; `attach_second` puts it into the detector's file."""
-        classes = list(self.data.classes)
-        described = {
-            "kind": KIND,
-            "classes": classes,
-            "side": self.side,
-            "least_score": LEAST,
-            "most_boxes": MOST,
-            "maps": list(self._maps),
-            "training_images": len(self.data.training),
-            **facts,
-        }
+        own = {"side": self.side, "least_score": LEAST, "most_boxes": MOST, "maps": list(self._maps)}
         examples = {
             "closeups": torch.zeros(2, self.side, self.side, 3, dtype=torch.uint8),
-            "surroundings": torch.zeros(2, self._rows[1].shape[1]),
-            "places": torch.zeros(2, numbers(len(classes))),
+            "surroundings": torch.zeros(2, self._around),
+            "places": torch.zeros(2, numbers(len(self.data.classes))),
         }
-        export_rows(network, examples, ["sides"], described, file)
+        self._write(network, examples, own, facts, file)
 
-    def _gathered(self, rng: np.random.Generator) -> tuple[NDArray[Any], ...]:
-        """Rows of all images, some of them mirrored, in random order, by column."""
-        images = self.data.training
-        most = max(1, min(_SHOWN, _ROWS // len(images)))
-        parts = [self._shown(image, most, rng) for image in images]
-        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
-        if not len(columns[0]):
-            raise TrainingFileError(f"none of {len(images)} images shows an object to learn from")
-        order = rng.permutation(len(columns[0]))
-        return tuple(column[order] for column in columns)
+    def _varied(self, rows: Columns, rng: np.random.Generator) -> Columns:
+        seen, *others = rows
+        return (recolored(seen.reshape(-1, self.side, 3), self.variation, rng).reshape(seen.shape), *others)
 
-    def _shown(self, image: LabelledImage, most: int, rng: np.random.Generator) -> tuple[NDArray[Any], ...]:
+    def _batch(self, columns: list[Tensor], rngs: list[np.random.Generator]) -> Batch:
+        return Batch(int(rngs[0].integers(1 << 31)), *columns)
+
+    def _of_image(self, image: LabelledImage, most: int, rng: np.random.Generator) -> Columns:
         """A row for each of some boxes of an image that have an object: found ones, as they are and led astray, and
         true ones led astray."""
         pixels = image.read()

@@ -304,12 +304,14 @@ def test_a_second_network_that_does_not_fit_is_refused(refined: Refined, tmp_pat
         with pytest.raises(ValueError, match=fault):
             CustomDetector(weights=str(tmp_path / "spoiled.onnx")).setup()
     attach_second(plain, plain, tmp_path / "twice.onnx")
-    with pytest.raises(NetworkFileError, match=r"must be a refiner of the classes .* it is a detector"):
+    with pytest.raises(
+        NetworkFileError, match=r"must be of the kind refiner and of the classes .* it is of the kind detector"
+    ):
         CustomDetector(weights=str(tmp_path / "twice.onnx")).setup()
     other, refiner = untrained(tmp_path, ("crate", "ball", "lamp")), tmp_path / "refiner.onnx"
     refiner.write_bytes(base64.b64decode(kept["dataflow.second"]))
     attach_second(other, refiner, tmp_path / "o.onnx")
-    with pytest.raises(NetworkFileError, match=r"must be a refiner of the classes .*lamp"):
+    with pytest.raises(NetworkFileError, match=r"must be of the kind refiner .*lamp"):
         CustomDetector(weights=str(tmp_path / "o.onnx")).setup()
 
 
@@ -377,7 +379,7 @@ def test_a_refiner_is_not_trained_for_other_classes_nor_resumed_for_another_dete
 ) -> None:
     plain, _, data = refined
     other = untrained(tmp_path, ("crate", "ball", "lamp"))
-    with pytest.raises(TrainingFileError, match=r"finds crate, ball, lamp; the data have crate, ball"):
+    with pytest.raises(TrainingFileError, match=r"knows crate, ball, lamp; the data have crate, ball"):
         RefinerTask(data, other)
     few = DetectionData(data.classes, data.training[:4], data.validation)
     own = Settings(epochs=1, batch=4, threads=1)

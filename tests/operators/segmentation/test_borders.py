@@ -239,7 +239,9 @@ def test_a_second_network_that_does_not_fit_is_refused(
 ) -> None:
     plain, _, _ = files
     attach_second(plain, plain, tmp_path / "twice.onnx")
-    with pytest.raises(NetworkFileError, match=r"must be one for borders of the classes .* it is a segmenter"):
+    with pytest.raises(
+        NetworkFileError, match=r"must be of the kind borders and of the classes .* it is of the kind segmenter"
+    ):
         Segmenter(weights=str(tmp_path / "twice.onnx")).setup()
 
 

@@ -1,0 +1,36 @@
+"""Text that somebody else wrote, made fit for a terminal."""
+
+from __future__ import annotations
+
+import json
+import re
+import unicodedata
+from collections.abc import Callable
+
+_HIDDEN = frozenset(("Cc", "Cf", "Cs", "Zl", "Zp"))
+"""Unicode categories: control, format (such as a change of direction), surrogate, line and paragraph separator."""
+_WITHIN_LINES = re.compile(r"[^\t\n]+")
+
+
+def visible(text: str) -> str:
+    """`text` with every character that a terminal would obey instead of show as its escape, such as `\\x1b`.
+
+    Line breaks and tabs are among them, so that a name cannot pass for a line of its own.
+    """
+    return _spelled(text, lambda c: c.encode("unicode_escape", "surrogatepass").decode("ascii"))
+
+
+def visible_lines(text: str) -> str:
+    """`text` of several lines, each of them `visible`; line feeds and tabs stay."""
+    return _WITHIN_LINES.sub(lambda line: visible(line[0]), text)
+
+
+def visible_json(text: str) -> str:
+    """A JSON document, in which JSON's own escapes stand for what `visible` would replace; line feeds stay."""
+    return _WITHIN_LINES.sub(lambda line: _spelled(line[0], lambda c: json.dumps(c)[1:-1]), text)
+
+
+def _spelled(text: str, spell: Callable[[str], str]) -> str:
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(spell(c) if unicodedata.category(c) in _HIDDEN else c for c in text)
