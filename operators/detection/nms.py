@@ -10,11 +10,13 @@ from numpy.typing import NDArray
 
 Boxes = NDArray[np.float32]
 """(N, 4) corners x1, y1, x2, y2."""
+_CELLS = 4096  # overlaps that are taken at once
+_NONE = np.zeros(0, np.int64)
 
 
 def intersection_over_union(box: Boxes, boxes: Boxes) -> NDArray[np.float32]:
     """IoU (N,) of one box (4,) with boxes (N, 4); 0 where the union has no area."""
-    return _overlaps(box, _areas(box[None]), boxes, _areas(boxes))
+    return _overlaps(box[None], _areas(box[None]), boxes, _areas(boxes))[0]
 
 
 def class_wise_nms(
@@ -52,25 +54,41 @@ def merging_nms(
 def _rounds(
     boxes: Boxes, scores: NDArray[np.float32], classes: NDArray[np.int32], iou_threshold: float
 ) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float32]]]:
-    """Each box that is kept, the boxes that it suppresses, and how much they overlap it."""
+    """Each box that is kept, the boxes that it suppresses, and how much they overlap it.
+
+    Overlaps are taken of several boxes with all that are left at once: of the more, the fewer are left.
+    """
     order = np.lexsort((boxes[:, 3], boxes[:, 2], boxes[:, 1], boxes[:, 0], classes, -scores))
-    boxes, classes, areas = boxes[order], classes[order], _areas(boxes)[order]
-    left = np.arange(len(order))
-    while left.size:
-        best, rest = left[0], left[1:]
-        overlaps = _overlaps(boxes[best], areas[best], boxes[rest], areas[rest])
-        drop = (overlaps > iou_threshold) & (classes[rest] == classes[best])
-        yield int(order[best]), order[rest[drop]], overlaps[drop]
-        left = rest[~drop]
+    boxes, classes = boxes[order], classes[order]
+    areas = _areas(boxes)
+    while order.size:
+        first = max(1, _CELLS // order.size)
+        overlaps = _overlaps(boxes[:first], areas[:first], boxes, areas)
+        over = (overlaps > iou_threshold) & (classes[:first, None] == classes)
+        np.fill_diagonal(over, False)
+        stays = np.ones(order.size, np.bool_)
+        for k, drops in enumerate(over.any(axis=1).tolist()):
+            if not stays[k]:
+                continue
+            dropped = _NONE
+            if drops:
+                dropped = (over[k, k + 1 :] & stays[k + 1 :]).nonzero()[0] + (k + 1)
+                stays[dropped] = False
+            yield int(order[k]), order[dropped], overlaps[k, dropped]
+        stays[:first] = False
+        left = stays.nonzero()[0]
+        order, boxes, classes, areas = order[left], boxes[left], classes[left], areas[left]
 
 
 def _overlaps(
-    box: Boxes, area: NDArray[np.float32] | np.float32, boxes: Boxes, areas: NDArray[np.float32]
+    some: Boxes, areas_of_some: NDArray[np.float32], boxes: Boxes, areas: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    corner = np.minimum(box[2:], boxes[:, 2:]) - np.maximum(box[:2], boxes[:, :2])
-    np.maximum(corner, 0, out=corner)
-    intersection = corner[:, 0] * corner[:, 1]
-    union = area + areas - intersection
+    """IoU (M, N) of boxes (M, 4) with boxes (N, 4)."""
+    x1, y1, x2, y2 = some.T[:, :, None]
+    left, top, right, bottom = np.ascontiguousarray(boxes.T)
+    width, height = np.minimum(x2, right) - np.maximum(x1, left), np.minimum(y2, bottom) - np.maximum(y1, top)
+    intersection = np.maximum(width, 0) * np.maximum(height, 0)
+    union = areas_of_some[:, None] + areas - intersection
     iou: NDArray[np.float32] = np.divide(intersection, union, out=np.zeros_like(union), where=union > 0)
     return iou
 
