@@ -16,7 +16,8 @@ _NONE = np.zeros(0, np.int64)
 
 def intersection_over_union(box: Boxes, boxes: Boxes) -> NDArray[np.float32]:
     """IoU (N,) of one box (4,) with boxes (N, 4); 0 where the union has no area."""
-    return _overlaps(box[None], _areas(box[None]), boxes, _areas(boxes))[0]
+    iou: NDArray[np.float32] = _overlaps(box[None], _areas(box[None]), boxes, _areas(boxes))[0]
+    return iou
 
 
 def class_wise_nms(

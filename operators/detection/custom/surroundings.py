@@ -13,6 +13,8 @@ F32 = NDArray[np.float32]
 GRID = 6
 """Samples along each side of a window."""
 _LEVELS = 3
+_TOGETHER = 8  # windows whose samples stay in the processor's cache
+Samples = NDArray[np.float64]
 
 
 def surroundings(maps: Sequence[F32], seen: F32, fit: Fit) -> F32:
@@ -29,19 +31,17 @@ def _sampled(map: F32, seen: F32, size: tuple[int, int]) -> F32:
     channels, _, width = map.shape
     stride = size[0] / width
     apart = np.sqrt(np.maximum(np.prod(seen[:, 2:] - seen[:, :2], axis=1), 1e-6)) / GRID / stride
-    level = np.clip(np.log2(np.maximum(apart, 1)).astype(int), 0, _LEVELS - 1)
+    deepest = sum(min(map.shape[1:]) >> k >= 4 for k in range(_LEVELS - 1))
+    level = np.clip(np.log2(np.maximum(apart, 1)).astype(int), 0, deepest)
     found = np.empty((len(seen), GRID * GRID * channels), np.float32)
     cells = np.ascontiguousarray(map.transpose(1, 2, 0))
-    for k in range(_LEVELS):
+    for k in range(int(level.max(initial=0)) + 1):
+        if k:
+            even = cells[: cells.shape[0] // 2 * 2, : cells.shape[1] // 2 * 2]
+            cells = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2, channels).mean(axis=(1, 3))
         rows = np.flatnonzero(level == k)
         if len(rows):
             found[rows] = _bilinear(cells, seen[rows] / np.float32(stride * 2**k)).reshape(len(rows), -1)
-        if k + 1 < _LEVELS:
-            if min(cells.shape[:2]) < 4:
-                level = np.minimum(level, k)
-                continue
-            even = cells[: cells.shape[0] // 2 * 2, : cells.shape[1] // 2 * 2]
-            cells = even.reshape(even.shape[0] // 2, 2, even.shape[1] // 2, 2, channels).mean(axis=(1, 3))
     return found
 
 
@@ -56,6 +56,18 @@ def _bilinear(cells: F32, seen: F32) -> F32:
     at = top[:, :, None] * width + left[:, None, :]
     flat = cells.reshape(-1, channels)
     right, below = int(width > 1), width * int(height > 1)
-    upper = (1 - u) * flat[at] + u * flat[at + right]
-    lower = (1 - u) * flat[at + below] + u * flat[at + below + right]
-    return np.asarray((1 - v) * upper + v * lower, np.float32)
+    found = np.empty((*at.shape, channels), np.float32)
+    for k in range(0, len(seen), _TOGETHER):
+        some = slice(k, k + _TOGETHER)
+        rows = [_between(flat, at[some] + down, at[some] + down + right, u[some]) for down in (0, below)]
+        rows[0] *= 1 - v[some]
+        rows[1] *= v[some]
+        np.add(rows[0], rows[1], out=found[some], casting="same_kind")
+    return found
+
+
+def _between(flat: F32, left: NDArray[np.intp], right: NDArray[np.intp], share: NDArray[np.float64]) -> Samples:
+    """Values (..., C) between two rows of `flat` (K, C) each."""
+    between: Samples = (1 - share) * flat.take(left, axis=0)
+    between += share * flat.take(right, axis=0)
+    return between
