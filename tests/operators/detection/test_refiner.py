@@ -231,12 +231,10 @@ def test_surroundings_of_any_window_lie_between_the_least_and_the_greatest_value
 
 
 def test_a_window_far_larger_than_a_small_map_has_samples_of_its_coarsest_cells() -> None:
-    """A map of 9 cells is halved once, then too small: the largest window takes what the halved one has."""
-    map = np.full((1, 2, 9, 9), 3.5, np.float32)
-    window = np.array([[-3000, -3000, 3000, 3000], [10, 10, 20, 20]], np.float32)
-    for _ in range(3):  # memory that was not written would hold what came before
-        np.full((2, GRID * GRID * 2), 77, np.float32)
-        assert (surroundings([map], window, Fit.plan("letterbox", (160, 96), (160, 96))) == 3.5).all()
+    """A map of 6 cells is halved once, then too small: the largest window takes what the halved one has."""
+    map, fit = np.full((1, 2, 6, 6), 3.5, np.float32), Fit.plan("letterbox", (160, 96), (160, 96))
+    seen = np.array([[-3000, -3000, 3000, 3000]] * 50 + [[10, 10, 20, 20]], np.float32)
+    assert (surroundings([map], seen, fit) == 3.5).all()
 
 
 # ---- the operator and its files
