@@ -128,7 +128,7 @@ class Cells:
     def sure(self, others: Sequence[Cells] = ()) -> Array:
         """Returns the points (N, 3) of the voxels that are not seen far less often than the others.
 
-        Those that `others` have too are theirs, unless nothing would be left.
+        Those that `others` have too are theirs, unless too few would be left.
         """
         if not len(self):
             return self.points

@@ -25,7 +25,7 @@ from operators.scene.matching import (
     in_places_of_their_own,
     outside,
 )
-from operators.scene.merging import are_one, may_be_one, merge
+from operators.scene.merging import are_one, may_be_one, merge, smaller_in_place
 from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
@@ -182,23 +182,10 @@ class ObjectMap:
             self._fit(object)
 
     def _fit(self, object: MapObject) -> None:
-        before = self._before(object) if object.images and self._kinds.is_large(object) else ()
-        object.fit(self._kinds.usual, self._heading, self._settings.range_noise, self.floor, before)
+        others = smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
+        object.fit(self._kinds.usual, self._heading, self._settings.range_noise, self.floor, others)
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)
-
-    def _before(self, object: MapObject) -> list[Cells]:
-        """Returns the voxels of smaller things that stand in the place of a large one: what shows of them is theirs."""
-        s, kinds = self._settings, self._kinds
-        return [
-            o.cells
-            for o in self.objects.values()
-            if o.class_id != object.class_id
-            and o.evidence >= s.confirm
-            and o.views >= s.views
-            and not (kinds.is_mover(o) or kinds.is_large(o))
-            and o.cells.apart(object.cells) < 0
-        ]
 
     def _has_left(self, object: MapObject, view: RangeView) -> bool:
         """Tells whether a view looks through the place of an object."""
