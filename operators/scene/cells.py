@@ -16,6 +16,7 @@ Keys = NDArray[np.int64]
 
 _HALF = 1 << 20
 _FEW = 4096  # pairs of places
+_LEAST = 20  # voxels that show where a thing is
 _WEIGHTS = np.array([1 << 42, 1 << 21, 1], np.int64)
 
 
@@ -124,13 +125,23 @@ class Cells:
         found[around] = np.isfinite(apart)
         return found
 
-    def sure(self) -> Array:
-        """Returns the points (N, 3) of the voxels that are not seen far less often than the others."""
+    def sure(self, others: Sequence[Cells] = ()) -> Array:
+        """Returns the points (N, 3) of the voxels that are not seen far less often than the others.
+
+        Those that `others` have too are theirs, unless too few would be left.
+        """
         if not len(self):
             return self.points
         least = 0.25 * _upper_quartile(self.hits)
         kept = (self.hits >= least) & (self.hits > self.free) & (self.hits >= self.other)
-        return self.points[kept] if kept.any() else self.points
+        if not kept.any():
+            return self.points
+        own = kept.copy()
+        for other in others:
+            if len(other):
+                place = np.minimum(np.searchsorted(other._keys, self._keys), len(other) - 1)
+                own &= other._keys[place] != self._keys
+        return self.points[own if np.count_nonzero(own) >= _LEAST else kept]
 
     @property
     def middle(self) -> Array:

@@ -118,14 +118,15 @@ class MapObject:
         heading: float | None = None,
         noise: float = 0.0,
         floor: float | None = None,
+        others: Sequence[Cells] = (),
     ) -> None:
-        """Puts the box around what is surely the object's, in agreement with its images and with its class.
+        """Puts the box around what is surely the object's and not `others`', in agreement with its images and class.
 
         `heading` is that of most things around, `noise` that of ranges at one metre; it grows by the square. How high
         it reaches over the `floor`, if that is known, tells which of the ways in which its class stands is its own.
         """
         self.fresh = 0
-        sure = self.cells.sure()
+        sure = self.cells.sure(others)
         if not len(sure):
             return
         sizes = [max(u.size) for u in usual.get(self.class_id, ())]

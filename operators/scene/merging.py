@@ -1,8 +1,8 @@
-"""Entries of the map that are of one thing, and what is made of them."""
+"""Entries of the map that are of one thing, what is made of them, and entries that stand in the place of others."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from operators.scene.box_overlap import shared_volume
 from operators.scene.cells import Cells
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MOST_EVIDENCE, MapObject
-from operators.scene.matching import closeness, tolerance
+from operators.scene.matching import MapSettings, closeness, tolerance
 
 _COVERED = 0.25  # share of the smaller of two boxes that both have, from which they are one
 _APART_COVERED = 0.5  # that share where both are seen beside each other
@@ -77,3 +77,21 @@ def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
     best.beside += other.beside
     best.born, best.id = min((a.born, a.id), (b.born, b.id))
     return best
+
+
+def smaller_in_place(object: MapObject, known: Iterable[MapObject], kinds: Kinds, s: MapSettings) -> list[Cells]:
+    """Returns the voxels of smaller things in the place of a large one that has images, as of a chair before a desk.
+
+    Masks give a part of such things to what is behind them. Only sure entries of other classes count.
+    """
+    if not (object.images and kinds.is_large(object)):
+        return []
+    return [
+        o.cells
+        for o in known
+        if o.class_id != object.class_id
+        and o.evidence >= s.confirm
+        and o.views >= s.views
+        and o.cells.apart(object.cells) <= s.voxel
+        and not (kinds.is_mover(o) or kinds.is_large(o))
+    ]

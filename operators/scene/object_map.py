@@ -25,7 +25,7 @@ from operators.scene.matching import (
     in_places_of_their_own,
     outside,
 )
-from operators.scene.merging import are_one, may_be_one, merge
+from operators.scene.merging import are_one, may_be_one, merge, smaller_in_place
 from operators.scene.range_view import RangeView, Sight
 from operators.tracking.assignment import assign
 
@@ -182,15 +182,15 @@ class ObjectMap:
             self._fit(object)
 
     def _fit(self, object: MapObject) -> None:
-        object.fit(self._kinds.usual, self._heading, self._settings.range_noise, self.floor)
+        s, others = self._settings, smaller_in_place(object, self.objects.values(), self._kinds, self._settings)
+        object.fit(self._kinds.usual, self._heading, s.range_noise, self.floor, others)
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)
 
     def _has_left(self, object: MapObject, view: RangeView) -> bool:
         """Tells whether a view looks through the place of an object."""
         sight = view.of(object.cells.points, self._settings.margin)
-        looked = int(np.count_nonzero(sight.looked))
-        return int(np.count_nonzero(sight.free)) >= 0.6 * max(looked, 1)
+        return int(np.count_nonzero(sight.free)) >= 0.6 * max(int(np.count_nonzero(sight.looked)), 1)
 
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)

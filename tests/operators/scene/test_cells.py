@@ -68,3 +68,10 @@ def test_bounds_are_as_far_apart_as_along_the_axis_of_the_widest_gap() -> None:
     assert second.apart(first) == first.apart(second)
     assert first.apart(first) < 0
     assert first.apart(Cells(SIDE)) == np.inf
+
+
+def test_voxels_that_others_have_too_are_theirs_unless_too_few_would_be_left() -> None:
+    grid = np.stack(np.meshgrid(np.arange(8), np.arange(8), [0]), axis=-1).reshape(-1, 3) * SIDE + SIDE / 2
+    cells, half, most = Cells.of(grid, SIDE), Cells.of(grid[grid[:, 0] > 0.4], SIDE), Cells.of(grid[5:], SIDE)
+    assert {*keys_of(cells.sure([half, Cells(SIDE)]), SIDE)} == {*keys_of(grid[grid[:, 0] < 0.4], SIDE)}
+    assert len(cells.sure([most])) == len(cells.sure()) == len(grid)

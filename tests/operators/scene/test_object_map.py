@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -258,3 +259,21 @@ def test_views_from_afar_are_dropped_for_near_ones_and_a_snapshot_holds_those_ke
     for one, other in zip(object.images, again.images, strict=True):
         assert len(one.points) > 0
         assert (one.points == other.points).all()
+
+
+def test_a_chair_before_a_desk_whose_masks_hold_both_does_not_move_the_desk() -> None:
+    desk: Solid = ((2.5, 0.0, 0.0), (0.7, 1.5, 0.75))
+    chair: Solid = ((1.8, 0.4, 0.0), (0.1, 0.45, 0.7))
+    sizes = {
+        BOX: (Usual((0.6, 1.5, 0.75), (0.4, 0.4, 0.16)),),
+        MUG: (Usual((0.1, 0.45, 0.7), (0.2, 0.2, 0.2)),),
+    }
+    known = ObjectMap(3, [], MapSettings(), sizes)
+    for k in range(12):
+        T = looking(0.4 * np.sin(k))
+        whole, front = observation(desk, BOX, T), observation(chair, MUG, T)
+        bled = replace(whole, points=np.concatenate([whole.points, front.points[::2]]))
+        known.update((k + 1) * SECOND // 4, [bled, front], RangeView(np.zeros((0, 3)), T, 0.012))
+    found = {o.class_id: o for o in known.confirmed()}[BOX]
+    deep = abs(np.cos(found.yaw)) * found.size[0] + abs(np.sin(found.yaw)) * found.size[1]
+    assert float(found.center[0] - deep / 2) > 2.0  # the desk's front is at 2.15, the chair's at 1.75
