@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from dataflow.messages import Activity, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
-from operators.recognition.agent_features import AGENTS, AgentWindow, Surroundings
+from operators.recognition.agent_features import AGENTS, DRINKS, AgentWindow, Surroundings
+from operators.recognition.in_hand import Hand, drinking
 from operators.recognition.possible import possible
 from operators.recognition.scene_agents import mattering, seen_times
 from operators.scene.agents import UNKNOWN
@@ -23,12 +24,13 @@ from operators.weights import shipped
 
 @dataclass
 class _Agent:
-    """State of one agent: its recent past, the network's state (2, L, W), what it does and since when (ns)."""
+    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), its hand."""
 
     window: AgentWindow
     state: NDArray[np.float32]
     activity: str
     since: int
+    hand: Hand
 
 
 class ActivityRecognizer(Operator):
@@ -38,7 +40,9 @@ class ActivityRecognizer(Operator):
     graph into two LSTM layers, whose state is kept from graph to graph for as long as the agent is in the scene; the
     network answers for a quarter of a second ago. `unknown` stands for what is too unsure, or too long out of sight.
 
-    What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat.
+    What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat. Who has
+    reached for a drink has it in hand for a while: one who then seems to stand drinks, unless the drink is seen where
+    it lay.
 
     Persons stand, walk, sit down, sit, stand up, reach or drink; balls roll or rest; robots drive or rest. Method:
     Hochreiter and Schmidhuber, "Long short-term memory", 1997; trained on simulated people (`dataflow train activity`).
@@ -81,23 +85,27 @@ class ActivityRecognizer(Operator):
             window.add(time, body)
             vectors.append(window.vector(body, (nodes.stamp - seen[body.id]) * 1e-9, self._around, here))
         self._counts.update({"graphs": 1, "agents": len(agents), "unusable nodes": unusable})
-        return self._answer(nodes.stamp, agents, vectors, seen)
+        drinks = {b.id: (b, seen[b.id] * 1e-9) for b in bodies if b.label in DRINKS}
+        return self._answer(nodes.stamp, agents, vectors, seen, drinks)
 
     def on_reset(self, input: str) -> None:
         """The clock behind an input began anew: so do all agents."""
         self._begin()
 
     def snapshot(self) -> Mapping[str, Any]:
-        agents = [[i, a.window.snapshot(), a.state, a.activity, a.since] for i, a in self._agents.items()]
+        agents = [
+            [i, a.window.snapshot(), a.state, a.activity, a.since, a.hand.snapshot()] for i, a in self._agents.items()
+        ]
         return {"agents": agents, "around": self._around.snapshot(), "counts": dict(self._counts)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
         self._around.restore(state["around"])
-        for id, window, network, activity, since in state["agents"]:
-            kept = AgentWindow()
+        for id, window, network, activity, since, hand in state["agents"]:
+            kept, held = AgentWindow(), Hand()
             kept.restore(window)
-            self._agents[int(id)] = _Agent(kept, np.array(network, np.float32), str(activity), int(since))
+            held.restore(hand)
+            self._agents[int(id)] = _Agent(kept, np.array(network, np.float32), str(activity), int(since), held)
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
 
     def summary(self) -> Mapping[str, float | int]:
@@ -105,10 +113,15 @@ class ActivityRecognizer(Operator):
         return dict(self._counts)
 
     def _fresh(self, stamp: int) -> _Agent:
-        return _Agent(AgentWindow(), self._model.fresh(), "", stamp)
+        return _Agent(AgentWindow(), self._model.fresh(), "", stamp, Hand())
 
     def _answer(
-        self, stamp: int, agents: list[Body], vectors: list[NDArray[np.float32]], seen: Mapping[int, int]
+        self,
+        stamp: int,
+        agents: list[Body],
+        vectors: list[NDArray[np.float32]],
+        seen: Mapping[int, int],
+        drinks: Mapping[int, tuple[Body, float]],
     ) -> Activity:
         probabilities = np.zeros((len(agents), len(self._classes)), np.float32)
         objects = np.full(len(agents), -1, np.int64)
@@ -120,11 +133,13 @@ class ActivityRecognizer(Operator):
             probabilities /= np.maximum(probabilities.sum(axis=1, keepdims=True), 1e-6)
         chosen = []
         for k, body in enumerate(agents):
-            agent, best = self._agents[body.id], int(probabilities[k].argmax())
+            agent = self._agents[body.id]
             agent.state = states[k]
-            sure = probabilities[k, best] >= self.least and stamp - seen[body.id] <= self.memory * 1e9
-            activity = self._classes[best] if sure else UNKNOWN
-            self._counts["unknown"] += not sure
+            fresh = stamp - seen[body.id] <= self.memory * 1e9
+            if self._holds(stamp, body, self._likeliest(probabilities[k], fresh), drinks):
+                probabilities[k, :-1] = drinking(probabilities[k, :-1], self._classes[:-1])
+            activity = self._likeliest(probabilities[k], fresh)
+            self._counts["unknown"] += activity == UNKNOWN
             if activity != agent.activity:
                 agent.activity, agent.since = activity, stamp
             chosen.append(self._classes.index(activity))
@@ -143,3 +158,14 @@ class ActivityRecognizer(Operator):
             objects=objects,
             since=np.array([self._agents[b.id].since for b in agents], np.int64),
         )
+
+    def _likeliest(self, probabilities: NDArray[np.float32], fresh: bool) -> str:
+        best = int(probabilities.argmax())
+        return self._classes[best] if fresh and probabilities[best] >= self.least else UNKNOWN
+
+    def _holds(self, stamp: int, body: Body, activity: str, drinks: Mapping[int, tuple[Body, float]]) -> bool:
+        """Tells whether a person who seems to do something has a drink in hand."""
+        if body.label != "person" or "drinking" not in self._classes:
+            return False
+        reached = self._around.object_of(activity, body) if activity == "reaching" else -1
+        return self._agents[body.id].hand.update(stamp * 1e-9, activity, reached, drinks)

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.scene.agents import GoalInference, Motion, activity_of
+from operators.scene.agents import Motion, activity_of
 from operators.scene.bodies import Body, BoxPairs
+from operators.scene.goals import GoalInference
 from operators.scene.relations import FLOOR, ROBOT, ROOM, Hysteresis, Relation, RelationRules, relations_of
 
 Array = NDArray[np.float64]
@@ -25,8 +26,8 @@ class GraphSettings:
     smoothing: float = 0.4
     agents: tuple[str, ...] = ("person", "robot", "ball")
     goals: tuple[str, ...] = ("chair", "table", "mug", "bottle", "door", "shelf")
-    trust: float = 2.0
-    memory: float = 4.0
+    trust: float = 1.0
+    memory: float = 2.0
     elsewhere: float = 2.5
     least_goal: float = 0.1
     rules: RelationRules = field(default_factory=RelationRules)
@@ -94,7 +95,8 @@ class LayeredGraph:
         now = relations_of(bodies, T_world_robot, s.rules, self._pairs)
         people = [b for b in bodies if b.agent and b.label == "person"]
         by_id = {b.id: b for b in bodies}
-        supports = {s: by_id[o] for (s, p, o) in now if p == "on" and s in by_id and o in by_id} if people else {}
+        on = [(s, o) for (s, p, o) in now if p == "on" and o != FLOOR] if people else []
+        supports = {s: by_id[o] for s, o in on if s in by_id and o in by_id}
         wanted = [b for b in bodies if b.label in s.goals]
         goals = {b.id: self._goals_of(time, b, wanted, supports, now) for b in people}
         held, began, ended = self._hysteresis.update(stamp, now)

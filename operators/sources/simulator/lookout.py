@@ -17,11 +17,11 @@ from operators.sources.simulator.trajectory import Trajectory
 
 _PLACES, _HEADINGS = 80, 72  # on the round, and of the camera, that are tried
 _CHOICES = 3  # things that a person goes to, from which on it chooses
-_HEIGHTS = (0.4, 0.9, 1.5)  # metres above the floor at which a person is to be seen
+_HEIGHTS = (0.4, 0.9, 1.5, 1.75)  # metres above the floor at which a person is to be seen, the head too
 _STOPS = 9  # places on a person's way at which it is to be seen
 _SLACK = 0.35  # metres before a point from which on what is hit counts as the thing itself
 _INSIDE = 0.95  # share of the half image within which a point counts as in view
-_CLOSE, _FAR = 2.5, 6.0  # metres up to which nearness does not matter, and from which on nothing is seen
+_CLOSE, _FAR = 4.0, 6.0  # metres up to which nearness does not matter, and from which on nothing is seen
 _CIRCLE = 0.5  # metres, radius of the round that is never driven
 
 

@@ -15,7 +15,6 @@ from dataflow.messages import Activity, Diagnostics, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import Played, play
 from operators.scene import SceneGraphBuilder
-from operators.scene.agents import GoalInference
 from operators.scene.bodies import Body, footprint_share, gap
 from operators.scene.relations import Hysteresis
 
@@ -251,34 +250,6 @@ def test_gap_is_symmetric_and_no_share_exceeds_one(x: float, y: float, size: flo
     assert gap(first, second) == pytest.approx(gap(second, first), abs=1e-5)
     assert 0 <= footprint_share(first, second) <= 1
     assert gap(first, second) == 0 or footprint_share(first, second) == 0
-
-
-def test_probabilities_of_goals_sum_to_one_and_follow_the_path() -> None:
-    goals = [
-        Body(i, "chair", np.array([x, y, 0.5]), np.ones(3), 0.0, np.zeros(3)) for i, x, y in ((1, 4, 0), (2, 0, 4))
-    ]
-    inference = GoalInference(4.0, 4.0, 2.5)
-    for k in range(15):
-        walker = Body(9, "person", np.array([0.15 * k, 0.0, 0.85]), np.ones(3), 0.0, np.zeros(3))
-        beliefs = inference.update(0.2 * k, walker, goals, {})
-    assert sum(beliefs.values()) == pytest.approx(1)
-    assert beliefs[1] > 0.8
-
-
-def test_of_two_mugs_equally_near_the_one_before_the_right_hand_is_the_goal() -> None:
-    def thing(id: int, label: str, x: float, y: float, yaw: float = 0.0) -> Body:
-        return Body(id, label, np.array([x, y, 0.8]), np.full(3, 0.1), yaw, np.zeros(3))
-
-    table = thing(1, "table", 0.5, 0.0, np.pi)  # its heading is that of either side
-    mugs = [
-        thing(2, "mug", 0.5, -0.19),
-        thing(3, "mug", 0.5, 0.19),
-    ]  # right and left, looking along x
-    inference = GoalInference(2.0, 4.0, 2.5)
-    for k in range(10):
-        walker = Body(9, "person", np.array([min(-1 + 0.15 * k, 0.0), 0.0, 0.85]), np.ones(3), 0.0, np.zeros(3))
-        beliefs = inference.update(0.2 * k, walker, mugs, {2: table, 3: table})
-    assert beliefs[2] > 2 * beliefs[3]
 
 
 def test_hysteresis_forgets_what_is_no_more() -> None:
