@@ -1,20 +1,25 @@
 """Does every operator repeat? Graphs run many times, in several processes; one digest means yes.
 
-    python benchmarks/repeated_graphs.py [GRAPH ...] [--runs 20] [--seconds 3] [--set GRAPH.NAME=VALUE ...]
+    python benchmarks/repeated_graphs.py [GRAPH ...] [--runs 20] [--set GRAPH.NAME=VALUE ...]
+    python benchmarks/repeated_graphs.py --data DATA
 
 A digest is over all messages of an operator's streams, or over its figures where it has none. Four processes share the
-runs of a graph. Graphs that need data or a network are named with `--set`. Several runs of some graphs each may
-share a --json file, of which `--table FILE` prints the whole.
+runs. A simulated drive is recorded once and replayed, but for two graphs whose sources run as often. With `--data`,
+the folder that graphs/stereo.yaml and its like take, those graphs run too. Graphs named alone may need `--set`.
+Several runs of some graphs each may share a --json file, of which `--table FILE` prints the whole.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import os
 import subprocess
 import sys
+import tempfile
 from collections import defaultdict
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +28,64 @@ import xxhash
 import dataflow
 from dataflow.firing.threads import environment
 from dataflow.graph import load_graph
+from dataflow.operator import Operator, Source
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PROCESSES = 4
-GRAPHS = (
-    "cloud", "dead_reckoning", "depth", "fusion", "landmarks", "localize", "mapping", "mono", "movers", "orientation",
-    "perception", "places", "preprocessing", "redundant", "registration", "simulated_lidar", "simulated_stereo", "slam",
-    "slam_lidar", "synthetic_rgbd",
-)  # fmt: skip
+GRAPHS: dict[str, tuple[str, ...]] = {  # with the settings that make them short, and yet have every operator speak
+    "cloud": ("duration=600ms",),
+    "dead_reckoning": ("duration=2s",),
+    "depth": ("duration=600ms",),
+    "fusion": ("duration=1500ms",),
+    "landmarks": ("duration=3s",),
+    "localize": ("duration=2s",),
+    "mapping": ("duration=800ms",),
+    "mono": ("duration=1500ms",),
+    "movers": ("duration=700ms",),
+    "orientation": ("duration=3s",),
+    "perception": ("duration=1500ms",),
+    "places": ("duration=2s",),
+    "preprocessing": ("duration=800ms",),
+    "redundant": ("duration=1200ms",),
+    "registration": ("duration=2s",),
+    "simulated_lidar": ("duration=1s",),
+    "simulated_robot": ("duration=800ms",),
+    "simulated_stereo": ("duration=1s",),
+    "slam": ("duration=1500ms",),
+    "slam_lidar": ("duration=2s",),
+    "synthetic_rgbd": ("frames=15",),
+}
+SIMULATED = (
+    "simulated_robot",
+    "synthetic_rgbd",
+)  # whose sources run as well; the others are recorded once, and replayed
+WITH_DATA: dict[str, tuple[str, ...]] = {
+    "landmarks_park": ("file={data}/landmark_slam/victoria_park.txt",),
+    "lidar": ("path={data}/kitti_lidar_camera", "drive.stop=8"),
+    "mono_depth": ("model={data}/models/tcmonodepth_small_192x320.onnx", "duration=1s"),
+    "mono_folder": ("data={data}", "camera.stop=20"),
+    "orientation_broad": ("file={data}/broad_imu/02_undisturbed_slow_rotation_B.hdf5", "trial.stop=6000"),
+    "orientation_euroc": ("folder={data}/euroc_v1_01_imu",),
+    "rgbd_perception": ("data={data}", "camera.stop=15"),
+    "slam_folder": ("data={data}", "camera.stop=30"),
+    "stereo": ("data={data}", "camera.stop=8"),
+}
 
 Row = dict[str, Any]
 
 
-def digests(graph: str, settings: list[str]) -> dict[str, Row]:
-    """Runs a graph here; returns the class, the number of messages or figures and the digest of every operator."""
+def digests(graph: str, settings: list[str], recording: Path | None) -> dict[str, Row]:
+    """Runs a graph here, or replays a recording through it; returns the class, the number of messages or figures and
+    the digest of every operator that ran."""
     os.chdir(REPOSITORY)
-    given = dict(one.split("=", 1) for one in settings)
-    ran, found = dataflow.run(f"graphs/{graph}.yaml", settings=given), {}
-    for name, node in load_graph(f"graphs/{graph}.yaml", settings=settings).nodes.items():
+    file, given, found = f"graphs/{graph}.yaml", dict(one.split("=", 1) for one in settings), {}
+    if recording is None:
+        ran = dataflow.run(file, settings=given)
+    else:
+        ran = dataflow.replay(recording, graph=file, settings=given)
+    for name, node in load_graph(file, settings=settings).nodes.items():
+        if recording is not None and node.source:
+            continue
         streams = sorted(set(node.outputs.values()) & set(ran.report.streams))
         figures: dict[str, Any] = dict(ran.report.summaries.get(name) or {})
         told = {stream: list(ran.report.streams[stream]) for stream in streams} or figures
@@ -50,22 +95,27 @@ def digests(graph: str, settings: list[str]) -> dict[str, Row]:
     return found
 
 
-def repeated(graph: str, settings: list[str], runs: int) -> list[Row]:
-    """Returns a row for each operator of a graph."""
-    seen: dict[str, list[Row]] = defaultdict(list)
+def repeated(graphs: Mapping[str, list[str]], runs: int, folder: Path) -> list[Row]:
+    """Runs graphs with their settings; returns a row for each operator of each. Recordings lie in a folder."""
+    for name, settings in graphs.items():
+        if name in GRAPHS and name not in SIMULATED:
+            given = dict(one.split("=", 1) for one in settings)
+            dataflow.run(f"graphs/{name}.yaml", settings=given, record=folder / f"{name}.mcap")
+    words = [f"{name}.{setting}" for name, settings in graphs.items() for setting in settings]
+    seen: dict[tuple[str, str], list[Row]] = defaultdict(list)
     for k in range(PROCESSES):
-        share = len(range(k, runs, PROCESSES))
-        command = [sys.executable, __file__, graph, "--one", str(share), "--set", *(f"{graph}.{s}" for s in settings)]
+        share = ["--one", str(len(range(k, runs, PROCESSES))), "--recordings", str(folder)]
+        command = [sys.executable, __file__, *graphs, *share, "--set", *words]
         done = subprocess.run(command, env=environment(1), capture_output=True, text=True, check=False)
         if done.returncode:
-            raise RuntimeError(f"{graph}: exit code {done.returncode}: {done.stderr.strip()[-300:]}")
-        for run in json.loads(done.stdout):
+            raise RuntimeError(f"{', '.join(graphs)}: exit code {done.returncode}: {done.stderr.strip()[-300:]}")
+        for graph, run in json.loads(done.stdout):
             for name, row in run.items():
-                seen[name].append(row)
+                seen[graph, name].append(row)
     return [
         {"operator": every[0]["operator"], "graph": graph, "name": name, "messages": every[0]["messages"],
          "runs": len(every), "digests": len({row["digest"] for row in every}), "first": every[0]["digest"]}
-        for name, every in seen.items()
+        for (graph, name), every in seen.items()
     ]  # fmt: skip
 
 
@@ -80,35 +130,56 @@ def table(rows: list[Row]) -> list[str]:
         graphs = ", ".join(dict.fromkeys(row["graph"] for row in found))
         most, runs = max(row["digests"] for row in found), min(row["runs"] for row in found)
         print(f"| {operator} | {graphs} | {sum(row['messages'] for row in found)} | {runs} | {most} |")
+    absent = sorted(set(operators()) - set(by_operator))
+    print(f"\nIn no row: {', '.join(absent) or 'none'}.")
     return sorted({row["operator"] for row in rows if row["digests"] > 1})
+
+
+def operators() -> list[str]:
+    """Returns the classes of all operators and sources that come with the project."""
+    names = []
+    for folder in sorted((REPOSITORY / "operators").iterdir()):
+        if (folder / "__init__.py").is_file():
+            module = importlib.import_module(f"operators.{folder.name}")
+            public = [getattr(module, name) for name in getattr(module, "__all__", ())]
+            names += [c.__name__ for c in public if isinstance(c, type) and issubclass(c, Operator | Source)]
+    return names
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("graphs", nargs="*", default=list(GRAPHS), help="names of graphs/NAME.yaml")
+    parser.add_argument("graphs", nargs="*", help="names of graphs/NAME.yaml; none means all")
     parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--seconds", type=float, default=3.0, help="`duration` of graphs that have it")
+    parser.add_argument("--data", type=Path, help="folder of recorded data")
     parser.add_argument("--set", nargs="*", default=[], metavar="GRAPH.NAME=VALUE")
     parser.add_argument("--json", type=Path, help="file to which all rows are added")
     parser.add_argument("--table", type=Path, help="prints the table of such a file, and runs nothing")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--recordings", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.table:
         table(json.loads(arguments.table.read_text()))
         return
-    rows = []
-    for name in arguments.graphs:
-        settings = [one.partition(".")[2] for one in arguments.set if one.startswith(f"{name}.")]
-        if arguments.one:
-            print(json.dumps([digests(name, settings) for _ in range(arguments.one)]))
-            return
-        if "duration:" in (REPOSITORY / "graphs" / f"{name}.yaml").read_text(encoding="utf-8"):
-            settings.append(f"duration={round(1e3 * arguments.seconds)}ms")
-        rows += repeated(name, settings, arguments.runs)
-        print(f"{name}: {max(row['digests'] for row in rows if row['graph'] == name)}", file=sys.stderr, flush=True)
-        if arguments.json:
-            known = json.loads(arguments.json.read_text()) if arguments.json.is_file() else []
-            arguments.json.write_text(json.dumps([*known, *(r for r in rows if r["graph"] == name)], indent=1) + "\n")
+
+    def given(name: str) -> list[str]:
+        return [one.partition(".")[2] for one in arguments.set if one.startswith(f"{name}.")]
+
+    if arguments.one:
+        files = {file.stem: file for file in arguments.recordings.glob("*.mcap")}
+        each = [name for name in arguments.graphs for _ in range(arguments.one)]
+        print(json.dumps([(name, digests(name, given(name), files.get(name))) for name in each]))
+        return
+    known = dict(GRAPHS)
+    if arguments.data:
+        folder = arguments.data.resolve()
+        known |= {name: tuple(one.format(data=folder) for one in settings) for name, settings in WITH_DATA.items()}
+    graphs = {name: [*known.get(name, ()), *given(name)] for name in arguments.graphs or known}
+    os.chdir(REPOSITORY)
+    with tempfile.TemporaryDirectory() as folder:
+        rows = repeated(graphs, arguments.runs, Path(folder))
+    if arguments.json:
+        before = json.loads(arguments.json.read_text()) if arguments.json.is_file() else []
+        arguments.json.write_text(json.dumps([*before, *rows], indent=1) + "\n")
     differing = table(rows)
     if differing:
         sys.exit(f"not repeatable: {', '.join(differing)}")

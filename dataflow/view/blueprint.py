@@ -184,8 +184,9 @@ def _plots(shown: Layout) -> list[Part]:
             continue
         entity, title, apart = entity_of(name), _short(name, shown), plots_of(shown.streams[name])
         if apart:
-            each = [_plot(f"{title} {what}", [f"+ {entity}/plot/{what}/**"]) for what in apart]
-            parts.append(rrb.Vertical(contents=each, name=title))
+            drawn = [what for what in apart if (name, what) not in shown.silent]
+            each = [_plot(f"{title} {what}", [f"+ {entity}/plot/{what}/**"]) for what in drawn]
+            parts += [rrb.Vertical(contents=each, name=title)] if each else []
         else:
             parts.append(_plot(title, [f"+ {entity}/plot/**"]))
     if health:

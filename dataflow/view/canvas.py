@@ -78,6 +78,7 @@ class Canvas:
         where = f"plot/{path}"
         if not len(values):
             return
+        self.scene.new_curves |= (self.entity, where) not in self.scene.remembered
         if self.scene.changed(self.entity, where, tuple(names)):
             paint = colors.AXES if len(names) == 3 else colors.of_classes(names)
             self.log(where, rr.SeriesLines(names=list(names), colors=paint), static=True)

@@ -106,6 +106,8 @@ class SceneState:
     viewpoint: Viewpoint = field(default_factory=Viewpoint)
     begin: int | None = None
     """The stamp (ns) of the first message that was drawn."""
+    new_curves: bool = False
+    """Curves were begun since the views were last derived."""
     _noted: set[tuple[str, str]] = field(default_factory=set)
     _waiting: dict[str, int] = field(default_factory=dict)
     _rows: dict[str, tuple[int, bool]] = field(default_factory=dict)  # frame: stamp of its last row, a stream's pose?
@@ -116,6 +118,10 @@ class SceneState:
             return False
         self.remembered[entity, key] = value
         return True
+
+    def has_plotted(self, stream: str, path: str) -> bool:
+        """Tells whether a stream has drawn curves at `plot/<path>`."""
+        return (entity_of(stream), f"plot/{path}") in self.remembered
 
     def due(self, entity: str, stamp: int) -> bool:
         """Tells whether a pose is to be drawn at `entity`: the last one is `pose_step` old. Then this is the last."""

@@ -1,7 +1,7 @@
 """The pose of a frame: solved from its corners, refined by its depth, with what supports it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -32,6 +32,8 @@ JITTER = 0.33  # working pixels; variances grow with the fourth power of what tr
 MOVING = 10.0  # of the share of the view that moves
 MINORITY = 100.0  # of the share by which tracks that agree fall short of a half
 
+RIVAL = 0.33  # of the tracks that agree: as many that agree on another motion contest it
+
 STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
 
 
@@ -50,6 +52,12 @@ class Sighting:
     ages: NDArray[np.int64]
     tracked: int = 0  # features that were looked for a pose in, those that disagree with this one included
     recognised: bool = False  # by descriptors, so the pose may lie far from the prediction
+    contrary: Points = field(default_factory=lambda: np.zeros((0, 3)))  # (M, 3) in the camera: another body's corners
+
+    @property
+    def points_camera(self) -> Points:
+        """The points (N, 3) in the depth camera."""
+        return transform_points(invert(self.T_world_camera), self.points_world)
 
     @property
     def minority(self) -> float:
@@ -116,24 +124,48 @@ class Fitter:
         self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
     ) -> Sighting | None:
         """RANSAC PnP; OpenCV seeds it alike at every call."""
+        return self._consensus(points_world, pixels, ages, threshold, fewest)[0]
+
+    def _consensus(
+        self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
+    ) -> tuple[Sighting | None, NDArray[np.bool_]]:
+        """Returns the pose that most agree with, if enough do, and which (N,) do."""
+        none = np.zeros(len(points_world), np.bool_)
         if len(points_world) < fewest:
-            return None
+            return None, none
         threshold = max(threshold, 1.0)
         ok, rotation, translation, inliers = cv2.solvePnPRansac(
             points_world, pixels, self.camera.K_color, None, iterationsCount=300,
             reprojectionError=threshold, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
         )  # fmt: skip
         if not ok or inliers is None:
-            return None
+            return None, none
         T_color_world = np.eye(4)
         T_color_world[:3, :3] = cv2.Rodrigues(rotation)[0]
         T_color_world[:3, 3] = translation.ravel()
         error = project(transform_points(T_color_world, points_world), self.camera.K_color) - pixels
         chosen = np.einsum("ij,ij->i", error, error) < threshold**2
         if np.count_nonzero(chosen) < fewest:
-            return None
+            return None, none
         T_world_camera = invert(T_color_world) @ self.camera.T_color_depth
-        return Sighting(T_world_camera, points_world[chosen], pixels[chosen], ages[chosen], len(points_world))
+        return Sighting(T_world_camera, points_world[chosen], pixels[chosen], ages[chosen], len(points_world)), chosen
+
+    def follow(
+        self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
+    ) -> Sighting | None:
+        """As `solve`, for tracks: where those that disagree agree on a second motion, the larger surface stands still.
+
+        What moves stands before the world: it may fill most of the image, and yet is smaller than what it hides.
+        """
+        first, agree = self._consensus(points_world, pixels, ages, threshold, fewest)
+        if first is None:
+            return None
+        rivals = max(fewest, int(RIVAL * len(first.pixels)))
+        second = self.solve(points_world[~agree], pixels[~agree], ages[~agree], threshold, rivals)
+        if second is None:
+            return first
+        still, moving = sorted((first, second), key=_area, reverse=True)
+        return replace(still, tracked=len(points_world), contrary=moving.points_camera)
 
     def refine(
         self,
@@ -167,12 +199,15 @@ class Fitter:
         shape = frame.surface.inverse_depth.shape
         movers = Movers.none(frame.surface.K, (shape[0], shape[1]))
         stages = ((4, 0.3, 8), *STAGES) if sighting and sighting.recognised else STAGES
+        if sighting:
+            movers = movers.around(sighting.contrary)
         for stride, gate, iterations in stages:
             points = frame.surface.points(stride)
+            points = points[~movers.hold(points)]
             if stride == 2 and sighting and references:
                 earlier = [k for k in known.earlier(T, segment) if not any(k is r for r in references)]
                 terms = self._planes(points, [*references, *earlier], freedom, gate)
-                movers = Movers.between(frame.surface.K, (shape[0], shape[1]), points, terms, T)
+                movers = movers.also(Movers.between(frame.surface.K, (shape[0], shape[1]), points, terms, T))
                 points = points[~movers.hold(points)]
             surfaces = self._planes(points, references, freedom, gate)
             alignment = align(T, [*features, *surfaces], prior, iterations)
@@ -200,3 +235,8 @@ class Fitter:
             PlaneTerm(points, k.surface, k.T_camera_world, noise, scale, freedom, gate, PLANE_STRENGTH)
             for k in references
         ]
+
+
+def _area(sighting: Sighting) -> float:
+    """Returns the surface that corners stand for, up to a factor: they lie evenly over the image."""
+    return float((sighting.points_camera[:, 2] ** 2).sum())

@@ -45,8 +45,19 @@ class Movers:
             nearer = np.bincount(tile[seen[in_front]], minlength=rows * columns)
             compared = np.bincount(tile[seen[in_front | same]], minlength=rows * columns)
             moving |= (nearer > 0.5 * compared) & (compared >= FEWEST)
-        grown = moving.reshape(rows, columns).astype(np.uint8)
-        return Movers(cv2.dilate(grown, np.ones((3, 3), np.uint8)) > 0, K)
+        return Movers(_grown(moving.reshape(rows, columns)), K)
+
+    def around(self, points: Points) -> "Movers":
+        """Returns these and the tiles around points (N, 3), in the view's depth camera, that are known to move."""
+        if not len(points):
+            return self
+        moving = np.zeros(self.tiles.size, np.bool_)
+        moving[_tile_of(points, self.K, self.tiles.shape)] = True
+        return self.also(Movers(_grown(moving.reshape(self.tiles.shape)), self.K))
+
+    def also(self, others: "Movers") -> "Movers":
+        """Returns these and others of the same grid."""
+        return Movers(self.tiles | others.tiles, self.K)
 
     def hold(self, points: Points) -> NDArray[np.bool_]:
         """Returns which of the points (N, 3), in the view's depth camera, lie in a moving tile."""
@@ -69,6 +80,11 @@ class Movers:
 
 def _tiles(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // TILE), -(-shape[1] // TILE)
+
+
+def _grown(tiles: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Returns the tiles and their neighbours."""
+    return cv2.dilate(tiles.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _tile_of(points: Points, K: Matrix, tiles: tuple[int, ...]) -> NDArray[np.int64]:

@@ -3,7 +3,8 @@
 Corners of a keyframe are tracked into each frame and solved by RANSAC PnP; the pose is then refined over
 reprojections and point-to-plane distances to the surfaces of nearby keyframes, with a motion prior for what
 neither determines. A corner keeps its point from keyframe to keyframe for as long as it agrees, so what moves
-slowly disagrees in the end; what moves fast stands in front of the map, and is left out of the refinement.
+slowly disagrees in the end; what moves fast stands in front of the map, and is left out of the refinement. Where
+corners agree on two motions, the larger surface stands still.
 """
 
 from dataclasses import dataclass, field, replace
@@ -118,7 +119,7 @@ class RgbdOdometry:
         guess = project(transform_points(T_color_world, keyframe.points_world), self._working.K_color)
         gray = with_exposure_of(keyframe.gray, frame.gray)
         pixels, found = track_corners(keyframe.gray, gray, keyframe.pixels, guess)
-        return self._fitter.solve(
+        return self._fitter.follow(
             keyframe.points_world[found],
             pixels[found],
             keyframe.ages[found],
@@ -333,4 +334,6 @@ def _support(frame: Frame, fit: Fit) -> str:
     corners = f"{fit.inliers} corners" if fit.inliers else ""
     depth = "depth" if fit.compared else ""
     rests = " and ".join(part for part in (corners, depth) if part)
-    return "; ".join(part for part in (rests, frame.flaws) if part)
+    others = len(fit.sighting.contrary) if fit.sighting else 0
+    contest = f"{others} corners move with something else" if others else ""
+    return "; ".join(part for part in (rests, contest, frame.flaws) if part)

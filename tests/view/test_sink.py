@@ -172,6 +172,7 @@ def test_a_blueprint_has_a_view_for_everything_there_is_and_no_other() -> None:
         ("2D", "camera/image"),
         ("2D", "camera/depth"),
         ("TextDocument", "Scene"),
+        ("TimeSeries", "imu/data orientation"),
         ("TimeSeries", "imu/data gyroscope"),
         ("TimeSeries", "imu/data accelerometer"),
         ("TimeSeries", "Latency"),
