@@ -45,6 +45,7 @@ BYTES = 150_000
 """The largest picture: one that is larger is given fewer colours."""
 
 VIEWS: dict[str, tuple[str, ...]] = {
+    "cloud": ("replay", "recordings/demo.mcap", "--graph", "graphs/cloud.yaml"),
     "dead_reckoning": ("run", "graphs/dead_reckoning.yaml"),
     "depth": ("run", "graphs/depth.yaml"),
     "fusion": ("run", "graphs/fusion.yaml", "--set", "duration=30s"),
@@ -71,6 +72,7 @@ VIEWS: dict[str, tuple[str, ...]] = {
 """The arguments of `dataflow` by the picture's name."""
 
 LATER = {
+    "cloud": 9.2,
     "fusion": 29,
     "landmarks": 29,
     "localize": 17,
@@ -78,7 +80,7 @@ LATER = {
     "mono": 11,
     "orientation": 11,
     "places": 15,
-    "preprocessing": 5,
+    "preprocessing": 2,
     "redundant": 17,
     "registration": 11,
     "slam": 25,
@@ -179,7 +181,8 @@ def picture(name: str, folder: Path) -> Path:
     shown, recorded = folder / f"{name}.rrd", folder / f"{name}.mcap"
     command = [sys.executable, "-m", "dataflow.cli.main", *VIEWS[name], "--quiet", "--record", str(recorded)]
     subprocess.run(command, cwd=REPOSITORY, check=True)
-    at(LATER.get(name), REPOSITORY / VIEWS[name][1], recorded, shown)
+    (graph,) = (word for word in VIEWS[name] if word.endswith(".yaml"))
+    at(LATER.get(name), REPOSITORY / graph, recorded, shown)
     recorded.unlink()
     for complaint in complaints(shown, MOMENTS):
         print(f"{name}: the viewer reports an error: {complaint}", file=sys.stderr)
