@@ -115,7 +115,7 @@ def test_a_users_own_folder_becomes_a_detector_that_finds_their_objects(tmp_path
     told = json.loads(trained.stdout)
     assert told["scores"]["ap50"] > 0.5
     assert told["refiner"]["epochs"] == 8
-    assert open_second(open_network(out, "detector")) is not None
+    assert open_second(open_network(out, "detector"), "refiner") is not None
     assert sorted(file.name for file in tmp_path.glob("mine.*")) == ["mine.onnx", "mine.pt", "mine.refiner.pt"]
 
     unseen = write_coco(tmp_path / "unseen", 30, seed=1000)
