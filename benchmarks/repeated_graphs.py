@@ -32,6 +32,7 @@ from dataflow.operator import Operator, Source
 
 REPOSITORY = Path(__file__).resolve().parent.parent
 PROCESSES = 4
+WITHIN = 7200  # seconds that one of them may take
 GRAPHS: dict[str, tuple[str, ...]] = {  # with the settings that make them short, and yet have every operator speak
     "cloud": ("duration=600ms",),
     "dead_reckoning": ("duration=2s",),
@@ -106,7 +107,7 @@ def repeated(graphs: Mapping[str, list[str]], runs: int, folder: Path) -> list[R
     for k in range(PROCESSES):
         share = ["--one", str(len(range(k, runs, PROCESSES))), "--recordings", str(folder)]
         command = [sys.executable, __file__, *graphs, *share, "--set", *words]
-        done = subprocess.run(command, env=environment(1), capture_output=True, text=True, check=False)
+        done = subprocess.run(command, env=environment(1), capture_output=True, text=True, check=False, timeout=WITHIN)
         if done.returncode:
             raise RuntimeError(f"{', '.join(graphs)}: exit code {done.returncode}: {done.stderr.strip()[-300:]}")
         for graph, run in json.loads(done.stdout):

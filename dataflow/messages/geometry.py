@@ -106,6 +106,14 @@ def yaw_of(quaternion: npt.ArrayLike) -> F64:
     return np.asarray(np.arctan2(2 * (x * y + w * z), 1 - 2 * (y * y + z * z)))
 
 
+def roll_pitch_yaw(rotation: npt.ArrayLike) -> F64:
+    """Returns the angles (3,), radians, of a rotation (3, 3): about the fixed axes x, y and z, one after the other."""
+    R = np.asarray(rotation, np.float64)
+    return np.array(
+        [np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(np.clip(R[2, 0], -1.0, 1.0)), np.arctan2(R[1, 0], R[0, 0])]
+    )
+
+
 def transform_matrix(position: npt.ArrayLike, orientation: npt.ArrayLike) -> F64:
     """Rigid transforms (..., 4, 4) of translations (..., 3) and quaternions (..., 4)."""
     rotation = quaternion_to_matrix(orientation)

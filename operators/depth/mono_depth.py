@@ -16,6 +16,7 @@ from dataflow.messages.diagnostics import Level
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.depth.scaling import Scaling, fitted
 from operators.inference import ModelError, open_session
+from operators.network_input import three_channels
 from operators.status import counted_status
 
 if TYPE_CHECKING:
@@ -101,7 +102,7 @@ class MonoDepth(Operator):
 
     def _nearness(self, pixels: NDArray[np.uint8]) -> Nearness:
         """Returns the model's output (H, W) for pixels (H, W) or (H, W, 3), at their size."""
-        color = pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
+        color = three_channels(pixels)
         height, width = color.shape[:2]
         shrinking = width >= self._size[0] and height >= self._size[1]
         fitting = cv2.resize(color, self._size, interpolation=cv2.INTER_AREA if shrinking else cv2.INTER_LINEAR)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Detections2D, Image
 from operators.detection.fit import Fit
+from operators.network_input import three_channels
 
 MARGIN = 0.05
 """Share of a box by which it is enlarged on each side: boxes of detectors cut off rims."""
@@ -19,7 +20,7 @@ def views(image: Image, detections: Detections2D | None) -> tuple[list[NDArray[n
     Without detections that is the whole image, and there are no ids. Objects without an id are numbered from 0. A box
     that lies outside the image gives a view of one pixel at its edge, so that rows stay those of the detections.
     """
-    pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
+    pixels = three_channels(image.data)
     if detections is None:
         return [pixels], None
     cut = []

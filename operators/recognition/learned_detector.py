@@ -16,6 +16,7 @@ from operators.detection.custom.first_look import Looked
 from operators.detection.custom.refiner import Refiner
 from operators.detection.decode import Candidates
 from operators.detection.nms import class_wise_nms, intersection_over_union
+from operators.network_input import three_channels
 from operators.recognition.learned_object import LEAST, PROPOSALS, LearnedObject, LearnedObjectError
 from operators.recognition.proposals import F32, Glance, Trunk
 from operators.scene.map_file import learned_files, together
@@ -67,7 +68,7 @@ class LearnedDetector(Operator):
         self._counts = {"images": 0, "learned objects": 0, "known boxes replaced": 0}
 
     def process(self, image: Image) -> Detections2D:
-        pixels = image.data if image.is_color else np.repeat(image.data[..., None], 3, axis=2)
+        pixels = three_channels(image.data)
         glance = self._trunk.look(pixels)
         known, learned = self._known(glance, pixels), self._found(glance)
         known = known.select(self._staying(known, learned))

@@ -1,4 +1,4 @@
-"""Training of a second network on what the first one in a file answers: what all kinds of them have alike."""
+"""Trains a second network on the answers of the first one in a file: the part that all kinds of them have alike."""
 
 from __future__ import annotations
 

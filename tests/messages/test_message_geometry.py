@@ -82,6 +82,13 @@ def test_yaw_survives_its_quaternion(yaw: float) -> None:
     assert abs(float(geometry.yaw_of(quaternion)) - yaw) < 1e-12
 
 
+@given(SEEDS)
+@settings(max_examples=30, deadline=None)
+def test_roll_pitch_and_yaw_are_those_about_the_fixed_axes(seed: int) -> None:
+    for rotation in Rotation.random(5, random_state=seed):
+        assert np.allclose(geometry.roll_pitch_yaw(rotation.as_matrix()), rotation.as_euler("xyz"), atol=1e-9)
+
+
 def test_any_leading_dimensions_are_taken() -> None:
     q = random_quaternions(1, 6).reshape(2, 3, 4)
     assert geometry.quaternion_to_matrix(q).shape == (2, 3, 3, 3)

@@ -233,6 +233,19 @@ def test_a_stream_gets_its_view_with_its_first_message(late: bool, tmp_path: Pat
     assert ("rear/image" in named) == late
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_curves_get_their_view_when_they_are_first_drawn(late: bool, tmp_path: Path) -> None:
+    path, oriented = tmp_path / "a.rrd", imu(STAMP + 1).replace(orientation=[0, 0, 0, 1])
+    with ViewerSink(Save(path)) as sink:
+        sink.open({"r/imu/data": Imu})
+        assert sink.log("r/imu/data", imu(STAMP), wait=10.0)
+        if late:
+            assert sink.log("r/imu/data", oriented, wait=10.0)
+    named = {row.values[0] for row in blueprint_rows(path) if row.component == "ViewBlueprint:display_name"}
+    assert "imu/data gyroscope" in named
+    assert ("imu/data orientation" in named) == late
+
+
 def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
     turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
     room = np.column_stack([3 + 5 * np.cos(turn), 4 * np.sin(turn), np.linspace(-0.5, 2, 64)])

@@ -11,6 +11,7 @@ import pytest
 import rerun as rr
 from example_messages import example
 from rrd_rows import Row, at, rows
+from scipy.spatial.transform import Rotation
 
 from dataflow import messages
 from dataflow.messages import (
@@ -332,6 +333,15 @@ def test_curves_carry_names_and_values(tmp_path: Path) -> None:
     (gyro,) = at(found, "/i/d/plot/gyroscope", "Scalars:scalars")
     np.testing.assert_array_equal(gyro.values, [1, 2, np.nan])
     assert at(found, "/i/d/plot/accelerometer", "SeriesLines:names")[0].values == ["ax m/s²", "ay m/s²", "az m/s²"]
+
+
+def test_an_orientation_is_drawn_as_roll_pitch_and_yaw_in_degrees(tmp_path: Path) -> None:
+    imu = Imu(
+        stamp=STAMP, frame="imu", angular_velocity=[0, 0, 0], linear_acceleration=[0, 0, 9.81],
+        orientation=Rotation.from_euler("xyz", [10, -20, 130], degrees=True).as_quat(),
+    )  # fmt: skip
+    (row,) = at(draw(tmp_path, ("i/d", imu)), "/i/d/plot/orientation", "Scalars:scalars")
+    np.testing.assert_allclose(row.values, [10, -20, 130])
 
 
 def test_diagnostics_are_told_when_they_change_and_plotted_by_kind(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from dataflow.interop.export.frames import PAIR_WITHIN, write_text
 from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Imu, Message, NavSatFix, Odometry
-from dataflow.messages.geometry import quaternion_to_matrix
+from dataflow.messages.geometry import quaternion_to_matrix, roll_pitch_yaw
 
 UNKNOWN = -1
 """Of the status numbers that no message here holds."""
@@ -78,7 +78,7 @@ def packet_of(imu: Imu, fix: NavSatFix, odometry: Odometry) -> list[float]:
     assert imu.orientation is not None
     assert odometry.linear is not None
     R = quaternion_to_matrix(imu.orientation)
-    roll, pitch, yaw = math.atan2(R[2, 1], R[2, 2]), -math.asin(np.clip(R[2, 0], -1, 1)), math.atan2(R[1, 0], R[0, 0])
+    roll, pitch, yaw = roll_pitch_yaw(R).tolist()
     level = np.array([[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]) @ R
     velocity = R @ odometry.linear
     accuracy = math.nan if fix.covariance is None else math.sqrt((fix.covariance[0, 0] + fix.covariance[1, 1]) / 2)

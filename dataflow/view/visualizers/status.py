@@ -6,11 +6,10 @@ import math
 import re
 
 import numpy as np
-import numpy.typing as npt
 import rerun as rr
 
 from dataflow.messages import Diagnostics, Imu, JointState, Level, MagneticField, WheelTicks
-from dataflow.messages.geometry import quaternion_to_matrix
+from dataflow.messages.geometry import quaternion_to_matrix, roll_pitch_yaw
 from dataflow.view.canvas import Canvas, visualizer
 
 _LEVELS = {Level.OK: "INFO", Level.WARN: "WARN", Level.ERROR: "ERROR", Level.STALE: "WARN"}
@@ -28,18 +27,12 @@ _RATE = re.compile(r"rate|hz|fps|frequency|throughput")
 def imu(canvas: Canvas, message: Imu) -> None:
     """Curves of the gyroscope and the accelerometer, and of orientation and temperature where they are given."""
     if message.orientation is not None:
-        canvas.plot("orientation", _euler_degrees(message.orientation), ["roll °", "pitch °", "yaw °"])
+        angles = np.degrees(roll_pitch_yaw(quaternion_to_matrix(message.orientation)))
+        canvas.plot("orientation", angles, ["roll °", "pitch °", "yaw °"])
     canvas.plot("gyroscope", message.angular_velocity, ["wx rad/s", "wy rad/s", "wz rad/s"])
     canvas.plot("accelerometer", message.linear_acceleration, ["ax m/s²", "ay m/s²", "az m/s²"])
     if message.temperature is not None:
         canvas.plot("temperature", [message.temperature], ["°C"])
-
-
-def _euler_degrees(orientation: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Roll, pitch and yaw (3,) of a quaternion: rotations about the fixed axes x, y and z, one after the other."""
-    R = quaternion_to_matrix(orientation)
-    pitch = -np.arcsin(np.clip(R[2, 0], -1.0, 1.0))
-    return np.degrees([np.arctan2(R[2, 1], R[2, 2]), pitch, np.arctan2(R[1, 0], R[0, 0])])
 
 
 @visualizer(MagneticField, "plot")
