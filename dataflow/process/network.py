@@ -2,13 +2,24 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable
+from typing import Protocol
 
 from dataflow.graph.sections import Network
-from dataflow.transport import NetworkConfig
+from dataflow.transport import BusError, NetworkConfig
+from dataflow.transport.bounded import within
 
 BLOCKED, BLOCKED_LIVE = 30.0, 2.0
 """Seconds that a publication waits for a subscriber that takes nothing. A live run loses messages rather than time."""
+LEAVE_WITHIN = 4.5
+"""Seconds for taking leave of whom is connected from outside: less than any run gives its processes to close."""
+
+
+class Closable(Protocol):
+    """A part of a process's place in the network."""
+
+    def close(self) -> None: ...
 
 
 def network_config(network: Network, listen: Iterable[str], *, live: bool) -> NetworkConfig:
@@ -25,3 +36,21 @@ def network_config(network: Network, listen: Iterable[str], *, live: bool) -> Ne
         exposed=not network.loopback_only,
         zenoh={path: value for path, value in settings.items() if value},
     )
+
+
+def leave_network(process: str, *parts: Closable) -> None:
+    """Closes parts of a process's place in the network in turn, and says so if `LEAVE_WITHIN` does not suffice.
+
+    All that was to be done is done by then: a neighbour that hangs must not fail the run.
+    """
+
+    def leave() -> None:
+        for part in parts:
+            part.close()
+
+    try:
+        late = "" if within(LEAVE_WITHIN, leave, "leave") else f"not done within {LEAVE_WITHIN:g} s"
+    except BusError as error:
+        late = str(error)
+    if late:
+        print(f"process {process!r} leaves the network unheard: {late}", file=sys.stderr)

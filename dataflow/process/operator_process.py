@@ -10,7 +10,6 @@ from __future__ import annotations
 import gc
 import math
 import queue
-import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -27,7 +26,7 @@ from dataflow.process.inlet import Inlet
 from dataflow.process.live_sources import LiveSources, Step
 from dataflow.process.losses import StreamDamaged, losses_of
 from dataflow.process.making import Making
-from dataflow.process.network import network_config
+from dataflow.process.network import leave_network, network_config
 from dataflow.process.orders import Orders
 from dataflow.process.outlet import Network, Outlet, incarnations_of, left_by
 from dataflow.process.pace import Pace
@@ -37,7 +36,7 @@ from dataflow.process.runners import Runners, give, open_box, statics_of
 from dataflow.process.standing import Standing
 from dataflow.process.watchdog import Watchdog
 from dataflow.sync import StreamOrderError
-from dataflow.transport import Bus, BusError, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
+from dataflow.transport import Bus, Envelope, Fanout, Outgoing, OutsidePublisher, TapServer
 from dataflow.transport.fanout import POOL_BYTES
 
 IDLE_WAIT = 0.1
@@ -251,13 +250,8 @@ class OperatorProcess:
         failures += self.runners.close(but=reading)
         for log in self.feeding.logs:
             log.close()
-        self.taps.close()
-        self.outside.close()
+        leave_network(self.config.label, self.taps, self.outside, self.bus)
         self.outlet.close()
-        try:
-            self.bus.close()
-        except BusError as error:  # a neighbour that hangs takes no leave; everything that was to be done is done
-            print(f"process {self.config.label!r} leaves the network unheard: {error}", file=sys.stderr)
         if failures:
             raise failures[0]
 

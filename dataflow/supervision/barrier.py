@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from dataflow.supervision.asking import Asking, ahead_of
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run_state import RunState
@@ -18,6 +19,7 @@ class Barrier:
         self.run = run
         self._deadline = 0.0
         self._probing = False
+        self._asking = Asking(run)
 
     def begin(self) -> None:
         run = self.run
@@ -50,6 +52,9 @@ class Barrier:
                 run.status.waiting = ()
                 return True
         run.status.waiting = tuple(p.label for p in processes if p.life is not Life.READY and self._missing(p))
+        timeout = run.plan.start_timeout
+        if run.steady > self._deadline - timeout + ahead_of(timeout):
+            self._asking.ask(_late(processes), self._deadline)
         if run.steady > self._deadline:
             self._fail(processes)
         return False
@@ -69,11 +74,16 @@ class Barrier:
 
     def _fail(self, processes: list[Supervised]) -> None:
         timeout = self.run.plan.start_timeout
-        late = [p.describe() for p in processes if p.life is not Life.READY and p.life is not Life.PROBING]
-        if late:
-            raise RunFailed(f"not ready within {timeout:g} s: {'; '.join(late)}", self.run.last_words())
+        if late := _late(processes):
+            names = "; ".join(p.describe() for p in late)
+            raise RunFailed(f"not ready within {timeout:g} s: {names}", self.run.last_words(late))
         silent = [f"{key} → {p.label}" for p in processes for key in sorted(p.unseen)]
         raise RunFailed(f"no connection within {timeout:g} s on: {', '.join(silent)}")
+
+
+def _late(processes: Iterable[Supervised]) -> list[Supervised]:
+    """Returns those that are not ready."""
+    return [p for p in processes if p.life is not Life.READY and p.life is not Life.PROBING]
 
 
 def expect_probes(run: RunState, process: Supervised) -> None:

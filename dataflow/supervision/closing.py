@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from dataflow.supervision.asking import Asking, ahead_of
 from dataflow.supervision.life import Life, Step
 from dataflow.supervision.outcome import summaries_of
 from dataflow.supervision.report import RunFailed
@@ -31,10 +32,11 @@ def bounded(stall_timeout: float) -> float:
 
 @dataclass(slots=True)
 class _Stage:
-    """The processes that leave together, and until when."""
+    """The processes that leave together, and until when; before that, those who are left are asked where they are."""
 
     sinks: bool
     deadline: float
+    ask_from: float
 
 
 class Closing:
@@ -46,6 +48,7 @@ class Closing:
         self.run, self.outcome, self.failure = run, outcome, failure
         self._at_once = at_once
         self._hand_over = hand_over
+        self._asking = Asking(run)
         run.enter(Phase.CLOSING)
         self._stage = self._begin(sinks=False)
 
@@ -73,6 +76,8 @@ class Closing:
         """Goes on when a stage is through, or its time is up."""
         leaving = self._leaving(sinks=self._stage.sinks)
         late = self.run.steady > self._stage.deadline
+        if self.failure is None and self.run.steady > self._stage.ask_from:
+            self._asking.ask(leaving, self._stage.deadline)
         if leaving and late:
             self._give_up_on(leaving)
         given_up = self.run.steady > self._stage.deadline + DIE_WITHIN
@@ -102,12 +107,13 @@ class Closing:
                     run.send(process, "leave", outcome=outcome, summaries=summaries_of(run))
                 else:
                     run.send(process, "leave", outcome=outcome)
-        return _Stage(sinks, run.steady + self._time_for(sinks=sinks))
+        timeout = self._time_for(sinks=sinks)
+        return _Stage(sinks, run.steady + timeout, run.steady + ahead_of(timeout))
 
     def _give_up_on(self, late: list[Supervised]) -> None:
         if self.failure is None:
             names = "; ".join(p.describe() for p in late)
             timeout = self._time_for(sinks=self._stage.sinks)
-            self.failure = RunFailed(f"did not close within {timeout:g} s: {names}", self.run.last_words())
+            self.failure = RunFailed(f"did not close within {timeout:g} s: {names}", self.run.last_words(late))
         for process in late:
             self.run.kill(process, process.cause or "was killed since it did not leave")

@@ -62,7 +62,9 @@ def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited:
             os.close(other)
         from dataflow.process.main import main
         from dataflow.process.speech import install
+        from dataflow.process.stacks import answer
 
+        answer()
         install()
         code = main(descriptor, handed)
         sys.stdout.flush()
@@ -193,6 +195,10 @@ def main(descriptor: int) -> None:
     """Runs the nursery process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     import importlib
+
+    from dataflow.process.stacks import turn_a_deaf_ear
+
+    turn_a_deaf_ear()
 
     _adopt_orphans()
     for name in PRELOAD:

@@ -4,7 +4,7 @@ given."""
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -103,8 +103,10 @@ class RunState:
         """Returns the keys that a process takes from others."""
         return taken_keys(self.graph, process.plan)
 
-    def last_words(self) -> str:
-        lines = [f"[{p.label}] {line}" for p in self.processes.values() for line in list(p.words)[-5:]]
+    def last_words(self, late: Collection[Supervised] = ()) -> str:
+        """Returns what processes said last; of those that are `late` all that is kept, where they are included."""
+        said = ((p, line) for p in self.processes.values() for line in list(p.words)[0 if p in late else -5 :])
+        lines = [f"[{p.label}] {line}" for p, line in said]
         return "\n".join(lines)
 
     # Acting

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from dataflow.supervision.asking import Asking, ahead_of
 from dataflow.supervision.life import WORKS
 from dataflow.supervision.part import Part
 from dataflow.supervision.quiescence import Quiescence
@@ -26,6 +27,7 @@ class StallWatch(Part):
         super().__init__(run)
         self.quiescence = quiescence
         self._heard = 0.0
+        self._asking = Asking(run)
 
     def released(self) -> None:
         self._heard = self.run.steady
@@ -43,13 +45,15 @@ class StallWatch(Part):
 
     def tick(self) -> None:
         timeout = self.run.plan.stall_timeout
+        for process in self._stuck(ahead_of(timeout)):
+            self._asking.ask([process], self._stuck_since(process))
         if self.run.steady - self._heard <= timeout:
             return
-        stuck = self._stuck()
+        stuck = self._stuck(timeout)
         if not stuck:
             return
         names = "; ".join(p.at_work() for p in stuck) + self._waits_for_clock()
-        words = self.run.last_words()
+        words = self.run.last_words(stuck)
         for process in self.quiescence.unanswered():  # they could not leave in order
             self.run.kill(process)
         raise RunFailed(f"no progress for {timeout:g} s; still busy: {names}", words)
@@ -61,9 +65,15 @@ class StallWatch(Part):
             self.run.kill(process)
             raise RunFailed(f"{process.describe()} has read nothing for {seconds:.0f} s", words)
 
-    def _stuck(self) -> list[Supervised]:
-        """Returns those who hold up the run: who does not answer, else who has not ended."""
+    def _stuck(self, seconds: float) -> list[Supervised]:
+        """Returns those who hold up the run for so long: who does not answer, else who has not ended."""
+        if self.run.steady - self._heard <= seconds:
+            return []
         return self.quiescence.unanswered() or [p for p in self.run.working() if p.report is None]
+
+    def _stuck_since(self, process: Supervised) -> object:
+        """Returns what changes when a process goes on."""
+        return self._heard
 
     def _waits_for_clock(self) -> str:
         """Names a source that has nothing to do for long because its next message is due late."""
@@ -100,21 +110,26 @@ class LiveStallWatch(StallWatch):
         if kind == "stream_ended":
             self._flowing.discard(fields["stream"])
 
-    def _stuck(self) -> list[Supervised]:
-        """Returns those who are at a call for as long as nothing has happened."""
-        timeout = self.run.plan.stall_timeout
-        return [p for p in self.run.working() if p.work is not None and p.work[2] >= timeout]
+    def _stuck(self, seconds: float) -> list[Supervised]:
+        """Returns those who are at one call for so long."""
+        return [p for p in self.run.working() if p.work is not None and p.work[2] >= seconds]
+
+    def _stuck_since(self, process: Supervised) -> object:
+        return None if process.work is None else process.work[:2]
 
     def tick(self) -> None:
         super().tick()
-        if not self._flowing and (stuck := self._stuck()):  # however busy a timer is
-            names = "; ".join(p.at_work() for p in stuck)
-            raise RunFailed(f"all sources have ended, and a call does not: {names}", self.run.last_words())
         now, timeout = self.run.steady, self.run.plan.stall_timeout
+        if not self._flowing and (stuck := self._stuck(timeout)):  # however busy a timer is
+            names = "; ".join(p.at_work() for p in stuck)
+            raise RunFailed(f"all sources have ended, and a call does not: {names}", self.run.last_words(stuck))
         for process in list(self.run.working()):
-            silence = now - self._signs.get(process.label, now)
+            sign = self._signs.get(process.label, now)
+            silence = now - sign
+            if silence > ahead_of(timeout):
+                self._asking.ask([process], sign)
             if silence > timeout:
-                words = self.run.last_words()
+                words = self.run.last_words([process])
                 self.run.kill(process)
                 raise RunFailed(f"{process.describe()} gave no sign of life for {silence:.0f} s", words)
             if process.is_sink and silence > PING_AFTER and not self.quiescence.asked:  # operators' processes give one

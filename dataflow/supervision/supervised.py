@@ -10,7 +10,7 @@ from dataflow.supervision.life import HAS_PROCESS, Life, Step, after
 from dataflow.supervision.plan import ProcessPlan
 from dataflow.sync import FOREVER, NEVER
 
-WORDS_KEPT = 50
+WORDS_KEPT = 200
 
 
 @dataclass(slots=True)

@@ -14,6 +14,7 @@ from typing import Any, Self
 
 import zenoh
 
+from dataflow.transport.bounded import within
 from dataflow.transport.counters import Counters
 from dataflow.transport.keys import static_key, stream_of_static
 from dataflow.transport.network import NetworkConfig
@@ -182,10 +183,7 @@ class Bus:
             if self._closed:
                 return
             self._closed = True
-        closer = threading.Thread(target=self.session.close, name="bus close", daemon=True)
-        closer.start()
-        closer.join(CLOSE_WITHIN)
-        if closer.is_alive():
+        if not within(CLOSE_WITHIN, self.session.close, "bus close"):
             raise BusError(f"Zenoh did not close within {CLOSE_WITHIN:g} s")
         for token in self._tokens:
             token.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import subprocess
@@ -166,7 +167,7 @@ class Broken(Operator):
     x: In[FeatureVector]
     y: Out[FeatureVector]
     at: int = Param(20, doc="the number at which it fails")
-    how: str = Param("raise", doc="raise, die, hang, stamp, type, mutate, chatter, exit, children or daemon")
+    how: str = Param("raise", doc="raise, die, crash, hang, stamp, type, mutate, chatter, exit, children or daemon")
 
     def process(self, x: FeatureVector) -> FeatureVector:
         if number(x) == self.at:
@@ -175,6 +176,8 @@ class Broken(Operator):
                     raise RuntimeError("the gripper is on fire")
                 case "die":
                     os.kill(os.getpid(), signal.SIGKILL)
+                case "crash":
+                    ctypes.string_at(0)
                 case "hang":
                     time.sleep(3600)
                 case "stamp":

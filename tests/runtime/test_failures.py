@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -120,6 +121,14 @@ def test_an_operator_that_hangs_ends_the_run_within_the_stall_timeout() -> None:
     failure = fails(broken("hang"), placement="process_each", stall_timeout=1.0)
 
     assert "no progress for 1 s; still busy: process 'bad'" in str(failure)
+    assert re.search(r'runtime_operators.py", line \d+ in process', failure.details), failure.details
+
+
+def test_a_fault_in_native_code_ends_the_run_with_the_line_that_called_it() -> None:
+    failure = fails(broken("crash"), placement="process_each")
+
+    assert "process 'bad' was killed by SIGSEGV" in str(failure)
+    assert re.search(r'runtime_operators.py", line \d+ in process', failure.details), failure.details
 
 
 def test_a_failure_leaves_a_recording_that_says_so(tmp_path: Path) -> None:

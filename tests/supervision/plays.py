@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dataflow.graph import load_text
+from dataflow.process.stacks import ASK
 from dataflow.records.black_box import Reached, Remains
 from dataflow.records.firing import FiringRecord, encode_batch
 from dataflow.supervision.commands import Command, Over, Send, Signal, Spawn
@@ -183,6 +184,10 @@ def sent(commands: list[Command], kind: str) -> list[tuple[str, Mapping[str, Any
 
 def spawned(commands: list[Command]) -> list[str]:
     return [c.label for c in commands if isinstance(c, Spawn)]
+
+
+def asked_where(commands: list[Command]) -> list[str]:
+    return [c.label for c in commands if isinstance(c, Signal) and c.number == ASK]
 
 
 def killed(commands: list[Command]) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 import pytest
-from plays import Play, killed, sent, spawned
+from plays import Play, asked_where, killed, sent, spawned
 
 from dataflow.supervision.commands import Announce, Over, Withdraw
 from dataflow.supervision.events import Aborted, Begin, Died, HungUp, LeftBehind, Printed, Said, Tick
@@ -53,6 +53,7 @@ def test_a_process_that_is_not_ready_is_named_when_the_time_is_up() -> None:
     play.wait(25.0)
 
     assert play.failure() == "not ready within 10 s: process 'sum'"
+    assert asked_where(play.commands) == ["sum"]
     assert killed(play.commands) == ["sum"]
 
 
@@ -148,6 +149,7 @@ def test_nobody_makes_progress_and_who_does_not_answer_is_killed_and_named() -> 
     play.wait(60.0)
 
     assert play.failure() == "no progress for 20 s; still busy: process 'left'; process 'sum'"
+    assert asked_where(play.commands) == ["left", "sum"]
     assert "sum" in killed(play.commands)
 
 
@@ -243,6 +245,26 @@ def test_patience_shortens_the_time_for_closing(patience: float, closes_within: 
 
     assert play.failure() == f"did not close within {closes_within:g} s: process 'sum'"
     assert killed(play.commands) == ["sum"]
+    assert asked_where(play.commands) == ["sum"]
+
+
+def test_what_a_late_process_is_at_is_part_of_the_failure_and_what_others_said_long_ago_is_not() -> None:
+    play = Play(stall_timeout=8.0).starts()
+    play.deaf.add("sum")
+    for label in play.processes:
+        play.tell(*(Printed(label, f"{label} {k}") for k in range(10)))
+    play.tell(*(play.ended(label) for label in play.processes))
+    play.wait(7.5)
+    play.tell(Printed("sum", 'File "driver.py", line 7 in release'))
+    play.wait(2.0)
+
+    assert play.over is not None
+    assert play.over.failure is not None
+    details = play.over.failure.details
+    assert '[sum] File "driver.py", line 7 in release' in details
+    assert "[sum] sum 0" in details
+    assert "[left] left 9" in details
+    assert "[left] left 0" not in details
 
 
 def test_what_a_process_has_left_behind_is_named() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 
 import pytest
-from plays import LEFT, STEP, Play, killed, sent, spawned
+from plays import LEFT, STEP, Play, asked_where, killed, sent, spawned
 
 from dataflow.chaos.plan import Fault
 from dataflow.records.firing import Emission, FiringRecord
@@ -261,6 +261,7 @@ def test_a_process_that_gives_no_sign_of_life_for_too_long_ends_the_run(label: s
         play.wait(0.5)
 
     assert play.failure() == f"process {label!r} gave no sign of life for 20 s"
+    assert asked_where(play.commands) == [label]
 
 
 def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
@@ -271,6 +272,7 @@ def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
         play.wait(0.5)
 
     assert play.failure() == "no progress for 20 s; still busy: process 'smooth', smooth at stamp 5 for 20 s"
+    assert asked_where(play.commands) == ["smooth"]
 
 
 def test_a_call_that_does_not_end_is_named_when_the_sources_have_ended_though_a_timer_goes_on() -> None:

@@ -17,6 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from dataflow.process.stacks import ASK
 from simulation.world import EPOCH, Process, Task, World
 
 FIRST = 1_000_000
@@ -587,6 +588,8 @@ class Signals:
 
     def pidfd_send_signal(self, descriptor: int, number: int) -> None:
         world, process = self._system.world, self._system.things[descriptor].process
+        if number == ASK:
+            return  # what its threads are at is nothing to a simulated process
         does = {int(signal.SIGKILL): world.kill, int(signal.SIGSTOP): world.freeze, int(signal.SIGCONT): world.thaw}[
             number
         ]

@@ -1,0 +1,32 @@
+"""A call that takes too long is not waited for, and what it raises is raised."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+from dataflow.transport.bounded import within
+
+
+def test_an_act_that_ends_has_ended_when_it_is_said_so() -> None:
+    done: list[str] = []
+
+    assert within(10.0, lambda: done.append(threading.current_thread().name), "leave")
+    assert done == ["leave"]
+
+
+def test_an_act_that_does_not_end_is_not_waited_for() -> None:
+    gate = threading.Event()
+    try:
+        assert not within(0.01, gate.wait, "leave")
+    finally:
+        gate.set()
+
+
+def test_what_an_act_raises_is_raised() -> None:
+    def fail() -> None:
+        raise ConnectionError("nobody is there")
+
+    with pytest.raises(ConnectionError, match="nobody is there"):
+        within(10.0, fail, "leave")
