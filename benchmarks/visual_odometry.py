@@ -1,10 +1,11 @@
-"""Accuracy and time of RGB-D odometry on a 7-Scenes folder, beside two peers in the same process, one thread.
+"""Accuracy and time of RGB-D odometry on a 7-Scenes folder, beside three peers in the same process, one thread.
 
     python benchmarks/visual_odometry.py                                    7-Scenes
     python benchmarks/visual_odometry.py worlds                             twelve simulated worlds, movers on
     python benchmarks/visual_odometry.py worlds office:811 corridor:812     others, kind and seed
 
-Peers: frame-to-frame ORB + RANSAC PnP (OpenCV), and depth-only generalised ICP to a local map (small_gicp).
+Peers: frame-to-frame ORB + RANSAC PnP (OpenCV), depth-only generalised ICP to a local map (small_gicp), and the dense
+frame-to-model SLAM on a TSDF grid of Open3D.
 Decoding is excluded. The methods take turns frame by frame, so load on the machine falls on all alike.
 """
 
@@ -38,6 +39,7 @@ from operators.odometry.camera import RgbdCamera  # noqa: E402
 from operators.odometry.rgbd_odometry import RgbdOdometry  # noqa: E402
 from operators.odometry.settings import RgbdOdometryConfig  # noqa: E402
 from operators.odometry.tracking import TrackResult  # noqa: E402
+from operators.sources.simulator.native import open3d  # noqa: E402
 
 Matrix = NDArray[np.float64]
 Track = Callable[[NDArray[np.uint8], NDArray[np.float32], int], Matrix]
@@ -140,6 +142,37 @@ def score(estimate: list[Matrix], truth: list[Matrix], delta: int) -> dict[str, 
     return {"ate_cm": 100 * ape.get_statistic(metrics.StatisticsType.rmse), **out}
 
 
+class Open3dFrameToModel:
+    """Open3D's dense SLAM: each frame is tracked against what a TSDF grid of the ones before shows from the last pose.
+
+    Settings are those of its example `dense_slam.py`, with voxels of 5.8 mm.
+    """
+
+    FAR, TRUNCATION = 3.0, 8.0
+
+    def __init__(self, camera: RgbdCamera, shape: tuple[int, ...]) -> None:
+        self.native = native = open3d()
+        slam, device = native.t.pipelines.slam, native.core.Device("CPU:0")
+        K = native.core.Tensor(np.ascontiguousarray(camera.K_depth))
+        self.model = slam.Model(0.0058, 16, 40_000, native.core.Tensor(np.eye(4)), device)
+        self.frame, self.seen = (slam.Frame(shape[0], shape[1], K, device) for _ in range(2))
+        self.T = np.eye(4)
+        self.number = 0
+
+    def track(self, image: NDArray[np.uint8], depth: NDArray[np.float32], stamp: int) -> Matrix:
+        millimetres = np.where(np.isfinite(depth), 1e3 * depth, 0).astype(np.uint16)
+        self.frame.set_data_from_image("depth", self.native.t.geometry.Image(millimetres))
+        self.frame.set_data_from_image("color", self.native.t.geometry.Image(np.ascontiguousarray(image)))
+        if self.number:
+            fit = self.model.track_frame_to_model(self.frame, self.seen, 1000.0, self.FAR, 0.07)
+            self.T = self.T @ fit.transformation.numpy()
+        self.model.update_frame_pose(self.number, self.native.core.Tensor(self.T))
+        self.model.integrate(self.frame, 1000.0, self.FAR, self.TRUNCATION)
+        self.model.synthesize_model_frame(self.seen, 1000.0, 0.1, self.FAR, self.TRUNCATION, False)
+        self.number += 1
+        return self.T
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["recorded", "worlds"], nargs="?", default="recorded")
@@ -180,6 +213,7 @@ def main() -> None:
         "features only": ours("features only", RgbdOdometryConfig(refine=False)),
         "ORB frame to frame": OrbFrameToFrame(camera).track,
         "small_gicp depth only": GicpLocalMap(camera).track,
+        "Open3D frame to model": Open3dFrameToModel(camera, frames[0][1].shape).track,
     }
     poses: dict[str, list[Matrix]] = {name: [] for name in methods}
     times: dict[str, list[float]] = {name: [] for name in methods}
