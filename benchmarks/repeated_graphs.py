@@ -5,7 +5,8 @@
 
 A digest is over all messages of an operator's streams, or over its figures where it has none. Four processes share the
 runs. A simulated drive is recorded once and replayed, but for two graphs whose sources run as often. With `--data`,
-the folder that graphs/stereo.yaml and its like take, those graphs run too. Graphs named alone may need `--set`.
+the folder that graphs/stereo.yaml and its like take, those graphs run too. Graphs named alone may need `--set`. What
+no graph of graphs/ runs alone has weights, a video, a bag or a small graph of its own, made by repeated_made.py.
 Several runs of some graphs each may share a --json file, of which `--table FILE` prints the whole.
 """
 
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import xxhash
+from repeated_made import MADE, maps, perceived
 
 import dataflow
 from dataflow.firing.threads import environment
@@ -75,17 +77,26 @@ WITH_DATA: dict[str, tuple[str, ...]] = {
 Row = dict[str, Any]
 
 
-def digests(graph: str, settings: list[str], recording: Path | None) -> dict[str, Row]:
-    """Runs a graph here, or replays a recording through it; returns the class, the number of messages or figures and
-    the digest of every operator that ran."""
+def digests(graph: str, settings: list[str], folder: Path) -> dict[str, Row]:
+    """Runs a graph here, or replays through it what a folder has for it; returns the class, the number of messages or
+    figures and the digest of every operator that ran."""
     os.chdir(REPOSITORY)
-    file, given, found = f"graphs/{graph}.yaml", dict(one.split("=", 1) for one in settings), {}
-    if recording is None:
-        ran = dataflow.run(file, settings=given)
-    else:
+    recording, bag, own = (folder / f"{graph}.{kind}" for kind in ("mcap", "bag", "yaml"))
+    file, given, found = (
+        own if own.exists() else f"graphs/{graph}.yaml",
+        dict(one.split("=", 1) for one in settings),
+        {},
+    )
+    if graph == "handed":
+        return perceived(recording)
+    if bag.exists():
+        ran = dataflow.replay(bag, graph=file, maps=maps())
+    elif recording.exists():
         ran = dataflow.replay(recording, graph=file, settings=given)
+    else:
+        ran = dataflow.run(file, settings=given)
     for name, node in load_graph(file, settings=settings).nodes.items():
-        if recording is not None and node.source:
+        if node.source and recording.exists():
             continue
         streams = sorted(set(node.outputs.values()) & set(ran.report.streams))
         figures: dict[str, Any] = dict(ran.report.summaries.get(name) or {})
@@ -99,12 +110,14 @@ def digests(graph: str, settings: list[str], recording: Path | None) -> dict[str
 def repeated(graphs: Mapping[str, list[str]], runs: int, folder: Path) -> list[Row]:
     """Runs graphs with their settings; returns a row for each operator of each. Recordings lie in a folder."""
     for name, settings in graphs.items():
+        if name in MADE:
+            settings += MADE[name](folder)
         if name in GRAPHS and name not in SIMULATED:
             given = dict(one.split("=", 1) for one in settings)
             dataflow.run(f"graphs/{name}.yaml", settings=given, record=folder / f"{name}.mcap")
     words = [f"{name}.{setting}" for name, settings in graphs.items() for setting in settings]
     seen: dict[tuple[str, str], list[Row]] = defaultdict(list)
-    for k in range(PROCESSES):
+    for k in range(min(PROCESSES, runs)):
         share = ["--one", str(len(range(k, runs, PROCESSES))), "--recordings", str(folder)]
         command = [sys.executable, __file__, *graphs, *share, "--set", *words]
         done = subprocess.run(command, env=environment(1), capture_output=True, text=True, check=False, timeout=WITHIN)
@@ -166,11 +179,10 @@ def main() -> None:
         return [one.partition(".")[2] for one in arguments.set if one.startswith(f"{name}.")]
 
     if arguments.one:
-        files = {file.stem: file for file in arguments.recordings.glob("*.mcap")}
         each = [name for name in arguments.graphs for _ in range(arguments.one)]
-        print(json.dumps([(name, digests(name, given(name), files.get(name))) for name in each]))
+        print(json.dumps([(name, digests(name, given(name), arguments.recordings)) for name in each]))
         return
-    known = dict(GRAPHS)
+    known = GRAPHS | dict.fromkeys(MADE, ())
     if arguments.data:
         folder = arguments.data.resolve()
         known |= {name: tuple(one.format(data=folder) for one in settings) for name, settings in WITH_DATA.items()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,12 @@ _ONE_SIDED = 0.5
 """Length of the mean direction of points that lie more to one side of their sensor than all round it."""
 FARTHEST = 50.0
 """Metres: half of what is in view, at most."""
+_NEWEST = 4
+"""Clouds seen to one side that are remembered: those at the end of a run."""
+_ASIDE = (-0.97, 1.05, 0.4)
+"""From where one looks: ahead, up and to the side."""
+_HIGH, _WIDE = 0.38, 0.5
+"""Tangents of half of what is in view: the viewer's angle is some 50 degrees, less room for names; a view is wide."""
 MOST_PLACES = 2048
 """Sets of places that are kept; of more, every second one, and so on."""
 
@@ -39,6 +46,7 @@ class Viewpoint:
     _around: list[Vector] = field(default_factory=list)
     _kept: list[Vector] = field(default_factory=list)
     _places: list[Vector] = field(default_factory=list)
+    _newest: deque[Vector] = field(default_factory=lambda: deque(maxlen=_NEWEST))
     _passed: int = 0  # sets of places since the last one that was kept
     _stride: int = 1
     _ahead: Vector | None = None  # the direction in which one looks, decided once
@@ -51,15 +59,17 @@ class Viewpoint:
             self._ranges.append(float(np.median(d)))
 
     def saw_points(self, T: Vector | None, points: npt.ArrayLike) -> None:
-        """Points (N, 3) of a cloud in its sensor's frame tell how far things are; those of a scan all round, with the
-        frame's pose `T` in the root frame, also where the place is."""
+        """Points (N, 3) of a cloud in its sensor's frame tell how far things are; with the frame's pose `T` in the root
+        frame, those of a scan all round also where the place is, and the newest what there is at the end."""
         p = np.asarray(points, np.float64).reshape(-1, 3)
         distances = np.linalg.norm(p, axis=1)
         self.saw_range(distances)
         p, distances = p[distances > 0], distances[distances > 0]
-        if len(p) < 16 or len(self._around) >= 16:
+        if len(p) < 16 or T is None:
             return
-        if T is not None and np.linalg.norm((p / distances[:, None]).mean(axis=0)) < _ONE_SIDED:
+        if np.linalg.norm((p / distances[:, None]).mean(axis=0)) >= _ONE_SIDED:
+            self._newest.append(p @ T[:3, :3].T + T[:3, 3])
+        elif len(self._around) < 16:
             self._around.append(p @ T[:3, :3].T + T[:3, 3])
 
     def saw_places(self, T: Vector | None, points: npt.ArrayLike) -> None:
@@ -111,21 +121,48 @@ class Viewpoint:
         level = self._ahead
         reach = float(np.clip(np.median(self._ranges) if self._ranges else 3.0, 1.0, 30.0))
         side = np.cross(level, up)
-        points = self._around + self._kept
+        clouds, way = self._around + self._kept, list[Vector]()
         if whole and len(self._places) > 1 and _extent(self._places, up) <= FARTHEST:
-            points = points + self._places
-        if points:
-            lower, upper = np.percentile(np.concatenate(points), [3, 97], axis=0)
-            middle = (lower + upper) / 2
-            size = float(np.linalg.norm((upper - lower)[up == 0]) / 2)
-            beside = 0.0
-            if not (self._around or self._kept):  # what was seen on the way lies beside it
-                beside = 0.75 * reach if self._ranges else 0.3 * size
-            size = float(np.clip(size + beside, 1.0, FARTHEST))
-            away = -0.97 * level + 1.05 * up + 0.4 * side
-            return Outlook(up, middle + size * away, middle - (0.1 * size * level if self._kept else 0.0))
+            clouds, way = clouds + list(self._newest), self._places
+        if clouds or way:
+            axes = np.array([level, up, side])
+            beside = 0.0 if clouds else (reach if self._ranges else 1.0)  # what was seen on the way lies beside it
+            return _fitted(np.concatenate([*_usual(clouds, 3), *_usual(way, 1)]), axes, beside)
         position = at - level * (0.75 * reach) + up * (0.6 * reach) + side * (0.45 * reach)
         return Outlook(up, position, at + level * (0.75 * reach))
+
+
+def _usual(sets: list[Vector], share: float) -> list[Vector]:
+    """All points of some sets, drawn into the box that has all but a share (per cent) on each side; none of none."""
+    if not sets:
+        return []
+    points = np.concatenate(sets)
+    lower, upper = np.percentile(points, [share, 100 - share], axis=0)
+    return [np.clip(points, lower, upper)]
+
+
+def _fitted(points: Vector, axes: Vector, beside: float) -> Outlook:
+    """The nearest viewpoint in a fixed direction from which all points (N, 3) are in view, and `beside` metres farther.
+
+    `axes` are the unit vectors ahead, up and to the side. A point at depth q along the view and height h in the image
+    is in view from the distance d where |h - c| <= (d - q) tan: the least d, and the c to aim at, follow from the
+    largest q + h / tan and q - h / tan.
+    """
+    back = np.asarray(_ASIDE) @ axes
+    away = float(np.linalg.norm(back))
+    back = back / away
+    right = np.cross(axes[1], back)
+    right /= np.linalg.norm(right)
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2
+    from_middle = points - middle
+    near, target, distance = from_middle @ back, middle.copy(), 1.0
+    for axis, tangent in ((np.cross(back, right), _HIGH), (right, _WIDE)):
+        along = from_middle @ axis / tangent
+        above, below = float((near + along).max()), float((near - along).max())
+        target += axis * ((above - below) / 2 * tangent)
+        distance = max(distance, (above + below) / 2)
+    distance = min(max(distance + beside, away), 2 * away * FARTHEST)
+    return Outlook(axes[1], target + distance * back, target)
 
 
 def _extent(places: list[Vector], up: Vector) -> float:

@@ -37,6 +37,8 @@ DATA = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / 
 PROGRAMS = Path(sys.executable).parent
 SETTLED = 4.0
 """Seconds that the viewer may take to draw a moment, without a GPU."""
+WITHIN = 900
+"""Seconds for a file or a picture, on a busy machine without a GPU."""
 MOMENTS = (0.0, 0.02, 0.5, 1.0)
 """Shares of a file's length at which no view may report an error."""
 SIZE = (1200, 750)
@@ -94,8 +96,9 @@ GROWN = "demo"
 MOMENT = 9.2
 """Seconds after its start at which it is taken: a person walks to a chair."""
 
-WIDE, HIGH = 4800, 3000
-"""The screen is so large that the pointer, in its middle, is not on the window."""
+WIDE, HIGH = 4 * DRAWN[0] + 200, 4 * DRAWN[1] + 200
+"""The screen is so large that the pointer, in its middle, is not on the window: for a picture, the viewer makes its
+window twice as wide and high in pixels as it is asked for."""
 
 
 def rendered(shown: Path) -> Picture:
@@ -104,7 +107,7 @@ def rendered(shown: Path) -> Picture:
     subprocess.run(
         ["xvfb-run", "-a", "-s", f"-screen 0 {WIDE}x{HIGH}x24", str(PROGRAMS / "rerun"), "--screenshot-to", str(large),
          "--window-size", f"{DRAWN[0]}x{DRAWN[1]}", "--bind", "127.0.0.1", "--new", str(shown)],
-        check=True, capture_output=True, timeout=180,
+        check=True, capture_output=True, timeout=WITHIN,
     )  # fmt: skip
     pixels = cv2.imread(str(large))
     if pixels is None:
@@ -156,6 +159,8 @@ def at(seconds: float | None, graph: Path, recorded: Path, file: Path) -> None:
             streams = [name for name, info in recording.streams.items() if info.message_type is not None]
             end = None if seconds is None else begins + round(seconds * 1e9)
             from_recording(recording, sink, streams, end=end, graph=made)
+            if not sink.close(WITHIN):
+                raise SystemExit(f"{file.name} was not written within {WITHIN} s")
 
 
 def grown(folder: Path) -> Path:

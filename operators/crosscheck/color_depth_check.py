@@ -22,6 +22,9 @@ class ColorDepthCheck(Operator):
 
     A camera that is turned against its extrinsic paints things with what is beside them, and nothing fails: boxes are
     lifted from the wrong points. The check adds up images, since a single one has edges that are none of the depth's.
+
+    Method: edges of depth on edges of the image, added up over images, as in Levinson and Thrun, "Automatic online
+    calibration of cameras and lasers", 2013.
     """
 
     image: In[Image] = In(doc="colour or grey, of the same stamp")

@@ -27,6 +27,9 @@ class DepthScanCheck(Operator, tolerance="60ms"):
 
     Which of the two is wrong it cannot say, but by how much: the angle and shift between them against the extrinsics,
     and the share by which depths are too long. Where stamps or points differ in time, the LiDAR's velocity is needed.
+
+    Method: projective association, Blais and Levine, "Registering multiview range data to create 3D computer objects",
+    1995, with the scale as one more unknown.
     """
 
     cloud: In[PointCloud] = In(doc="one turn of the LiDAR")

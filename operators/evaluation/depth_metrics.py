@@ -19,6 +19,8 @@ class DepthMetrics(Operator):
     not scored. Figures are means over the images that have a depth to judge, with the worst image's RMSE beside them;
     `measured` is the share of the pixels with a known true depth that have one. Both must be of one view: the frames'
     names may differ, as those of two cameras at one place do.
+
+    Method: Eigen et al., "Depth map prediction from a single image using a multi-scale deep network", 2014.
     """
 
     depth: In[DepthImage] = In(doc="the depths to score")

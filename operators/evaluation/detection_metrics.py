@@ -32,6 +32,8 @@ class DetectionMetrics(Operator):
     is no false positive, as COCO treats objects outside of its area range. It takes the share or the count in the
     truth message; without them the limit does not apply. AP asks for the whole curve, so run the detector with a low
     score threshold (0.01) and give the one of your robot here, for precision and recall.
+
+    Method: Lin et al., "Microsoft COCO: common objects in context", 2014, by pycocotools.
     """
 
     detections: In[Detections2D] = In(doc="the boxes to score")

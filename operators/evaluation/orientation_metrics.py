@@ -19,6 +19,8 @@ class OrientationMetrics(Operator):
 
     Each estimate is paired with the truth nearest in time within `tolerance`. A truth that poses another frame of the
     robot is brought to the estimate's by the extrinsics.
+
+    Method: Laidig et al., "BROAD: a benchmark for robust inertial orientation estimation", 2021.
     """
 
     estimate: In[Imu | Pose | Odometry] = In(doc="the orientations to score; a sample without one is passed over")

@@ -27,6 +27,8 @@ class SegmentationMetrics(Operator):
     shows and the segmenter does not know counts with IoU 0 and is listed as `unknown_classes`. Pixels that are void in
     the truth are not judged. A map that is a smaller or larger version of the truth's is scaled to it, without
     interpolation.
+
+    Method: Everingham et al., "The Pascal visual object classes challenge", 2010: intersection over union.
     """
 
     segmentation: In[SegmentationMap] = In(doc="the class maps to score")

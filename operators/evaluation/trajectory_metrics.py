@@ -28,6 +28,9 @@ class TrajectoryMetrics(Operator):
     Both must pose the same child frame; the frames they are expressed in may differ, which the alignment makes up for.
     Poses are paired after the fact, each with the truth nearest in time within `tolerance`: truth is a batch input, so
     it may come at any rate and late without delaying or dropping an estimate.
+
+    Methods: Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems", 2012; the alignment, Umeyama, 1991;
+    the drift of segments, Geiger et al., "Are we ready for autonomous driving?", 2012.
     """
 
     estimate: In[Pose | Odometry] = In(doc="the poses to score")

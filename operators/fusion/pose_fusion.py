@@ -30,6 +30,9 @@ class PoseFusion(Operator):
     nobody knows which is wrong, and the covariance grows until it holds both. Either is said in the status before it
     is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its say. For one that
     moves fast, or with biases and delays, there is EkfFusion.
+
+    Methods: rotations, Hartley et al., "Rotation averaging", 2013; positions by least squares with the covariances as
+    weights; contradictions by the chi-square test of the difference.
     """
 
     estimates: In[Imu | Pose | Odometry] = In(many=True, doc="poses in `frame` with covariance; orientations")

@@ -29,6 +29,9 @@ class PositionFusion(Operator):
     Each sensor is compared with the others. Of three or more the one that contradicts the rest is left out; of two
     nobody knows which is wrong, and the covariance grows until it holds both. Either is said in the status before it
     is averaged. Covariances follow how far a sensor is from the others, so a degrading one loses its say.
+
+    Method: positions and bearings in one weighted least squares, as in Hartley and Zisserman, "Multiple view geometry",
+    2004, 12; contradictions by the chi-square test of the residuals.
     """
 
     sightings: In[LandmarkSightings] = In(many=True, doc="things seen by each sensor, with identities and covariances")

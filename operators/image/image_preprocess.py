@@ -24,6 +24,9 @@ class ImagePreprocess(Operator):
     In this order; what is not asked for is not done, and an image that needs nothing passes bit for bit. `rectify`
     turns the image as its calibration's R and P say; `undistort` keeps the camera's axes and chooses the focal length
     by `keep`. The calibration that results comes with every image.
+
+    Methods: the lenses, Brown, "Decentering distortion of lenses", 1966, and Kannala and Brandt, 2006, by OpenCV;
+    `clahe`, Zuiderveld, "Contrast limited adaptive histogram equalization", 1994.
     """
 
     image: In[Image] = In(doc="raw image, grey or colour")

@@ -24,6 +24,9 @@ class StereoVisualOdometry(Operator):
     The pose is that of the left camera's optical frame, at every frame; `status` says what it rests on, as
     VisualOdometry's does. The images must be rectified: rows of the two correspond. A constant error of the
     disparities, as an imperfect rectification leaves it, is estimated on the way.
+
+    Methods: Lucas and Kanade, "An iterative image registration technique", 1981, in time and across the pair; RANSAC
+    PnP; a window of frames adjusted as in Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
     """
 
     left: In[Image] = In(doc="left image, rectified, grey or colour")

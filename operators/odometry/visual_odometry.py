@@ -42,6 +42,9 @@ class VisualOdometry(Operator):
     joins it to the old one when that is seen again. An image that is black or repeats the last one is not used. The
     images need not be registered, but must be free of lens distortion. Without `extrinsics` the two cameras are
     taken to coincide.
+
+    Methods: corners, Shi and Tomasi, "Good features to track", 1994; RANSAC PnP; point-to-plane alignment to the
+    surfaces of keyframes, Newcombe et al., "KinectFusion", 2011; views found again by SIFT, Lowe, 2004.
     """
 
     image: In[Image] = In(doc="colour or grey, of the same stamp")

@@ -46,3 +46,22 @@ def test_no_public_docstring_opens_with_a_question_word(repository: Path) -> Non
         if OPENS_WITH_A_QUESTION.match(first)
     ]
     assert not found, "\n".join(found)
+
+
+WITHOUT_A_METHOD = {
+    "BaseOdometry", "CloudBuilder", "CustomDetector", "DepthDecoder", "DepthSelfFilter",
+    "DepthWatch", "ImageClassifier", "ImageDecoder", "ImageWatch", "MotionCheck", "OnnxDetector",
+    "OnnxSegmenter", "ScanWatch", "SceneGraphMetrics", "ScoreFilter", "Segmenter", "SelfFilter",
+    "TorchvisionRigDetector", "TorchvisionRigSegmenter", "TrajectoryPlots",
+}  # fmt: skip
+"""Operators that apply a definition or a network of any make, or what this project thought of itself."""
+
+
+def test_every_other_operator_names_the_source_of_its_method(repository: Path) -> None:
+    page = (repository / "docs" / "operators.md").read_text(encoding="utf-8")
+    takes = dict(re.findall(r"^\| \[(\w+)\]\(#\w+\) \| (.*?) \|", page.split("\n## ", 1)[0], re.MULTILINE))
+    sections = {part.split("\n", 1)[0]: part for part in re.split(r"^### ", page, flags=re.MULTILINE)[1:]}
+    silent = {
+        name for name, types in takes.items() if types and not re.search(r"\b(19|20)\d\d\b|REP \d", sections[name])
+    }
+    assert silent == WITHOUT_A_METHOD

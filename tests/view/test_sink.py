@@ -42,8 +42,6 @@ from dataflow.view import (
 )
 from dataflow.view.backlog import Bounds
 from dataflow.view.blueprint import blueprint
-from dataflow.view.frames import Rank
-from dataflow.view.scene import SceneState
 
 STAMP = 1_700_000_000_000_000_000
 SECOND = 1_000_000_000
@@ -244,56 +242,6 @@ def test_curves_get_their_view_when_they_are_first_drawn(late: bool, tmp_path: P
     named = {row.values[0] for row in blueprint_rows(path) if row.component == "ViewBlueprint:display_name"}
     assert "imu/data gyroscope" in named
     assert ("imu/data orientation" in named) == late
-
-
-def test_where_a_sensor_scans_all_round_the_whole_place_is_in_view() -> None:
-    turn = np.linspace(0, 2 * np.pi, 64, endpoint=False)
-    room = np.column_stack([3 + 5 * np.cos(turn), 4 * np.sin(turn), np.linspace(-0.5, 2, 64)])
-    ahead = np.abs(room)
-    around, before = SceneState(), SceneState()
-    for scene, points in ((around, room - [1, 0, 0]), (before, ahead)):
-        scene.tree.place("world", "lidar", np.array([[1.0, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]),
-                         owner="r/base", rank=Rank.TREE, stamp=0)  # fmt: skip
-        scene.viewpoint.saw_points(scene.tree.pose("lidar"), points)
-
-    looked = around.viewpoint.outlook(around.tree)
-    assert looked.position is not None
-    assert looked.target is not None
-    assert np.allclose(looked.target[:2], [3, 0], atol=0.3)  # the middle of the room, in the world
-    assert looked.position[2] > 4
-    assert np.linalg.norm(looked.position - looked.target) > 5
-    nearer = before.viewpoint.outlook(before.tree).position
-    assert nearer is not None
-    assert nearer[2] < looked.position[2]
-
-
-def test_the_whole_way_of_a_run_without_ranges_is_in_view_when_it_is_over() -> None:
-    scene, away = SceneState(), np.eye(4)
-    away[:3, 3] = [10, 0, 0]
-    for x in np.linspace(0, 40, 5000):
-        scene.viewpoint.saw_places(away, [x, 4 * np.sin(x), 0])
-    scene.viewpoint.posed.setdefault("base")
-    scene.tree.place("world", "base", np.eye(4), owner="r/base", rank=Rank.TREE, stamp=0)
-    assert scene.viewpoint.knows_more
-
-    begun = scene.viewpoint.outlook(scene.tree)
-    over = scene.viewpoint.outlook(scene.tree, whole=True)
-
-    assert begun.target is not None
-    assert over.target is not None
-    assert over.position is not None
-    assert np.linalg.norm(begun.target) < 5
-    assert np.allclose(over.target, [30, 0, 0], atol=1)
-    assert np.linalg.norm(over.position - over.target) > 20
-
-
-def test_a_way_too_long_to_be_in_view_leaves_the_view_as_it_was() -> None:
-    scene = SceneState()
-    for x in range(0, 300, 3):
-        scene.viewpoint.saw_places(np.eye(4), [x, 0, 0])
-    scene.viewpoint.saw_range(np.full(10, 2.0))
-    before, over = (scene.viewpoint.outlook(scene.tree, whole=whole).position for whole in (False, True))
-    assert np.array_equal(before, over)
 
 
 def test_hidden_and_unknown_streams_are_passed_over(tmp_path: Path) -> None:

@@ -116,3 +116,7 @@ def test_a_truth_that_is_not_finite_is_counted_and_the_others_score() -> None:
     figures = operator.summary()
     assert (figures["matched"], figures["truths not finite"]) == (4, 1)
     assert figures["position_nees_mean"] == pytest.approx(1 / 3)
+
+
+def test_equal_poses_give_equal_figures_bit_for_bit() -> None:
+    assert figures(1.0) == figures(1.0) != figures(1.01)

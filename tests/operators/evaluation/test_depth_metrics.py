@@ -57,3 +57,10 @@ def test_nothing_to_judge_is_said() -> None:
 def test_two_sizes_are_an_error() -> None:
     with pytest.raises(OperatorFailure, match=r"depth has \(1, 2\) pixels, but the truth \(1, 1\)"):
         scored([image([[1.0, 1.0]])], [image([[1.0]])])
+
+
+def test_equal_depths_give_equal_figures_bit_for_bit() -> None:
+    rng = np.random.default_rng(0)
+    true = [image(rng.uniform(0.5, 6, (12, 16)), stamp) for stamp in (10, 20, 30)]
+    found = [image(one.data + rng.normal(0, 0.1, one.data.shape), one.stamp) for one in true]
+    assert scored(found, true) == scored(found, true) != scored(true, true)

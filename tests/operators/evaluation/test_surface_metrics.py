@@ -58,3 +58,7 @@ def test_another_frame_an_empty_surface_and_none_at_all_are_named() -> None:
     nothing = PointCloud(stamp=1, frame="world", points=np.zeros((0, 3), np.float32))
     assert scored([nothing], sheet())["f_score"] == "not computed: 0 points of the surface, 50000 true ones"
     assert scored([], sheet())["f_score"] == "not computed: no surface came"
+
+
+def test_equal_surfaces_give_equal_figures_though_points_of_them_are_drawn_at_random() -> None:
+    assert scored([sheet(0.01, width=3.0)], sheet()) == scored([sheet(0.01, width=3.0)], sheet())

@@ -212,3 +212,10 @@ def test_equal_trajectories_give_equal_figures() -> None:
     noisy = circle()
     noisy[:, :3, 3] += np.random.default_rng(5).normal(0, 0.02, (63, 3))
     assert score(noisy, circle()) == score(noisy, circle())
+
+
+def test_equal_paths_give_equal_figures_bit_for_bit() -> None:
+    path = circle()
+    found = path.copy()
+    found[:, :3, 3] += np.random.default_rng(0).normal(0, 0.05, (len(path), 3))
+    assert score(found, path) == score(found, path) != score(path, path)
