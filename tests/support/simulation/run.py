@@ -172,7 +172,7 @@ class Simulation:
             (f"{process}.runners", "BlackBox"): memory.black_box(world),
             ("dataflow.transport.links", "RingWriter"): memory.ring_writer(world),
             ("dataflow.transport.ring", "os"): system,
-            ("dataflow.transport.fanout", "os"): SimpleNamespace(sched_yield=_nothing),  # others' greenlets need no core
+            ("dataflow.transport.fanout", "os"): SimpleNamespace(sched_yield=_nothing),  # greenlets need no core
             (f"{supervision}.rings", "os"): system,
             (f"{supervision}.rings", "make_ring"): functools.partial(make_ring, self._ring_bytes),
             (f"{process}.operator_process", "limit_threads"): _nothing,
