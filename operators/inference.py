@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from operators.protobuf import field
+
 if TYPE_CHECKING:
     import onnxruntime
 
@@ -89,13 +91,4 @@ def _outputs(names: Sequence[str]) -> bytes:
 
     That is a ModelProto whose field 7, the graph, has a field 12, an output, with field 1, its name, for each.
     """
-    return b"".join(_field(7, _field(12, _field(1, name.encode()))) for name in names)
-
-
-def _field(number: int, content: bytes) -> bytes:
-    """Encodes one length-delimited field of protobuf's wire format."""
-    size, length = bytearray(), len(content)
-    while length > 127:
-        size.append(length & 127 | 128)
-        length >>= 7
-    return bytes([number << 3 | 2]) + bytes(size) + bytes([length]) + content
+    return b"".join(field(7, field(12, field(1, name.encode()))) for name in names)

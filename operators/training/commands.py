@@ -43,6 +43,7 @@ from operators.training.people_commands import train_activity
 from operators.training.refining import BORDERS, REFINER, BorderEpochs, RefinerEpochs, command_of, train_second
 from operators.training.running import input_size, keep_earlier, prepare, report, run_task, tell_data, variation_of
 from operators.training.torchvision_command import train_torchvision
+from operators.training.trunk_command import train_trunk
 
 __all__ = ["evaluate", "train"]
 
@@ -60,6 +61,7 @@ train = typer.Typer(
 )
 train.command("activity")(train_activity)
 train.command("torchvision")(train_torchvision)
+train.command("trunk")(train_trunk)
 for each in (REFINER, BORDERS):
     train.command(each.kind)(command_of(each))
 

@@ -2,7 +2,8 @@
 
 The metadata entry `dataflow.network` holds a JSON object with at least `kind`, `classes`, `width` and `height`. A
 second network, which looks again at what the first one answered, lies in the entry `dataflow.second`: an ONNX model of
-its own with such metadata, in base64. A file without one is used without.
+its own with such metadata, in base64. A file without one is used without. Where the first entry tells by `trunk` where
+a trunk ends, other networks of the process that have the same one share it.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import base64
 import binascii
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,11 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from operators.inference import ModelError, open_content, open_session
+from operators.weights.shared_trunk import SharedTrunk, divided, tensor_of
 
 if TYPE_CHECKING:
     import onnxruntime
 
-KEY, SECOND = "dataflow.network", "dataflow.second"
+KEY, SECOND, TRUNK = "dataflow.network", "dataflow.second", "trunk"
 _FOLDER = Path(__file__).parent
 
 
@@ -38,20 +40,35 @@ def shipped(name: str) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class Network:
-    """An opened network. `size` is the (width, height) of its input, `facts` its whole metadata."""
+    """An opened network. `size` is the (width, height) of its input, `facts` its whole metadata.
+
+    Where it has a `trunk`, `session` is of the head that follows it.
+    """
 
     file: Path
     size: tuple[int, int]
     classes: tuple[str, ...]
     facts: dict[str, Any]
     session: onnxruntime.InferenceSession
+    trunk: SharedTrunk | None = None
 
     def run(self, pixels: NDArray[np.uint8]) -> Sequence[NDArray[Any]]:
         """The outputs for an image (H, W, 3), RGB, of the input's size."""
-        tensor = np.ascontiguousarray(pixels.transpose(2, 0, 1)[None], np.float32)
-        tensor /= np.float32(255)
-        found: Sequence[NDArray[Any]] = self.session.run(None, {self.session.get_inputs()[0].name: tensor})
+        names = [each.name for each in self.session.get_inputs()]
+        if self.trunk is None:
+            given: dict[str, NDArray[Any]] = {names[0]: tensor_of(pixels)}
+        else:
+            maps = dict(zip(self.facts[TRUNK], self.trunk.maps(pixels), strict=True))
+            given = {name: maps[name] for name in names}
+        found: Sequence[NDArray[Any]] = self.session.run(None, given)
         return found
+
+    def revealing(self, names: Sequence[str]) -> Network:
+        """The network that gives these inner values after its outputs. Raises ModelError for a name that it does not
+        have."""
+        if self.trunk is None:
+            return replace(self, session=open_session(self.file, reveal=names))
+        return _divided(self, names)
 
 
 def open_network(file: Path, kind: str) -> Network:
@@ -72,7 +89,19 @@ def open_network(file: Path, kind: str) -> Network:
         raise NetworkFileError(
             f"{file} must have one input tensor(float) [1, 3, {size[1]}, {size[0]}], has {described}"
         )
-    return Network(file, size, tuple(map(str, facts["classes"])), facts, session)
+    network = Network(file, size, tuple(map(str, facts["classes"])), facts, session)
+    return _divided(network) if TRUNK in facts else network
+
+
+def _divided(network: Network, reveal: Sequence[str] = ()) -> Network:
+    file, ends = network.file, network.facts[TRUNK]
+    if not isinstance(ends, list) or not ends or not all(isinstance(each, str) for each in ends):
+        raise NetworkFileError(f"{file}: {TRUNK!r} in its metadata must be a list of names, is {ends!r}")
+    try:
+        trunk, head = divided(file.read_bytes(), ends, str(file), reveal)
+    except ValueError as error:
+        raise NetworkFileError(f"{file} cannot be divided into trunk and head: {error}") from None
+    return replace(network, session=head, trunk=trunk)
 
 
 @dataclass(frozen=True, eq=False)

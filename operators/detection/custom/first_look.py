@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from operators.detection.custom.decode import find_boxes
 from operators.detection.decode import Candidates
 from operators.detection.fit import Fit
-from operators.inference import open_session
 from operators.weights import NetworkFileError, open_network
 
 
@@ -42,7 +41,7 @@ class FirstLook:
 
     def reveal(self, names: Sequence[str]) -> None:
         """Lets the network give inner maps as well. Raises ModelError for a name that it does not have."""
-        self.network = replace(self.network, session=open_session(self.network.file, reveal=names))
+        self.network = self.network.revealing(names)
 
     def look(self, pixels: NDArray[np.uint8], threshold: float, nms_iou: float, most: int) -> Looked:
         """Finds the best `most` boxes in an image (H, W, 3), RGB.
