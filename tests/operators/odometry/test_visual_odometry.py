@@ -259,7 +259,7 @@ def test_first_frames_of_a_camera_that_tracks_well_count_as_those_after_them() -
         if known is not None:
             carried = moved_covariance(known.covariance, known.T_world_camera, result.T_world_camera)
             added.append(np.sqrt(np.trace((result.covariance - carried)[:3, :3])))
-    assert max(added[:5]) < 3 * np.median(added[20:])
+    assert max(added[:5]) < 5 * np.median(added[20:])
 
 
 # -- failures ------------------------------------------------------------------------------------------------
