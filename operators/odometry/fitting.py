@@ -24,22 +24,24 @@ from operators.odometry.settings import RgbdOdometryConfig
 # over several pixels, tracks share motion blur), so they do not average like independent draws.
 PLANE_STRENGTH = 0.1
 PIXEL_STRENGTH = 0.2
-# Drift that no residual of one frame shows: variances are this much larger than residuals say (calibrated against
-# truth, see the benchmark). Calibration, rolling shutters and unsynchronised images err alike in every residual, so no
-# count averages them out, but tracks then miss by more than they jitter; and what moves may do so unnoticed.
-SYSTEMATIC = 0.75
-JITTER = 0.33  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
-MOVING = 10.0  # of the share of the view that moves
-MINORITY = 100.0  # of the share by which tracks that agree fall short of a half
+# What variances are of those that the residuals say (calibrated against truth, see the benchmark): the strengths above
+# believe too little where all is well. Calibration, rolling shutters and unsynchronised images err alike in every
+# residual, so no count averages them out, but tracks then miss by more than they jitter. And what moves by less than a
+# gate is wide pulls a pose along by its share of the view, however many residuals there are; it shows as a share of
+# the depth and of the tracks that disagree.
+SYSTEMATIC = 0.43
+JITTER = 0.38  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
+CONTESTED = 120.0  # of the product of both shares, and of the square of the gate
 
 RIVAL = 0.33  # of the tracks that agree: as many that agree on another motion contest it
 
 STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
 
 
-def systematic(noise: Noise) -> float:
-    """Returns how much larger variances are, for what errs alike in all residuals, than residuals say."""
-    return max(1.0, noise.pixel / JITTER) ** 4
+def systematic(missed: float) -> float:
+    """Returns how much larger variances are, for what errs alike in all residuals, where tracks miss by so many working
+    pixels."""
+    return max(1.0, missed / JITTER) ** 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,12 +61,6 @@ class Sighting:
         """The points (N, 3) in the depth camera."""
         return transform_points(invert(self.T_world_camera), self.points_world)
 
-    @property
-    def minority(self) -> float:
-        """Says by how much the share of features that agree falls short of a half, 0 to 0.5: a pose that most of them
-        contradict may be that of something that moves. Descriptors that pair wrongly contradict nothing."""
-        return 0.0 if self.recognised or not self.tracked else max(0.0, 0.5 - len(self.pixels) / self.tracked)
-
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -78,6 +74,7 @@ class Fit:
     compared: int  # of these, those that met a reference surface
     agreeing: int  # of these, those that lie on it
     noise: Noise
+    missed: float  # working pixels by which this frame's tracks miss; without any, those before
     movers: Movers
     sighting: Sighting | None
 
@@ -101,10 +98,22 @@ class Fit:
         return self.sighting is not None and self.sighting.recognised
 
     @property
+    def contested(self) -> float:
+        """Share of the depth that disagrees times that of the tracks; where only one can say, its square.
+
+        Descriptors that pair wrongly contradict nothing.
+        """
+        shares = [1.0 - self.depth_inliers] if self.compared else []
+        if self.sighting is not None and self.sighting.tracked and not self.sighting.recognised:
+            shares.append(1.0 - self.inliers / self.sighting.tracked)
+        return shares[0] * shares[-1] if shares else 0.0
+
+    @property
     def covariance(self) -> Matrix:
-        misfit = systematic(self.noise) + MOVING * self.movers.share
-        doubt = 1.0 + MINORITY * (self.sighting.minority if self.sighting else 0.0)
-        return SYSTEMATIC * misfit * doubt * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
+        """(6, 6) of the pose against its references, right perturbation: see SYSTEMATIC."""
+        gate = max(1.0, self.noise.pixel / JITTER) ** 2
+        misfit = systematic(self.missed) + CONTESTED * gate * self.contested
+        return SYSTEMATIC * misfit * np.asarray(np.linalg.inv(self.information + self.prior), np.float64)
 
     @property
     def weakest_sigma(self) -> float:
@@ -213,7 +222,7 @@ class Fitter:
             alignment = align(T, [*features, *surfaces], prior, iterations)
             T = alignment.T_world_camera
         corners, depth = alignment.normals[: len(features)], alignment.normals[len(features) :]
-        followed = corners if sighting and not sighting.recognised else ()
+        followed = corners[0].median if corners and sighting and not sighting.recognised else None
         return Fit(
             T_world_camera=T,
             information=alignment.information,
@@ -222,9 +231,8 @@ class Fitter:
             offered=len(points) * len(depth),
             compared=sum(part.seen for part in depth),
             agreeing=sum(part.inliers for part in depth),
-            noise=self.noise.after(
-                followed[0].median if followed else None, depth[0].median if depth and followed else None
-            ),
+            noise=self.noise.after(followed, depth[0].median if depth and followed is not None else None),
+            missed=self.noise.missed(followed),
             movers=movers,
             sighting=sighting,
         )

@@ -1,7 +1,7 @@
 """Keyframes: views with a known pose that later frames are measured against."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import Pixels, Points
-from operators.geometry.se3 import Matrix
+from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.features import Gray
 from operators.odometry.recognition import Description, describe
 from operators.odometry.surface import Surface
@@ -28,6 +28,7 @@ class Keyframe:
     points: Points  # (N, 3) the same corners in this view's depth camera
     ages: NDArray[np.int64]  # (N,) keyframes that have confirmed each corner's point
     segment: int = 0  # maps begun before this one after a loss; two segments share no known motion
+    sunk: Vector = field(default_factory=lambda: np.zeros(6))  # part of the covariance: a standard deviation that grows
 
     @cached_property
     def points_world(self) -> Points:

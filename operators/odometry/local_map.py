@@ -56,6 +56,7 @@ class LocalMap:
                 k,
                 T_world_camera=orthonormalised(T_known_newest @ k.T_world_camera),
                 covariance=known.covariance,
+                sunk=known.sunk,
                 segment=known.segment,
             )
             if k.segment == segment

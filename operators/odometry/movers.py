@@ -73,10 +73,6 @@ class Movers:
         moving = np.kron(self.tiles, np.ones((TILE, TILE), np.bool_))[:h, :w]
         return Surface(np.where(moving, np.float32(0), surface.inverse_depth), surface.K)
 
-    @property
-    def share(self) -> float:
-        return float(self.tiles.mean())
-
 
 def _tiles(shape: tuple[int, int]) -> tuple[int, int]:
     return -(-shape[0] // TILE), -(-shape[1] // TILE)

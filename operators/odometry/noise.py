@@ -29,9 +29,16 @@ class Noise:
             _blend(self.depth, depth_median, MEDIAN_OF_ONE, DEPTH_BOUNDS),
         )
 
+    def missed(self, pixel_median: float | None) -> float:
+        """Returns the standard deviation of one frame's tracks, working pixels, by such a median alone."""
+        return self.pixel if pixel_median is None else _seen(self.pixel, pixel_median, MEDIAN_OF_TWO)
+
 
 def _blend(sigma: float, median: float | None, expected: float, bounds: tuple[float, float]) -> float:
     if median is None:
         return sigma
-    seen = sigma * float(np.sqrt(median / expected))
-    return float(np.clip((1.0 - RATE) * sigma + RATE * seen, *bounds))
+    return float(np.clip((1.0 - RATE) * sigma + RATE * _seen(sigma, median, expected), *bounds))
+
+
+def _seen(sigma: float, median: float, expected: float) -> float:
+    return sigma * float(np.sqrt(median / expected))

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
-from operators.geometry.se3 import Matrix
+from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.corners import Corners, Layer, renewed, with_new
+from operators.odometry.drift import carried
 from operators.odometry.features import track_corners, with_exposure_of
 from operators.odometry.fitting import Fit, Fitter, Sighting
 from operators.odometry.frame import Frame, observe
@@ -172,8 +173,9 @@ class RgbdOdometry:
         status = Status.RELOCALISED if self._motion.blind_s > self.config.patience_s else Status.TRACKING
         self._motion = self._motion.measured(frame.stamp, T)
         self._noise = fit.noise
-        self._covariance = moved_covariance(newest.covariance, newest.T_world_camera, T) + fit.covariance
-        keyframe = self._new_keyframe(frame, fit)
+        covariance, sunk = carried(newest, T)
+        self._covariance = covariance + fit.covariance
+        keyframe = self._new_keyframe(frame, fit, sunk)
         reason = _support(frame, fit)
         if self._apart_since is not None:
             if frame.stamp - self._apart_since < self.config.give_up_s * 1e9:
@@ -192,8 +194,9 @@ class RgbdOdometry:
                 self._map.drop_newest_segment()
         self._apart_since, self._recalls = None, 0
         self._motion = Motion(frame.stamp, T, np.zeros(6))
-        self._covariance = moved_covariance(known.covariance, known.T_world_camera, T) + found.covariance
-        keyframe = self._new_keyframe(frame, found)
+        covariance, sunk = carried(known, T)
+        self._covariance = covariance + found.covariance
+        keyframe = self._new_keyframe(frame, found, sunk)
         return self._result(Status.RELOCALISED, f"the map found again by {found.inliers} features", found, keyframe)
 
     def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
@@ -219,7 +222,7 @@ class RgbdOdometry:
 
     # -- keyframes ---------------------------------------------------------------------------------------
 
-    def _new_keyframe(self, frame: Frame, fit: Fit) -> bool:
+    def _new_keyframe(self, frame: Frame, fit: Fit, sunk: Vector) -> bool:
         """Remembers the frame, where a keyframe is due and it serves the next frames better than the newest."""
         newest, surface = self._map.newest, fit.movers.left_out_of(frame.surface)
         baseline = view_distance(newest.T_world_camera, fit.T_world_camera, surface.typical_depth)
@@ -233,7 +236,7 @@ class RgbdOdometry:
         richer = len(candidate.points) > 1.5 * fit.inliers + self.config.min_inliers
         due = richer or ((moved or better) and len(candidate.points) >= fit.inliers)
         if due:
-            self._map.add(candidate)
+            self._map.add(replace(candidate, sunk=sunk))
         return due
 
     def _keyframe(self, frame: Frame, fit: Fit | None) -> Keyframe:

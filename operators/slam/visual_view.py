@@ -32,7 +32,7 @@ STRIDE = 4  # patches of a surface from one point of the map's cloud to the next
 SURE = 0.25  # of the covariance that the odometry's fit claims for a frame, which allows for drift (see the benchmark)
 # Working pixels. Tracks that miss by more tell of colour and depth that are not of one place and time, and then every
 # sight errs anew: its variance grows with the fourth power of it.
-ASTRAY = 0.6
+ASTRAY = 0.45
 PIXELS = 3.0  # working pixels by which a recognised feature may be off
 FIRST = 8  # features that a first pose may rest on, by which others are looked for
 FOUND = 6.0  # working pixels around where a first pose has a feature, in which it is looked for

@@ -60,7 +60,6 @@ def test_the_larger_surface_stands_still_though_most_corners_are_on_something_ne
 
     assert off(found) < 0.01 < off(most)
     assert found.tracked == 170
-    assert found.minority > 0.1
     where = project(found.contrary, K)
     assert len(where) >= 100
     assert where[:, 0].min() > 115
