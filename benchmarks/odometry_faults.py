@@ -125,21 +125,28 @@ def main() -> None:
     K_color[0, 0] = K_color[1, 1] = 525.0
     camera = RgbdCamera(K_color, K_depth)
     begins = [b for b in arguments.begins if 0 < b < len(frames)]
-    rows = [
-        {"fault": name, "begins": b} | run(frames, truth, camera, fault, b)
+    chosen = {
+        name: fault
         for name, fault in FAULTS.items()
         if not arguments.fault or any(part in name for part in arguments.fault)
-        for b in (begins if fault.frames else begins[:1])
-    ]
+    }
+    rows = []
+    if not arguments.json:
+        print("| fault | from frame | ATE cm | ATE where tracked cm | tracked % | found again, frames |")
+        print("| --- | ---: | ---: | ---: | ---: | ---: |")
+    for name, fault in chosen.items():
+        for b in begins if fault.frames else begins[:1]:
+            rows.append({"fault": name, "begins": b} | run(frames, truth, camera, fault, b))
+            if not arguments.json:
+                show(rows[-1])
     if arguments.json:
         print(json.dumps(rows, indent=1))
-        return
-    print("| fault | from frame | ATE cm | ATE where tracked cm | tracked % | found again, frames |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: |")
-    for row in rows:
-        figures = " | ".join(f"{row[name]:.2f}" for name in ("ate_cm", "ate_tracked_cm"))
-        figures += f" | {row['tracked_percent']:.1f} | {row['found_again_frames']:.0f}"
-        print(f"| {row['fault']} | {row['begins'] if FAULTS[row['fault']].frames else ''} | {figures} |")
+
+
+def show(row: dict[str, Any]) -> None:
+    figures = " | ".join(f"{row[name]:.2f}" for name in ("ate_cm", "ate_tracked_cm"))
+    figures += f" | {row['tracked_percent']:.1f} | {row['found_again_frames']:.0f}"
+    print(f"| {row['fault']} | {row['begins'] if FAULTS[row['fault']].frames else ''} | {figures} |", flush=True)
 
 
 def numbers(text: str) -> list[int]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -100,6 +101,7 @@ def shared(drive: Drive, i: int, begins: int) -> float:
     return max(shares)
 
 
+@lru_cache(maxsize=100)
 def _surface(drive: Drive, i: int) -> Surface:
     return Surface.from_depth(drive.depth[i], drive.camera.K_depth, 0.3, 6.0, 2)
 

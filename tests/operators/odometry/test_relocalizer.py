@@ -109,9 +109,8 @@ def test_a_like_pattern_of_another_shape_is_not_certain() -> None:
 
 def test_light_that_changes_leaves_a_view_alike() -> None:
     frame = view(pattern(1), 420)
-    darker = observe(
-        cv2.convertScaleAbs(frame.gray, alpha=0.5, beta=20), frame.depth, 1_000_000_000, K, K, CONFIG, Watch()
-    )
+    dark = (frame.gray * 0.5 + 20.0).astype(np.uint8)
+    darker = observe(dark, frame.depth, 1_000_000_000, K, K, CONFIG, Watch())
     assert gathered(darker, at(420), [keyframe(pattern(1), 400)], CAMERA).certain
 
 
