@@ -86,13 +86,6 @@ class Fit:
     def depth_agrees(self) -> bool:
         return self.compared > max(100, 0.1 * self.offered) and self.depth_inliers > 0.5
 
-    def certain(self, many: int, few: int) -> bool:
-        """Returns whether a recognised pose stands: by many features, or by few that depth confirms."""
-        met = self.compared > max(100, 0.1 * self.offered)
-        if self.inliers >= many:
-            return self.depth_agrees or not met
-        return self.inliers >= few and self.compared > 0.3 * self.offered and self.depth_inliers > 0.85
-
     @property
     def recognised(self) -> bool:
         return self.sighting is not None and self.sighting.recognised

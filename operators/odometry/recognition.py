@@ -4,7 +4,7 @@ Lowe, "Distinctive image features from scale-invariant keypoints", 2004. They co
 they are made of a keyframe only when a lost camera asks for it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -15,21 +15,25 @@ from operators.odometry.features import Gray
 
 COUNT = 500
 RATIO = 0.8  # a match is distinctive where the second nearest is so much farther
+DOUBTFUL = 0.9  # the same, where the whole of many matches is judged
+GROWTH = 1.6  # factor by which the same thing may look larger or smaller, where its depth is known
 
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Pixels (N, 2) of a working image and their descriptors (N, 128)."""
+    """Pixels (N, 2) of a working image, their descriptors (N, 128), and how many pixels (N,) each describes across."""
 
     pixels: Pixels
     descriptors: NDArray[np.float32]
+    sizes: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
 def describe(gray: Gray) -> Description:
     points, descriptors = cv2.SIFT.create(COUNT, contrastThreshold=0.02).detectAndCompute(gray, None)
     if descriptors is None:
         return Description(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    return Description(np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.float32))
+    pixels, sizes = np.array([p.pt for p in points], np.float64), np.array([p.size for p in points], np.float64)
+    return Description(pixels, np.asarray(descriptors, np.float32), sizes)
 
 
 def match(a: Description, b: Description) -> NDArray[np.int64]:
@@ -44,3 +48,28 @@ def match(a: Description, b: Description) -> NDArray[np.int64]:
             if m.trainIdx not in best or m.distance < best[m.trainIdx][0]:
                 best[m.trainIdx] = (m.distance, m.queryIdx)
     return np.array([(query, train) for train, (_, query) in sorted(best.items())], np.int64).reshape(-1, 2)
+
+
+def match_of_size(
+    a: NDArray[np.float32], b: NDArray[np.float32], size_a: NDArray[np.float64], size_b: NDArray[np.float64], most: int
+) -> NDArray[np.int64]:
+    """Returns pairs of indices (M, 2), each b once, that are distinctly nearest among those of a like size (metres).
+
+    What is as large there as here leaves fewer rivals than all do, so more of the right ones are distinct. The nearest
+    come first, at most `most` of them.
+    """
+    if len(a) < 2 or len(b) < 2:
+        return np.zeros((0, 2), np.int64)
+    square = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
+    unlike = np.abs(np.log(size_a)[:, None] - np.log(size_b)) > np.log(GROWTH)
+    square = np.where(unlike, np.float32(np.inf), np.maximum(square, 0.0))
+    nearest = np.argmin(square, axis=1)
+    rows = np.arange(len(a))
+    first = square[rows, nearest]
+    square[rows, nearest] = np.inf
+    second = square.min(axis=1)
+    distinct = np.flatnonzero(np.isfinite(first) & (first < DOUBTFUL**2 * second))
+    order = distinct[np.argsort(first[distinct], kind="stable")]
+    _, once = np.unique(nearest[order], return_index=True)
+    kept = order[np.sort(once)][:most]
+    return np.column_stack([kept, nearest[kept]]).astype(np.int64)

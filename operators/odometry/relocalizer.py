@@ -1,17 +1,37 @@
-"""Finds a lost camera's view among remembered keyframes."""
+"""Finds a lost camera's view among remembered keyframes.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+Where depth is seen, points of several keyframes are paired with those of the view, and the motion on which most agree
+is refined and judged by all that both see. Without depth, the pixels of one keyframe's points give the pose.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
 from operators.geometry.pinhole import Pixels, Points, project, unproject
+from operators.geometry.se3 import Matrix
 from operators.odometry.camera import RgbdCamera
+from operators.odometry.consensus import consensus
+from operators.odometry.evidence import gathered, seeing
 from operators.odometry.features import Gray
-from operators.odometry.keyframe import Keyframe
-from operators.odometry.recognition import describe, match
+from operators.odometry.fitting import Fit, Fitter, Sighting
+from operators.odometry.frame import Frame
+from operators.odometry.keyframe import Keyframe, view_distance
+from operators.odometry.local_map import LocalMap
+from operators.odometry.motion import Motion
+from operators.odometry.recognition import Description, describe, match, match_of_size
+from operators.odometry.surface import Surface
+
+PAIRS = 60  # features of one keyframe that are paired
+FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
+VIEWS = 2  # keyframes that a recognised view is compared with
+TYPICAL_DEPTH = 2.0  # metres
+SPARSE = 4  # patches of the view's surface between points by which these are chosen
+FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
+RECALL_PIXELS = 3.0  # working pixels by which such a feature may be off
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +41,80 @@ class Recall:
     keyframe: Keyframe
     points_world: Points
     pixels: Pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Landmarks:
+    """Features with depth: pixels (N, 2), points (N, 3) in the depth camera, sizes (N,) in metres, descriptors."""
+
+    pixels: Pixels
+    points: Points
+    sizes: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+
+    @staticmethod
+    def of(description: Description, surface: Surface, camera: RgbdCamera) -> "Landmarks":
+        points, known = lifted(description.pixels, surface, camera)
+        sizes = description.sizes[known] * points[known, 2]
+        return Landmarks(description.pixels[known], points[known], sizes, description.descriptors[known])
+
+
+def recognised(
+    frame: Frame, chosen: Sequence[Keyframe], fitter: Fitter, motion: Motion, T_predicted: Matrix, known: LocalMap
+) -> Iterator[tuple[Fit, Keyframe]]:
+    """Yields a frame's poses among chosen keyframes, refined and certain, each with the keyframe that shows most."""
+    if frame.depth_flaw is not None:
+        yield from _by_pixels(frame, chosen, fitter, motion, T_predicted, known)
+        return
+    seen = Landmarks.of(describe(frame.gray), frame.surface, fitter.camera)
+    for segment in sorted({k.segment for k in chosen}):
+        keyframes = [k for k in chosen if k.segment == segment]
+        sighting = common(seen, keyframes, fitter.camera)
+        if sighting is None:
+            continue
+        points = frame.surface.points(SPARSE)
+        there = [k for k in known.keyframes if k.segment == segment]
+        views = seeing(points, sighting.T_world_camera, there, VIEWS)
+        if not views:
+            continue
+        compared = LocalMap(VIEWS)
+        compared.keyframes = views
+        fit = fitter.refine(frame, sighting, motion, T_predicted, compared, segment)
+        views = seeing(points, fit.T_world_camera, there, VIEWS)
+        if gathered(frame, fit.T_world_camera, views, fitter.camera).certain:
+            yield fit, views[-1]
+
+
+def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Sighting | None:
+    """Returns the pose in which most of a view's features lie where keyframes of one segment have them."""
+    known, names = [np.zeros((0, 3))], [np.zeros(0, np.int64)]
+    for keyframe in keyframes:
+        landmarks = Landmarks.of(keyframe.description, keyframe.surface, camera)
+        pairs = match_of_size(landmarks.descriptors, seen.descriptors, landmarks.sizes, seen.sizes, PAIRS)
+        known.append(transform_points(keyframe.T_world_camera, landmarks.points[pairs[:, 0]]))
+        names.append(pairs[:, 1])
+    points, which = np.concatenate(known), np.concatenate(names)
+    found = consensus(points, seen.points[which], which)
+    if found is None or found.count < FEWEST:
+        return None
+    pixels, ages = seen.pixels[which[found.agree]], np.zeros(np.count_nonzero(found.agree), np.int64)
+    return Sighting(found.T_a_b, points[found.agree], pixels, ages, len(points), recognised=True)
+
+
+def _by_pixels(
+    frame: Frame, chosen: Sequence[Keyframe], fitter: Fitter, motion: Motion, T_predicted: Matrix, known: LocalMap
+) -> Iterator[tuple[Fit, Keyframe]]:
+    """Does as `recognised` where the view has no depth: by what it has in common with one keyframe."""
+    few, many = FEWEST_PIXELS, fitter.config.min_inliers
+    for recall in recalls(frame.gray, chosen, fitter.camera, few):
+        ages = np.zeros(len(recall.pixels), np.int64)
+        sighting = fitter.solve(recall.points_world, recall.pixels, ages, RECALL_PIXELS, few)
+        if sighting is None:
+            continue
+        sighting = replace(sighting, recognised=True)
+        fit = fitter.refine(frame, sighting, motion, T_predicted, known, recall.keyframe.segment)
+        if fit.inliers >= many:
+            yield fit, recall.keyframe
 
 
 def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewest: int) -> list[Recall]:
@@ -38,18 +132,23 @@ def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewes
     return sorted(found, key=lambda recall: -len(recall.pixels))
 
 
-def candidates(near: Sequence[Keyframe], others: Sequence[Keyframe], count: int, turn: int) -> list[Keyframe]:
-    """Returns the nearest keyframes and, in turns, some of the others: all are tried within a few frames."""
-    rest = [k for k in others if not any(k is n for n in near)]
-    take = min(max(count - len(near), 0), len(rest))
-    return [*near, *(rest[(turn * take + i) % len(rest)] for i in range(take))]
+def candidates(keyframes: Sequence[Keyframe], T_predicted: Matrix, near: int, others: int, turn: int) -> list[Keyframe]:
+    """Returns those nearest to a predicted view and, in turns, others: all are tried within a few frames."""
+    ranked = sorted(keyframes, key=lambda k: view_distance(k.T_world_camera, T_predicted, TYPICAL_DEPTH))
+    rest = ranked[near:]
+    take = min(others, len(rest))
+    return [*ranked[:near], *(rest[(turn * take + i) % len(rest)] for i in range(take))]
 
 
 def rough_points(keyframe: Keyframe, chosen: NDArray[np.int64], camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
     """Returns points (N, 3) of described pixels, and which are known: many lie on edges, where either depth may do."""
-    surface = keyframe.surface
+    return lifted(keyframe.description.pixels[chosen], keyframe.surface, camera)
+
+
+def lifted(pixels: Pixels, surface: Surface, camera: RgbdCamera) -> tuple[Points, NDArray[np.bool_]]:
+    """Returns the points (N, 3) of a surface that colour pixels (N, 2) see, depth camera, and which are known."""
     inverse, (h, w) = surface.inverse_depth, surface.inverse_depth.shape
-    rays = unproject(keyframe.description.pixels[chosen], camera.K_color) @ camera.T_depth_color[:3, :3].T
+    rays = unproject(pixels, camera.K_color) @ camera.T_depth_color[:3, :3].T
     origin = camera.T_depth_color[:3, 3]
     points, known = origin + 2.0 * rays, np.zeros(len(rays), np.bool_)
     for _ in range(3):

@@ -26,16 +26,18 @@ from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
 from operators.odometry.movers import Movers
 from operators.odometry.noise import Noise
-from operators.odometry.relocalizer import candidates, recalls
+from operators.odometry.relocalizer import candidates, recognised
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 from operators.odometry.watch import Watch
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
-RECALLED = 3  # keyframes that a lost camera compares one frame with
-FEWEST_RECALLED = 7  # features by which a view may be recognised, if its depth confirms them
-RECALL_PIXELS = 3.0  # working pixels by which a recognised feature may be off
-RECALL_EVERY = 3  # frames, while a new map is tracked
+RECALL_NEAR, RECALL_OTHERS = (
+    3,
+    5,
+)  # keyframes near the prediction and elsewhere that a lost camera compares one frame with
+RECALL_EVERY = 3  # frames, while a new map is tracked for longer than
+RECALL_ALWAYS_S = 1.0  # seconds, for which every frame is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +93,7 @@ class RgbdOdometry:
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
             return self._relocalised(frame, fit, *recalled)
-        return self._followed(frame, fit) if self._measured(fit) else self._guessed(frame, fit)
+        return self._followed(frame, fit) if self._measured(frame, fit) else self._guessed(frame, fit)
 
     # -- the steps ---------------------------------------------------------------------------------------
 
@@ -137,34 +139,37 @@ class RgbdOdometry:
         assert self._motion is not None
         return self._fitter.refine(frame, sighting, self._motion, T_predicted, self._map, known.segment)
 
-    def _measured(self, fit: Fit) -> bool:
-        return fit.inliers >= self.config.min_inliers or (fit.depth_agrees and fit.weakest_sigma < 0.05)
+    def _measured(self, frame: Frame, fit: Fit) -> bool:
+        """Returns whether a fit counts: after a gap, depth alone may fit where a like surface is, so corners decide."""
+        assert self._motion is not None
+        if fit.inliers >= self.config.min_inliers:
+            return True
+        gap = self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
+        missed = frame.image_flaw is None and len(self._map.newest.points) >= 2 * self.config.min_inliers
+        return fit.depth_agrees and fit.weakest_sigma < 0.05 and not (gap and missed)
 
     def _recall(self, frame: Frame, fit: Fit, T_predicted: Matrix) -> tuple[Fit, Keyframe] | None:
         """Looks for the view in the map: always while nothing is measured, now and then in a new map."""
         assert self._motion is not None
-        measured = self._measured(fit)
+        measured = self._measured(frame, fit)
         if measured and self._apart_since is None:
             self._recalls = 0
             return None
         self._recalls += 1
-        if frame.image_flaw is not None or (measured and self._recalls % RECALL_EVERY):
+        if frame.image_flaw is not None or (measured and not self._recall_due(frame.stamp)):
             return None
-        near = [] if measured else self._map.nearby(T_predicted, 2, self._map.newest.segment)
         others = self._map.elsewhere if measured else self._map.keyframes
-        chosen = candidates(near, others, RECALLED, self._recalls // (RECALL_EVERY if measured else 1))
-        for recall in recalls(frame.gray, chosen, self._working, FEWEST_RECALLED):
-            ages = np.zeros(len(recall.pixels), np.int64)
-            sighting = self._fitter.solve(recall.points_world, recall.pixels, ages, RECALL_PIXELS, FEWEST_RECALLED)
-            if sighting is None:
-                continue
-            found = self._refine(frame, replace(sighting, recognised=True), T_predicted, recall.keyframe)
-            if not found.certain(self.config.min_inliers, FEWEST_RECALLED):
-                continue
-            here = recall.keyframe.segment == self._map.newest.segment
+        chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self._recalls)
+        for found, known in recognised(frame, chosen, self._fitter, self._motion, T_predicted, self._map):
+            here = known.segment == self._map.newest.segment
             if not here or self._plausible(frame.stamp, found.T_world_camera, T_predicted):
-                return found, recall.keyframe
+                return found, known
         return None
+
+    def _recall_due(self, stamp: int) -> bool:
+        """Returns whether a new map that is tracked is searched for its place now."""
+        assert self._apart_since is not None
+        return stamp - self._apart_since < RECALL_ALWAYS_S * 1e9 or self._recalls % RECALL_EVERY == 0
 
     def _followed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Takes up a pose that was measured against the newest keyframes."""
@@ -188,7 +193,7 @@ class RgbdOdometry:
         assert self._motion is not None
         T = found.T_world_camera
         if known.segment != self._map.newest.segment:
-            if self._measured(fit):
+            if self._measured(frame, fit):
                 self._map.join(known, T @ invert(fit.T_world_camera))
             else:
                 self._map.drop_newest_segment()

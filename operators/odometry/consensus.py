@@ -1,0 +1,106 @@
+"""The rigid motion that most of many doubtful pairs of points agree on, where nine in ten may be wrong.
+
+Two pairs agree where they lie as far apart in one view as in the other; a clique of pairs that all agree gives the
+motion (Leordeanu and Hebert, 2005; Yang et al., "TEASER", 2020). Random samples of three would need thousands.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dataflow.messages.geometry import transform_points
+from operators.geometry.pinhole import Points
+from operators.geometry.se3 import Matrix
+
+SLACK = 0.04  # metres by which two distances may differ, and so much more for each metre of depth
+SLACK_PER_METRE = 0.01
+APART = 0.15  # metres: points nearer to each other say nothing of a rotation
+GATE = 0.12  # metres by which a point may be off the motion
+SEEDS = 4  # cliques that are tried
+FEWEST = 4  # points of a clique
+
+
+@dataclass(frozen=True, eq=False)
+class Consensus:
+    """T_a_b, which of the pairs (N,) agree with it, and how many different points of b these are."""
+
+    T_a_b: Matrix
+    agree: NDArray[np.bool_]
+    count: int
+
+
+def consensus(a: Points, b: Points, names: NDArray[np.int64]) -> Consensus | None:
+    """Returns the motion for which most pairs (N, 3), (N, 3) agree; b in a camera's axes, z forward.
+
+    A point of b may come in several pairs, by the same name (N,), and counts once.
+    """
+    if len(a) < FEWEST:
+        return None
+    slack = SLACK / 2 + SLACK_PER_METRE * b[:, 2]
+    between_b = _distances(b)
+    fits = (np.abs(_distances(a) - between_b) < slack[:, None] + slack) & (between_b > APART)
+    links = fits.astype(np.float32)
+    triangles = ((links @ links) * links).sum(axis=1)
+    best: Consensus | None = None
+    tried = np.zeros(len(a), np.bool_)
+    for _ in range(SEEDS):
+        seed = int(np.argmax(np.where(tried, -1.0, triangles)))
+        if tried[seed] or triangles[seed] <= 0:
+            break
+        clique = _clique(links, seed)
+        tried[clique] = True
+        if len(np.unique(names[clique])) < FEWEST:
+            continue
+        found = _grown(a, b, names, clique)
+        tried |= found.agree
+        if best is None or found.count > best.count:
+            best = found
+    return best
+
+
+def rigid(a: Points, b: Points) -> Matrix:
+    """Returns T_a_b of least squares for pairs (N, 3). Kabsch, 1976."""
+    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
+    U, _, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, mean_a - R @ mean_b
+    return T
+
+
+def _clique(links: NDArray[np.float32], seed: int) -> NDArray[np.intp]:
+    """Returns pairs that all agree: a seed and its friends, those with most friends among the rest first."""
+    friends = np.flatnonzero(links[seed])
+    among = links[np.ix_(friends, friends)]
+    chosen, left = [seed], np.ones(len(friends), np.float32)
+    while left.any():
+        next_ = int(np.argmax(np.where(left > 0, among @ left, -1.0)))
+        chosen.append(int(friends[next_]))
+        left[next_] = 0.0
+        left *= among[next_]
+    return np.array(chosen, np.intp)
+
+
+def _grown(a: Points, b: Points, names: NDArray[np.int64], clique: NDArray[np.intp]) -> Consensus:
+    """Returns the motion of a clique, fitted again to all pairs that agree with it."""
+    T = rigid(a[clique], b[clique])
+    for _ in range(5):
+        agree = _near(a, b, T)
+        if len(np.unique(names[agree])) < FEWEST:
+            break
+        T = rigid(a[agree], b[agree])
+    agree = _near(a, b, T)
+    return Consensus(T, agree, len(np.unique(names[agree])))
+
+
+def _near(a: Points, b: Points, T_a_b: Matrix) -> NDArray[np.bool_]:
+    off = transform_points(T_a_b, b) - a
+    return np.asarray(np.einsum("ij,ij->i", off, off) < GATE**2, np.bool_)
+
+
+def _distances(points: Points) -> NDArray[np.float64]:
+    """Returns the distances (N, N) of points (N, 3) from each other."""
+    square = np.einsum("ij,ij->i", points, points)
+    gram = points @ points.T
+    return np.asarray(np.sqrt(np.maximum(square[:, None] + square - 2.0 * gram, 0.0)), np.float64)
