@@ -14,7 +14,7 @@ class Usual:
 
     What is `round` has the outline of an ellipse, as seen from above. What is leafy shows points that are inside its
     box, by the share `inset` of half its side. What stands on the floor may have so much of its `foot`
-    hidden, metres; 0 for what does not.
+    hidden, metres; 0 for what does not. What lies `along` the room does so always: it stands at a wall or in one.
     """
 
     size: tuple[float, float, float]
@@ -22,6 +22,7 @@ class Usual:
     round: bool = False
     inset: float = 0.0
     foot: float = 0.0
+    along: bool = False
 
 
 CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
@@ -31,8 +32,8 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     ),
     "chair": (Usual((0.47, 0.50, 0.96), (0.16, 0.13, 0.12), foot=0.2),),
     "table": (Usual((0.60, 1.50, 0.75), (0.40, 0.40, 0.16), foot=0.2),),
-    "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25), foot=0.2),),
-    "door": (Usual((0.18, 1.06, 2.13), (0.50, 0.10, 0.05), foot=0.2),),
+    "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25), foot=0.2, along=True),),
+    "door": (Usual((0.18, 1.06, 2.13), (0.50, 0.10, 0.05), foot=0.2, along=True),),
     "monitor": (Usual((0.20, 0.56, 0.48), (0.10, 0.12, 0.10)),),
     "plant": (
         Usual((0.11, 0.13, 0.23), (0.30, 0.30, 0.20), True, 0.4),
@@ -52,7 +53,8 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
 }
 """By class, each way in which such things stand: medians over the objects of 36 training worlds (seeds 10000 to 10011
 of office, corridor and table_top). People who stand or walk come before those who sit, whose depth is less than it is
-(0.86 m), since their legs are hidden and may be turned any way."""
+(0.86 m), since their legs are hidden and may be turned any way. Along the room, within two degrees, lie all of
+55 doors and 120 shelves (seeds 10000 to 10005); of other classes, but for books that stand, at most 7 in 10."""
 
 TELLING: dict[str, float] = {"ball": 2.0}
 """Labels of another class that one of this class outweighs, where that is not one.

@@ -25,7 +25,7 @@ _INSIDE = 0.02  # metres by which points stray from a box that they are of
 _TAIL = 0.8  # standard deviations of noise by which the outermost of accumulated points are beyond a side
 _TAIL_FLAT, _TAIL_ROUND = 2.3, 1.4  # and those of single views, on flat sides and on round ones, which recede
 _ASKEW = 8.0  # cost of lying otherwise than most things around
-_TURN = 0.1  # radians by which the heading that points show strays
+_TURN, _TURN_ALONG = 0.1, 0.03  # radians by which the heading that points show strays, and that of a room
 _BOUND = 2.0  # standard deviations beyond which a residual's influence grows no more
 _SIZES = 4  # residuals, the last ones, that compare heading and sizes with what is known
 _ALIKE = 6  # views that tell as much as more do, since their errors are alike
@@ -63,27 +63,30 @@ def fit_cuboid(
     Least squares over centre, sizes and heading, by Gauss and Newton with differences: edges of the box's image against
     those of each view, with a bounded influence, since things hide each other; points at most on the surface, and on it
     where a view sees that side; log sizes as one of the usual ones. `start` is a box around the points. Each way in
-    which such things stand is tried, along the heading of `start` and along `heading`, that of most things around, and
-    the best is returned with its number; with `before`, an earlier result, only that one. Last comes by how many
-    standard deviations each view's edges stray from that box (V,).
+    which such things stand is tried, along the heading of `start` and along `heading`, that of most things around,
+    what always lies along the room only so; the best is returned with its number; with `before`, an earlier result,
+    only that one is tried. Last comes by how many standard deviations each view's edges stray from that box (V,).
 
     `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    logs, spreads = _priors(usual)
+    logs, spreads, along = _priors(usual)
+    ways = len(logs)
     if before is None:
-        x = _starts(start, views, logs)
+        x, forms = _starts(start, views, logs), np.arange(ways)
         if heading is not None:
             turned = _nearest_turn(start[2], heading)
             x = np.concatenate([x, _starts(_along(points, turned), views, logs)])
-            logs, spreads = np.tile(logs, (2, 1)), np.tile(spreads, (2, 1))
+            forms = np.concatenate([forms[~along], forms + ways])
+            x = x[forms]
         headings = x[:, 6].copy()
     else:
         form, box = before
-        logs, spreads = logs[form % len(logs), None], spreads[form % len(logs), None]
-        x = np.array([[*box[0], *np.log(box[1]), box[2]]])
-        towards = heading if heading is not None and form >= len(_priors(usual)[0]) else start[2]
-        headings = np.array([_nearest_turn(box[2], towards)])
+        form += ways if heading is not None and form < ways and along[form] else 0  # it settled before that was known
+        forms, x = np.array([form]), np.array([[*box[0], *np.log(box[1]), box[2]]])
+        headings = np.array([_nearest_turn(box[2], heading if heading is not None and form >= ways else start[2])])
+    logs, spreads = logs[forms % ways], spreads[forms % ways]
+    turns = np.where(along[forms % ways] & (forms >= ways), _TURN_ALONG, _TURN)
     outline = _ELLIPSE if usual and usual[0].round else _SIGNS
     inset = usual[0].inset if usual else 0.0
     noise *= (_TAIL_ROUND if outline is _ELLIPSE else _TAIL_FLAT) if raw else _TAIL
@@ -97,20 +100,19 @@ def fit_cuboid(
         flat = rows.reshape(-1, 7)
         image = ((_images(flat, P, outline) - boxes) * weights).reshape(len(flat), -1)
         image[np.isnan(image)] = 0.0
-        turn = ((rows[..., 6] - headings[:, None]) / _TURN).reshape(-1, 1)
+        turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
         parts = [image, _surface(flat, points, eyes, noise, inset), turn, size]
         return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
-    forms = np.arange(len(x)) if before is None else np.array([before[0]])
-    askew = np.where(forms < len(x) // 2, _ASKEW, 0.0) if heading is not None else np.zeros(len(x))
+    askew = np.where((forms < ways) & (heading is not None), _ASKEW, 0.0)
     for turn in range(_ROUNDS if before is None else 2):
         values = residuals(x[:, None] + _PROBES)
         r, J = values[:, 0], (values[:, 1:] - values[:, :1]) / _STEPS[:, None]
         if turn == _CHOICE and len(x) > 1:
             kept = np.argsort(_cost(r) + askew, kind="stable")[:2]
             x, r, J, headings, logs, spreads = (a[kept] for a in (x, r, J, headings, logs, spreads))
-            forms, askew = forms[kept], askew[kept]
+            forms, askew, turns = forms[kept], askew[kept], turns[kept]
         weighted = J * _influence(r)[:, None]
         A = weighted @ J.transpose(0, 2, 1) + 1e-3 * np.eye(7)
         step = np.linalg.solve(A, -(weighted @ r[..., None]))[..., 0].clip(-20 * _STEPS, 20 * _STEPS)
@@ -152,17 +154,19 @@ def _along(points: Array, yaw: float) -> Box:
     return (low + high) / 2 @ turn, high - low, yaw
 
 
-def _priors(usual: Sequence[Usual]) -> tuple[Array, Array]:
-    """Returns the usual log sizes (A, 3) and their spreads, with the sides on the ground either way round."""
+def _priors(usual: Sequence[Usual]) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Returns the usual log sizes (A, 3), their spreads, with the sides on the ground either way round, and which of
+    them (A,) always lie along the room.
+    """
     rows = []
     for each in usual:
         a, b, c = each.size
-        rows.append(((a, b, c), each.spread))
+        rows.append(((a, b, c), each.spread, each.along))
         if b > 1.3 * a:
-            rows.append(((b, a, c), (each.spread[1], each.spread[0], each.spread[2])))
+            rows.append(((b, a, c), (each.spread[1], each.spread[0], each.spread[2]), each.along))
     if not rows:
-        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0)))
-    return np.log([row[0] for row in rows]), np.array([row[1] for row in rows])
+        rows.append(((0.3, 0.3, 0.3), (3.0, 3.0, 3.0), False))
+    return np.log([row[0] for row in rows]), np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
 
 
 def _starts(start: Box, views: Sequence[ImageView], logs: Array) -> Array:

@@ -48,6 +48,10 @@ class Kinds:
             size = max(size, self._largest[class_id])
         return size <= _SMALL and max(map(abs, object.velocity.tolist())) <= _STILL
 
+    def may_leave(self, object: MapObject) -> bool:
+        """Tells whether an object is small, and of a class that moves by itself or is taken away in hands."""
+        return object.longest <= _SMALL and (object.class_id in self.movers or object.class_id in self.portable)
+
     def is_large(self, object: MapObject) -> bool:
         """Tells whether things of an object's class are seldom seen whole."""
         usual = self.usual.get(object.class_id)

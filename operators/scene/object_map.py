@@ -26,14 +26,13 @@ from operators.scene.matching import (
     outside,
 )
 from operators.scene.merging import are_one, may_be_one, merge, smaller_in_place
-from operators.scene.range_view import RangeView, Sight
+from operators.scene.presence import has_left, look_at
+from operators.scene.range_view import RangeView
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
 _GONE = 1.0  # times its size away from its place, and a thing is moved
-_SELDOM = 3  # of so many views of an object, one tells which voxels are not its own
 _AGAIN = 8  # views after which the heading of the room is looked for once more
-_LEFT = 0.35  # what is left of an object that is seen through: the foot of its place, which the floor confirms
 
 
 class ObjectMap:
@@ -143,7 +142,7 @@ class ObjectMap:
             around = (near[k] <= s.mover_reach + 2 * s.mover_speed) & (classes == each.class_id) & (value[k] == 0)
             for j in np.flatnonzero(around).tolist():
                 if not moves[j] and j not in left:
-                    left[j] = self._has_left(known[j], view)
+                    left[j] = has_left(known[j], view, s)
                 if moves[j] or left[j]:
                     value[k, j] = alike_mover(each, cells[k], known[j], stamp, s)
         return {k: ids[j] for k, j in assign(value, value > 0)}
@@ -187,11 +186,6 @@ class ObjectMap:
         if self.floor is not None and (foot := self._kinds.foot(object)) > 0:
             object.stand_on(self.floor, foot)
 
-    def _has_left(self, object: MapObject, view: RangeView) -> bool:
-        """Tells whether a view looks through the place of an object."""
-        sight = view.of(object.cells.points, self._settings.margin)
-        return int(np.count_nonzero(sight.free)) >= 0.6 * max(int(np.count_nonzero(sight.looked)), 1)
-
     def _begin(self, each: Observation, cells: Cells, stamp: int, eye: Array) -> None:
         votes = np.zeros(self._classes)
         votes[each.class_id] = self._kinds.vote(each.class_id, each.score)
@@ -217,35 +211,9 @@ class ObjectMap:
         near = [objects[k] for k in np.flatnonzero(view.may_show(centers, radii + s.margin)).tolist()]
         sights = dict(zip((o.id for o in near), view.of_each([o.cells.points for o in near], s.margin), strict=True))
         for object in objects:
-            self._look(object, sights.get(object.id), view.origin, shown.get(object.id), seconds)
-
-    def _look(self, object: MapObject, sight: Sight | None, eye: Array, own: Cells | None, seconds: float) -> None:
-        """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any."""
-        s, mover = self._settings, self._kinds.is_mover(object)
-        if not len(object.cells):
-            object.evidence = -1.0
-            return
-        if not mover and sight is not None:
-            if own is not None and object.views % _SELDOM == 0:
-                object.cells.doubt(sight.confirmed, own, _SELDOM)
-            object.cells.carve(sight.free)
-            object.most = max(object.most, len(object.cells))
-        if own is not None:
-            return
-        if len(object.cells) < _LEFT * object.most:
-            object.evidence = -1.0
-        if mover:
-            object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory
-        if sight is None:
-            return
-        looked = np.count_nonzero(sight.looked)
-        if looked < max(5, 0.2 * len(sight.looked)):
-            return
-        distance = float(np.linalg.norm(object.center - eye))
-        if np.count_nonzero(sight.free) >= 0.6 * looked:
-            object.evidence -= s.vacated * (3 if mover else 1)
-        elif np.count_nonzero(sight.confirmed) >= 0.6 * len(sight.looked) and object.longest >= s.miss_angle * distance:
-            object.evidence -= s.missed
+            sight, own = sights.get(object.id), shown.get(object.id)
+            left = own is None and sight is not None and self._kinds.may_leave(object) and has_left(object, view, s)
+            look_at(object, sight, view.origin, own, seconds, self._kinds, s, left=left)
 
     def _note_beside(self, seen: Sequence[Observation], ids: Sequence[int | None]) -> None:
         """Counts for neighbours in how many views both were seen, each in a place of its own in the image."""

@@ -14,6 +14,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 _FAR = 1 << 30
+GROWTH = 0.02  # share of the range by which the margin grows that is safe for all
 _WIDER = 2.0  # columns narrow towards the poles: at 60 degrees to half
 
 
@@ -52,8 +53,8 @@ class RangeView:
         """The returns (N, 3) in the world."""
         return transform_points(self._T_world_sensor, self._own)
 
-    def of(self, places: Array, margin: float) -> Sight:
-        """Tells what the view says of places (N, 3) in the world, within a margin and 2 % of the range."""
+    def of(self, places: Array, margin: float, growth: float = GROWTH) -> Sight:
+        """Tells what the view says of places (N, 3) in the world, within a margin and a share of the range."""
         column, row, ranges = self._directions(transform_points(self._T_sensor_world, places))
         if not len(self._nearest):
             none = np.zeros(len(places), np.bool_)
@@ -63,7 +64,7 @@ class RangeView:
         bins = np.where(inside, column * self._shape[1] + row, 0)
         nearest, farthest = self._nearest[bins], self._farthest[bins]
         looked = inside & (farthest > 0)
-        slack = margin + 0.02 * ranges
+        slack = margin + growth * ranges
         free = looked & (nearest > ranges + slack)
         confirmed = looked & (nearest <= ranges + slack) & (farthest >= ranges - slack)
         return Sight(looked, free, confirmed)

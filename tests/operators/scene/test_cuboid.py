@@ -100,3 +100,18 @@ def test_a_fit_tells_which_view_is_of_another_thing() -> None:
     strays = fit_cuboid(standing_box(points), views, points, CLASS_SIZES["book"])[2]
     assert np.argmax(strays) == 2
     assert strays[2] > 2.5 > np.delete(strays, 2).max()
+
+
+@pytest.mark.parametrize("before", [None, 0], ids=["open", "settled before the room's heading was known"])
+def test_a_shelf_lies_along_the_room_where_views_of_what_is_beside_it_would_turn_it(before: int | None) -> None:
+    """Boxes in the image of a shelf and a part of its neighbour, which some views show as one."""
+    shelf: Box = (np.array([2.8, 0.0, 0.7]), np.array([0.31, 1.0, 1.4]), 0.0)
+    askew: Box = (shelf[0], np.array([0.31, 1.0, 1.4]), 0.25)
+    views = [view_of(askew, y) for y in SIDEWAYS]
+    points = spine(askew)
+    settled = None if before is None else (before, askew)
+    start, usual = standing_box(points), CLASS_SIZES["shelf"]
+    free, along = (fit_cuboid(start, views, points, usual, settled, h)[1][2] for h in (None, 0.0))
+    off = [abs(np.remainder(yaw + np.pi / 4, np.pi / 2) - np.pi / 4) for yaw in (free, along)]
+    assert off[0] > 0.2
+    assert off[1] < 0.05

@@ -32,12 +32,31 @@ def test_the_heading_of_a_room_is_that_of_its_walls(degrees: float) -> None:
     assert abs(off) < 1.5
 
 
-def test_a_cloud_without_direction_has_no_heading() -> None:
+def test_a_table_that_stands_askew_is_not_the_room() -> None:
+    """Its top is seen from near: ten times as many points as the walls have."""
+    u, v = RNG.uniform(-0.8, 0.8, 16_000), RNG.uniform(-0.4, 0.4, 16_000)
+    c = np.sqrt(0.5)
+    top = np.column_stack([2 + c * (u - v), 2 + c * (u + v), 0.75 + RNG.normal(0, 0.01, 16_000)])
     heading = RoomHeading()
-    heading.add(RNG.normal(0, 1, (3000, 3)))
-    assert heading.angle is None
-    heading.add(np.zeros((0, 3)))
+    heading.add(np.concatenate([room(0.0), top]))
+    assert heading.angle is not None
+    assert abs(np.remainder(np.degrees(heading.angle) + 45, 90) - 45) < 1.5
+
+
+def test_a_round_room_has_no_heading() -> None:
+    around, up = RNG.uniform(0, 2 * np.pi, 8000), RNG.uniform(0, 2.5, 8000)
+    heading = RoomHeading()
+    heading.add(np.column_stack([3 * np.cos(around), 3 * np.sin(around), up]))
     assert heading.views == 1
+    assert heading.angle is None
+
+
+def test_a_view_of_nothing_upright_tells_no_heading() -> None:
+    heading = RoomHeading()
+    heading.add(np.zeros((0, 3)))
+    heading.add(np.column_stack([RNG.uniform(0, 4, (3000, 2)), np.zeros(3000)]))
+    assert heading.views == 0
+    assert heading.angle is None
 
 
 @given(
