@@ -236,13 +236,15 @@ def maps() -> dict[str, str]:
 def perceived(measured: Path) -> dict[str, Row]:
     """Hands recorded measurements to a `PerceptionSystem`; returns class, number of messages and digest by operator."""
     with dataflow.open(measured) as streams, tempfile.TemporaryDirectory() as folder:
-        every = {name: list(streams[f"robot/{name}"]) for name in (*TOPICS, "image_info", "depth_info", "extrinsics")}
-        told = {name: every[name][0] for name in ("image_info", "depth_info", "extrinsics")}
+        every: dict[str, list[Any]] = {
+            name: list(streams[f"robot/{name}"]) for name in (*TOPICS, "image_info", "depth_info", "extrinsics")
+        }
+        told: dict[str, Any] = {name: every[name][0] for name in ("image_info", "depth_info", "extrinsics")}
         sensors, file, last = ("image", "depth", "points", "imu", "wheels", "command"), Path(folder) / "made.mcap", -1
         with PerceptionSystem(sensors, record=file, segment=False, **told) as system:
             for image in every["image"]:
                 since = {k: [m for m in v if last < m.stamp <= image.stamp] for k, v in every.items()}
-                command = Twist(stamp=image.stamp, frame="base_link", linear=(0.5, 0, 0), angular=(0, 0, 0.1))
+                command = Twist(image.stamp, "base_link", linear=np.array([0.5, 0, 0]), angular=np.array([0, 0, 0.1]))
                 depth, points = (next(iter(since[name]), None) for name in ("depth", "points"))
                 system.process(
                     image.stamp, image=image, depth=depth, points=points, imu=since["imu"],
@@ -271,7 +273,8 @@ def _round(folder: Path, name: str, words: list[str]) -> list[str]:
     graph.write_text(Path(f"graphs/{name}.yaml").read_text(encoding="utf-8"), encoding="utf-8")
     _record(graph, file, words)
     with dataflow.open(file) as streams:
-        if not any("corrected" in text for message in streams["slam/status"] for text in message.messages):
+        states: list[Any] = list(streams["slam/status"])
+        if not any("corrected" in text for state in states for text in state.messages):
             raise RuntimeError(f"{name}: no loop in {' '.join(words)}")
     return words
 
@@ -314,8 +317,10 @@ def _random(folder: Path, part: str, name: str) -> tuple[str, Path]:
 def _seen(most: int, *, apart: int = 1) -> list[tuple[np.ndarray, Detections2D]]:
     """Images of the recording (BGR) with the true boxes in them."""
     with dataflow.open(DEMO) as streams:
-        truth = {m.stamp: m for m in streams["robot/objects"]}
-        images = [m for k, m in enumerate(streams["robot/image_jpeg"]) if k % apart == 0 and m.stamp in truth]
+        truth: dict[int, Any] = {m.stamp: m for m in streams["robot/objects"]}
+        images: list[Any] = [
+            m for k, m in enumerate(streams["robot/image_jpeg"]) if k % apart == 0 and m.stamp in truth
+        ]
         return [(np.asarray(cv2.imdecode(m.data, cv2.IMREAD_COLOR)), truth[m.stamp]) for m in images[:most]]
 
 
