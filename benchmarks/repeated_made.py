@@ -244,7 +244,9 @@ def perceived(measured: Path) -> dict[str, Row]:
         with PerceptionSystem(sensors, record=file, segment=False, **told) as system:
             for image in every["image"]:
                 since = {k: [m for m in v if last < m.stamp <= image.stamp] for k, v in every.items()}
-                command = Twist(image.stamp, "base_link", linear=np.array([0.5, 0, 0]), angular=np.array([0, 0, 0.1]))
+                command = Twist(
+                    stamp=image.stamp, frame="base_link", linear=np.array([0.5, 0, 0]), angular=np.array([0, 0, 0.1])
+                )
                 depth, points = (next(iter(since[name]), None) for name in ("depth", "points"))
                 system.process(
                     image.stamp, image=image, depth=depth, points=points, imu=since["imu"],
@@ -318,10 +320,9 @@ def _seen(most: int, *, apart: int = 1) -> list[tuple[np.ndarray, Detections2D]]
     """Images of the recording (BGR) with the true boxes in them."""
     with dataflow.open(DEMO) as streams:
         truth: dict[int, Any] = {m.stamp: m for m in streams["robot/objects"]}
-        images: list[Any] = [
-            m for k, m in enumerate(streams["robot/image_jpeg"]) if k % apart == 0 and m.stamp in truth
-        ]
-        return [(np.asarray(cv2.imdecode(m.data, cv2.IMREAD_COLOR)), truth[m.stamp]) for m in images[:most]]
+        every: list[Any] = list(streams["robot/image_jpeg"])
+        images = [m for m in every[::apart] if m.stamp in truth][:most]
+        return [(np.asarray(cv2.imdecode(m.data, cv2.IMREAD_COLOR)), truth[m.stamp]) for m in images]
 
 
 def _labelled(folder: Path, label: str, most: int) -> None:
