@@ -44,7 +44,7 @@ def counted(drive: Drive) -> dict[str, int]:
     camera is tracked, after how many gaps from the first on, after how many within a second, and false frames."""
     totals = {"gaps": 0, "seen": 0, "tracked": 0, "at once": 0, "within": 0, "wrong": 0}
     odometry = RgbdOdometry(drive.camera)
-    for i in range(max(BEGINS)):
+    for i in range(max(BEGINS) + 1):
         if i in BEGINS:
             for length in LENGTHS:
                 for name, count in _gap(drive, odometry, i, length).items():

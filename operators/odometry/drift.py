@@ -1,4 +1,4 @@
-"""What RGB-D odometry errs by alike in every fit, which no residual shows: it adds up from keyframe to keyframe."""
+"""Errors that RGB-D odometry makes alike in every fit, which no residual shows: they add up between keyframes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What supports a recognised pose: the shape and the brightness of all that the view and the map both see."""
+"""Evidence for a pose: the shape and the brightness of all that the view and the map both see."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ STRIDE = 2  # patches of the view's surface between points that are compared
 NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so much more by the square of the depth
 FEWEST = 300  # points that a view must have in common with the map
 OVERLAP, AGREEMENT, LIKENESS = 0.3, 0.6, 0.45  # the least of a view that is recognised (see the benchmark)
-TOGETHER = 1.2  # the least of agreement and likeness in sum
+TOGETHER = 1.25  # the least of agreement and likeness in sum
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """What a view and the map have in common where a pose lays the one on the other.
+    """Likeness of a view and the map where a pose lays the one on the other.
 
     `overlap` is the share of the view that the map saw, of which `agreement` lies on the map's surfaces, at so many
     `points`; `likeness` is the correlation of brightness there.

@@ -80,9 +80,14 @@ def recognised(
         compared = LocalMap(VIEWS)
         compared.keyframes = views
         fit = fitter.refine(frame, sighting, motion, T_predicted, compared, segment)
-        views = seeing(points, fit.T_world_camera, there, VIEWS)
-        if gathered(frame, fit.T_world_camera, views, fitter.camera).certain:
-            yield fit, views[-1]
+        if (view := believed(frame, fit, there, fitter.camera)) is not None:
+            yield fit, view
+
+
+def believed(frame: Frame, fit: Fit, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Keyframe | None:
+    """Returns the keyframe that sees most of a view, if shape and brightness make sure of its pose; else nothing."""
+    views = seeing(frame.surface.points(SPARSE), fit.T_world_camera, keyframes, VIEWS)
+    return views[-1] if views and gathered(frame, fit.T_world_camera, views, camera).certain else None
 
 
 def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Sighting | None:

@@ -26,7 +26,7 @@ from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
 from operators.odometry.movers import Movers
 from operators.odometry.noise import Noise
-from operators.odometry.relocalizer import candidates, recognised
+from operators.odometry.relocalizer import believed, candidates, recognised
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 from operators.odometry.watch import Watch
@@ -140,11 +140,14 @@ class RgbdOdometry:
         return self._fitter.refine(frame, sighting, self._motion, T_predicted, self._map, known.segment)
 
     def _measured(self, frame: Frame, fit: Fit) -> bool:
-        """Returns whether a fit counts: after a gap, depth alone may fit where a like surface is, so corners decide."""
+        """Returns whether a fit counts: after a gap, when it may be at a place that looks alike, with more evidence."""
         assert self._motion is not None
+        gap = self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
+        if gap and frame.image_flaw is None and frame.depth_flaw is None:
+            there = [k for k in self._map.keyframes if k.segment == self._map.newest.segment]
+            return believed(frame, fit, there, self.camera) is not None
         if fit.inliers >= self.config.min_inliers:
             return True
-        gap = self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
         missed = frame.image_flaw is None and len(self._map.newest.points) >= 2 * self.config.min_inliers
         return fit.depth_agrees and fit.weakest_sigma < 0.05 and not (gap and missed)
 

@@ -1,4 +1,4 @@
-"""What a view says of whether an object is still where it was."""
+"""Evidence in a view of whether an object is still where it was."""
 
 from __future__ import annotations
 

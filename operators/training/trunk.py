@@ -37,7 +37,7 @@ def share_trunk(first: Path, second: Path, first_out: Path, second_out: Path) ->
     mine, other = _Graph(onnx.load(first)), _Graph(onnx.load(second))
     alike = mine.alike.keys() & other.alike.keys()
     ends = [each for each in mine.alike if each in alike and (mine.ends(each, alike) or other.ends(each, alike))]
-    if not ends:
+    if not ends or not mine.computes(alike):
         raise TrainingFileError(
             f"{first} and {second} have no layers of equal weights at their beginning: they were not trained together"
         )
@@ -88,6 +88,10 @@ class _Graph:
             for k, name in enumerate(node.output):
                 known[name] = f"{own} {k}"
                 self.alike[known[name]] = name
+
+    def computes(self, alike: Iterable[str]) -> bool:
+        """Tells whether the common part has a layer with weights: an image is brought to 8 bits in any network."""
+        return any(self._made[self.alike[each]].op_type == "Conv" for each in alike)
 
     def ends(self, value: str, alike: Iterable[str]) -> bool:
         """Tells whether a value in 8 bits, of the common part, is used beyond it."""
