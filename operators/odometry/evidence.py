@@ -18,7 +18,7 @@ from operators.odometry.keyframe import Keyframe
 STRIDE = 2  # patches of the view's surface between points that are compared
 NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so much more by the square of the depth
 FEWEST = 300  # points that a view must have in common with the map
-OVERLAP, AGREEMENT, LIKENESS = 0.3, 0.6, 0.45  # the least of a view that is recognised (see the benchmark)
+OVERLAP, AGREEMENT, LIKENESS = 0.3, 0.5, 0.45  # the least of a view that is recognised (see the benchmark)
 TOGETHER = 1.25  # the least of agreement and likeness in sum
 
 
