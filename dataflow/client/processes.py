@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import threading
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ import msgpack
 
 from dataflow.messages import Message
 from dataflow.transport import Bus, Envelope, Kind, NetworkConfig
+from dataflow.transport.bounded import within
 from dataflow.transport.codec import encode
 from dataflow.transport.keys import runtime_key
 from dataflow.transport.publisher import BusError
@@ -156,11 +156,5 @@ def processes_of(found: RunningGraph) -> Iterator[Processes]:
     try:
         yield Processes(bus, found.namespace)
     finally:
-        closing = threading.Thread(target=_close, args=(bus,), daemon=True)
-        closing.start()
-        closing.join(CLOSE_WITHIN)
-
-
-def _close(bus: Bus) -> None:
-    with contextlib.suppress(BusError):  # a process that is stopped does not take leave; who asked need not wait for it
-        bus.close()
+        with contextlib.suppress(BusError):  # a process that is stopped takes no leave; who asked need not wait for it
+            within(CLOSE_WITHIN, bus.close, "bus close")

@@ -16,7 +16,7 @@ _WORDS: Final = 2
 """The descriptor to which words go."""
 
 
-def turn_a_deaf_ear() -> None:
+def ignore() -> None:
     """Ignores the question, in this process and in those that it forks until they can answer."""
     signal.signal(ASK, signal.SIG_IGN)
 

@@ -12,9 +12,9 @@ ASK_BEFORE = 1.0
 """Seconds before the time is up; of a short time, a fifth."""
 
 
-def ahead_of(timeout: float) -> float:
-    """Returns when to ask, in seconds, of a time that ends after so many."""
-    return timeout - min(ASK_BEFORE, timeout / 5)
+def notice(timeout: float) -> float:
+    """Returns how many seconds before the end of a time, which is so long, to ask."""
+    return min(ASK_BEFORE, timeout / 5)
 
 
 class Asking:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from dataflow.supervision.asking import Asking, ahead_of
+from dataflow.supervision.asking import Asking, notice
 from dataflow.supervision.life import ON_ITS_WAY, Life, Step
 from dataflow.supervision.report import RunFailed
 from dataflow.supervision.run_state import RunState
@@ -52,8 +52,7 @@ class Barrier:
                 run.status.waiting = ()
                 return True
         run.status.waiting = tuple(p.label for p in processes if p.life is not Life.READY and self._missing(p))
-        timeout = run.plan.start_timeout
-        if run.steady > self._deadline - timeout + ahead_of(timeout):
+        if run.steady > self._deadline - notice(run.plan.start_timeout):
             self._asking.ask(_late(processes), self._deadline)
         if run.steady > self._deadline:
             self._fail(processes)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from dataflow.supervision.asking import Asking, ahead_of
+from dataflow.supervision.asking import Asking, notice
 from dataflow.supervision.life import Life, Step
 from dataflow.supervision.outcome import summaries_of
 from dataflow.supervision.report import RunFailed
@@ -32,11 +32,10 @@ def bounded(stall_timeout: float) -> float:
 
 @dataclass(slots=True)
 class _Stage:
-    """The processes that leave together, and until when; before that, those who are left are asked where they are."""
+    """The processes that leave together, and until when."""
 
     sinks: bool
     deadline: float
-    ask_from: float
 
 
 class Closing:
@@ -76,7 +75,8 @@ class Closing:
         """Goes on when a stage is through, or its time is up."""
         leaving = self._leaving(sinks=self._stage.sinks)
         late = self.run.steady > self._stage.deadline
-        if self.failure is None and self.run.steady > self._stage.ask_from:
+        ahead = notice(self._time_for(sinks=self._stage.sinks))
+        if self.failure is None and self.run.steady > self._stage.deadline - ahead:
             self._asking.ask(leaving, self._stage.deadline)
         if leaving and late:
             self._give_up_on(leaving)
@@ -107,8 +107,7 @@ class Closing:
                     run.send(process, "leave", outcome=outcome, summaries=summaries_of(run))
                 else:
                     run.send(process, "leave", outcome=outcome)
-        timeout = self._time_for(sinks=sinks)
-        return _Stage(sinks, run.steady + timeout, run.steady + ahead_of(timeout))
+        return _Stage(sinks, run.steady + self._time_for(sinks=sinks))
 
     def _give_up_on(self, late: list[Supervised]) -> None:
         if self.failure is None:

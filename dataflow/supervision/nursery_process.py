@@ -60,11 +60,11 @@ def _fork_process(descriptor: int, words: int, handed: Sequence[int], inherited:
         os.dup2(words, 2)
         for other in (words, *inherited):
             os.close(other)
+        from dataflow.process import stacks
         from dataflow.process.main import main
         from dataflow.process.speech import install
-        from dataflow.process.stacks import answer
 
-        answer()
+        stacks.answer()
         install()
         code = main(descriptor, handed)
         sys.stdout.flush()
@@ -196,10 +196,9 @@ def main(descriptor: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     import importlib
 
-    from dataflow.process.stacks import turn_a_deaf_ear
+    from dataflow.process import stacks
 
-    turn_a_deaf_ear()
-
+    stacks.ignore()
     _adopt_orphans()
     for name in PRELOAD:
         importlib.import_module(name)

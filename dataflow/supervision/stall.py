@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from dataflow.supervision.asking import Asking, ahead_of
+from dataflow.supervision.asking import Asking, notice
 from dataflow.supervision.life import WORKS
 from dataflow.supervision.part import Part
 from dataflow.supervision.quiescence import Quiescence
@@ -45,7 +45,7 @@ class StallWatch(Part):
 
     def tick(self) -> None:
         timeout = self.run.plan.stall_timeout
-        for process in self._stuck(ahead_of(timeout)):
+        for process in self._stuck(timeout - notice(timeout)):
             self._asking.ask([process], self._stuck_since(process))
         if self.run.steady - self._heard <= timeout:
             return
@@ -92,6 +92,7 @@ class LiveStallWatch(StallWatch):
     def __init__(self, run: RunState, quiescence: Quiescence) -> None:
         super().__init__(run, quiescence)
         self._signs: dict[str, float] = {}
+        self._asking_silent = Asking(run)
         graph = run.graph
         self._flowing = {s for node in graph.sources() for s in node.outputs.values() if not graph.streams[s].static}
         """The streams of sources that have not ended."""
@@ -126,8 +127,8 @@ class LiveStallWatch(StallWatch):
         for process in list(self.run.working()):
             sign = self._signs.get(process.label, now)
             silence = now - sign
-            if silence > ahead_of(timeout):
-                self._asking.ask([process], sign)
+            if silence > timeout - notice(timeout):
+                self._asking_silent.ask([process], sign)
             if silence > timeout:
                 words = self.run.last_words([process])
                 self.run.kill(process)

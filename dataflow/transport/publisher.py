@@ -8,6 +8,7 @@ from typing import Any
 
 import zenoh
 
+from dataflow.transport.bounded import within
 from dataflow.transport.counters import Counters
 
 
@@ -15,10 +16,18 @@ class BusError(RuntimeError):
     """The network refused: says which operation, on which key, and why."""
 
 
+UNDECLARE_WITHIN = 10.0
+"""Seconds: Zenoh waits for callbacks that are under way, and for links that take nothing."""
+
+
 def undeclare(declared: Any) -> None:
-    """Ends a Zenoh declaration; one that ended already (with its session) is left alone."""
+    """Ends a Zenoh declaration; one that ended already (with its session) is left alone.
+
+    Raises `BusError` for one that does not end in `UNDECLARE_WITHIN` seconds.
+    """
     try:
-        declared.undeclare()
+        if not within(UNDECLARE_WITHIN, declared.undeclare, "undeclare"):
+            raise BusError(f"{declared} did not end within {UNDECLARE_WITHIN:g} s")
     except zenoh.ZError as error:
         if "closed" not in str(error).lower() and "undeclared" not in str(error).lower():
             raise BusError(f"undeclaring {declared}: {error}") from error

@@ -173,7 +173,7 @@ class TapServer:
             return {"taps": len(self._taps), "sent": self._sent, "skipped": skipped, "malformed": self.malformed}
 
     def close(self) -> None:
-        """Ends all taps. Takes at most `CLOSE_WITHIN` seconds; further calls do nothing."""
+        """Ends all taps, in bounded time (`undeclare`, `CLOSE_WITHIN`); further calls do nothing."""
         with self._wake:
             if self._closed:
                 return

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import threading
+from types import SimpleNamespace
 
 import pytest
 
+from dataflow.transport import publisher
 from dataflow.transport.bounded import within
+from dataflow.transport.publisher import BusError, undeclare
 
 
 def test_an_act_that_ends_has_ended_when_it_is_said_so() -> None:
@@ -30,3 +33,13 @@ def test_what_an_act_raises_is_raised() -> None:
 
     with pytest.raises(ConnectionError, match="nobody is there"):
         within(10.0, fail, "leave")
+
+
+def test_a_declaration_that_does_not_end_is_named_and_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = threading.Event()
+    monkeypatch.setattr(publisher, "UNDECLARE_WITHIN", 0.01)
+    try:
+        with pytest.raises(BusError, match=r"did not end within 0\.01 s"):
+            undeclare(SimpleNamespace(undeclare=gate.wait))
+    finally:
+        gate.set()
