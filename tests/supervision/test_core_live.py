@@ -265,16 +265,16 @@ def test_a_process_that_gives_no_sign_of_life_for_too_long_ends_the_run(label: s
 
 
 def test_one_that_is_both_at_a_long_call_and_silent_is_asked_once_for_each() -> None:
-    play = robot(stall_timeout=20.0).starts()
+    play = Play(LEFT, SUM, live=True, stall_timeout=20.0).starts()
     play.beating = False
-    play.deaf.add("smooth")
-    play.tell(play.beat("smooth", ("smooth", 5, 19.9)))
+    play.deaf.add("sum")
+    play.tell(play.beat("sum", ("sum", 5, 19.9)))
     for _ in range(60):
-        play.tell(play.beat("left"), play.beat("after"), play.progress("left", {"left": 5}))
+        play.tell(play.beat("left"), play.progress("left", {"left": 5}))
         play.wait(0.5)
 
-    assert play.failure() == "process 'smooth' gave no sign of life for 20 s"
-    assert asked_where(play.commands) == ["smooth", "smooth"]
+    assert play.failure() == "process 'sum' gave no sign of life for 20 s"
+    assert asked_where(play.commands) == ["sum", "sum"]
 
 
 def test_a_call_that_does_not_end_while_nothing_else_happens_is_named() -> None:
