@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from dataflow.messages.geometry import transform_points
+from operators.geometry.rigid import distances, fitted_motions
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -51,7 +52,7 @@ def motions(
     seeds = seeds[weights[seeds, 1] > 0]  # three matches, with its own, are a motion
     members = np.column_stack([seeds, around[seeds]])
     weights = np.column_stack([weights[seeds, :1], weights[seeds]])
-    found = _rigid(source[0][members], target[0][members], weights / weights.sum(axis=1, keepdims=True))
+    found = fitted_motions(source[0][members], target[0][members], weights / weights.sum(axis=1, keepdims=True))
     votes = np.zeros(len(found), np.int64)
     for k, T in enumerate(found):
         votes[k] = (np.linalg.norm(transform_points(T, source[0]) - target[0], axis=1) <= 2.5 * voxel).sum()
@@ -70,24 +71,9 @@ def _compatible(source: tuple[Array, Array], target: tuple[Array, Array], voxel:
 
 def _invariants(points: Array, normals: Array) -> tuple[Array, Array, Array]:
     """Returns (M, M) each: distances, cosines between normals, and cosines between a normal and the line to another."""
-    square = np.square(points).sum(axis=1)
-    length = np.sqrt(np.maximum(square[:, None] + square - 2 * points @ points.T, 0))
+    length = distances(points)
     along = normals @ points.T - (normals * points).sum(axis=1)[:, None]
     return length, normals @ normals.T, along / np.maximum(length, 1e-9)
-
-
-def _rigid(source: Array, target: Array, weights: Array) -> Array:
-    """Returns the motions (K, 4, 4) of points (K, N, 3) by weights (K, N) of sum 1. Umeyama, 1991."""
-    a, b = (np.einsum("kn,kni->ki", weights, points) for points in (source, target))
-    spread = np.einsum("kn,kni,knj->kij", weights, target - b[:, None], source - a[:, None])
-    u, _, vt = np.linalg.svd(spread)
-    flip = np.ones((len(source), 3))
-    flip[:, 2] = np.sign(np.linalg.det(u) * np.linalg.det(vt))
-    R = (u * flip[:, None, :]) @ vt
-    T = np.tile(np.eye(4), (len(source), 1, 1))
-    T[:, :3, :3] = R
-    T[:, :3, 3] = b - np.einsum("kij,kj->ki", R, a)
-    return T
 
 
 def _modes(found: Array, near: float) -> list[Array]:

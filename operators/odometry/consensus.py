@@ -4,6 +4,8 @@ Two pairs agree where they lie as far apart in one view as in the other; a cliqu
 motion (Leordeanu and Hebert, 2005; Yang et al., "TEASER", 2020). Random samples of three would need thousands.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +13,7 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_points
 from operators.geometry.pinhole import Points
+from operators.geometry.rigid import distances, fitted_motions
 from operators.geometry.se3 import Matrix
 
 SLACK = 0.04  # metres by which two distances may differ, and so much more for each metre of depth
@@ -38,8 +41,8 @@ def consensus(a: Points, b: Points, names: NDArray[np.int64]) -> Consensus | Non
     if len(a) < FEWEST:
         return None
     slack = SLACK / 2 + SLACK_PER_METRE * b[:, 2]
-    between_b = _distances(b)
-    fits = (np.abs(_distances(a) - between_b) < slack[:, None] + slack) & (between_b > APART)
+    between_b = distances(b)
+    fits = (np.abs(distances(a) - between_b) < slack[:, None] + slack) & (between_b > APART)
     links = fits.astype(np.float32)
     triangles = ((links @ links) * links).sum(axis=1)
     best: Consensus | None = None
@@ -59,16 +62,6 @@ def consensus(a: Points, b: Points, names: NDArray[np.int64]) -> Consensus | Non
     return best
 
 
-def rigid(a: Points, b: Points) -> Matrix:
-    """Returns T_a_b of least squares for pairs (N, 3). Kabsch, 1976."""
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    U, _, Vt = np.linalg.svd((a - mean_a).T @ (b - mean_b))
-    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, mean_a - R @ mean_b
-    return T
-
-
 def _clique(links: NDArray[np.float32], seed: int) -> NDArray[np.intp]:
     """Returns pairs that all agree: a seed and its friends, those with most friends among the rest first."""
     friends = np.flatnonzero(links[seed])
@@ -84,23 +77,21 @@ def _clique(links: NDArray[np.float32], seed: int) -> NDArray[np.intp]:
 
 def _grown(a: Points, b: Points, names: NDArray[np.int64], clique: NDArray[np.intp]) -> Consensus:
     """Returns the motion of a clique, fitted again to all pairs that agree with it."""
-    T = rigid(a[clique], b[clique])
+    T = _rigid(a[clique], b[clique])
     for _ in range(5):
         agree = _near(a, b, T)
         if len(np.unique(names[agree])) < FEWEST:
             break
-        T = rigid(a[agree], b[agree])
+        T = _rigid(a[agree], b[agree])
     agree = _near(a, b, T)
     return Consensus(T, agree, len(np.unique(names[agree])))
+
+
+def _rigid(a: Points, b: Points) -> Matrix:
+    """Returns T_a_b of least squares."""
+    return np.asarray(fitted_motions(b[None], a[None], np.full((1, len(a)), 1 / len(a)))[0], np.float64)
 
 
 def _near(a: Points, b: Points, T_a_b: Matrix) -> NDArray[np.bool_]:
     off = transform_points(T_a_b, b) - a
     return np.asarray(np.einsum("ij,ij->i", off, off) < GATE**2, np.bool_)
-
-
-def _distances(points: Points) -> NDArray[np.float64]:
-    """Returns the distances (N, N) of points (N, 3) from each other."""
-    square = np.einsum("ij,ij->i", points, points)
-    gram = points @ points.T
-    return np.asarray(np.sqrt(np.maximum(square[:, None] + square - 2.0 * gram, 0.0)), np.float64)

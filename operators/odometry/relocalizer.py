@@ -4,6 +4,8 @@ Where depth is seen, points of several keyframes are paired with those of the vi
 is refined and judged by all that both see. Without depth, the pixels of one keyframe's points give the pose.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -53,7 +55,7 @@ class Landmarks:
     descriptors: NDArray[np.float32]
 
     @staticmethod
-    def of(description: Description, surface: Surface, camera: RgbdCamera) -> "Landmarks":
+    def of(description: Description, surface: Surface, camera: RgbdCamera) -> Landmarks:
         points, known = lifted(description.pixels, surface, camera)
         sizes = description.sizes[known] * points[known, 2]
         return Landmarks(description.pixels[known], points[known], sizes, description.descriptors[known])
@@ -72,9 +74,8 @@ def recognised(
         sighting = common(seen, keyframes, fitter.camera)
         if sighting is None:
             continue
-        points = frame.surface.points(SPARSE)
         there = [k for k in known.keyframes if k.segment == segment]
-        views = seeing(points, sighting.T_world_camera, there, VIEWS)
+        views = seeing(frame.surface.points(SPARSE), sighting.T_world_camera, there, VIEWS)
         if not views:
             continue
         compared = LocalMap(VIEWS)

@@ -32,10 +32,7 @@ from operators.odometry.tracking import Status, TrackResult, moved_covariance
 from operators.odometry.watch import Watch
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
-RECALL_NEAR, RECALL_OTHERS = (
-    3,
-    5,
-)  # keyframes near the prediction and elsewhere that a lost camera compares one frame with
+RECALL_NEAR, RECALL_OTHERS = 3, 5  # keyframes, near the prediction and elsewhere, that a lost view is compared with
 RECALL_EVERY = 3  # frames, while a new map is tracked for longer than
 RECALL_ALWAYS_S = 1.0  # seconds, for which every frame is tried
 
@@ -89,11 +86,12 @@ class RgbdOdometry:
         # 4. Refine with the depth image, against the surfaces of nearby keyframes.
         fit = self._refine(frame, sighting, T_predicted, self._map.newest)
         # 5. Failing that, or in a new map, recognise the view by its descriptors.
-        recalled = self._recall(frame, fit, T_predicted)
+        measured = self._measured(frame, fit)
+        recalled = self._recall(frame, T_predicted, measured=measured)
         # 6. Decide what the pose rests on, and remember it.
         if recalled is not None:
-            return self._relocalised(frame, fit, *recalled)
-        return self._followed(frame, fit) if self._measured(frame, fit) else self._guessed(frame, fit)
+            return self._relocalised(frame, fit if measured else None, *recalled)
+        return self._followed(frame, fit) if measured else self._guessed(frame, fit)
 
     # -- the steps ---------------------------------------------------------------------------------------
 
@@ -146,15 +144,11 @@ class RgbdOdometry:
         if gap and frame.image_flaw is None and frame.depth_flaw is None:
             there = [k for k in self._map.keyframes if k.segment == self._map.newest.segment]
             return believed(frame, fit, there, self.camera) is not None
-        if fit.inliers >= self.config.min_inliers:
-            return True
-        missed = frame.image_flaw is None and len(self._map.newest.points) >= 2 * self.config.min_inliers
-        return fit.depth_agrees and fit.weakest_sigma < 0.05 and not (gap and missed)
+        return fit.inliers >= self.config.min_inliers or (fit.depth_agrees and fit.weakest_sigma < 0.05)
 
-    def _recall(self, frame: Frame, fit: Fit, T_predicted: Matrix) -> tuple[Fit, Keyframe] | None:
+    def _recall(self, frame: Frame, T_predicted: Matrix, *, measured: bool) -> tuple[Fit, Keyframe] | None:
         """Looks for the view in the map: always while nothing is measured, now and then in a new map."""
         assert self._motion is not None
-        measured = self._measured(frame, fit)
         if measured and self._apart_since is None:
             self._recalls = 0
             return None
@@ -184,28 +178,24 @@ class RgbdOdometry:
         covariance, sunk = carried(newest, T)
         self._covariance = covariance + fit.covariance
         keyframe = self._new_keyframe(frame, fit, sunk)
-        reason = _support(frame, fit)
-        if self._apart_since is not None:
-            if frame.stamp - self._apart_since < self.config.give_up_s * 1e9:
-                status = Status.LOST
-            reason += "; a new map, its place in the old one unknown"
-        return self._result(status, reason, fit, keyframe)
+        return self._placed(status, _support(frame, fit), fit, keyframe)
 
-    def _relocalised(self, frame: Frame, fit: Fit, found: Fit, known: Keyframe) -> TrackResult:
-        """Takes up a pose that was found among older keyframes, and what was tracked meanwhile with it."""
+    def _relocalised(self, frame: Frame, tracked: Fit | None, found: Fit, known: Keyframe) -> TrackResult:
+        """Takes up a pose that was found among older keyframes, and a new map that is `tracked` meanwhile with it."""
         assert self._motion is not None
         T = found.T_world_camera
         if known.segment != self._map.newest.segment:
-            if self._measured(frame, fit):
-                self._map.join(known, T @ invert(fit.T_world_camera))
+            if tracked is not None:
+                self._map.join(known, T @ invert(tracked.T_world_camera))
             else:
                 self._map.drop_newest_segment()
-        self._apart_since, self._recalls = None, 0
+            self._apart_since = None
+        self._recalls = 0
         self._motion = Motion(frame.stamp, T, np.zeros(6))
         covariance, sunk = carried(known, T)
         self._covariance = covariance + found.covariance
         keyframe = self._new_keyframe(frame, found, sunk)
-        return self._result(Status.RELOCALISED, f"the map found again by {found.inliers} features", found, keyframe)
+        return self._placed(Status.RELOCALISED, f"the map found again by {found.inliers} features", found, keyframe)
 
     def _guessed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Goes on by the motion so far, and begins a new map where the old one stays out of sight."""
@@ -309,6 +299,15 @@ class RgbdOdometry:
         self._noise, self._watch = state.noise, state.watch
         self._recalls, self._apart_since = state.recalls, state.apart_since
         self._map.keyframes = list(state.keyframes)
+
+    def _placed(self, status: Status, reason: str, fit: Fit, keyframe: bool) -> TrackResult:
+        """Returns the result of a measured pose; in a new map it is not known where that is in the old one."""
+        assert self._motion is not None
+        if self._apart_since is None:
+            return self._result(status, reason, fit, keyframe)
+        lost = self._motion.stamp - self._apart_since < self.config.give_up_s * 1e9
+        reason += "; a new map, its place in the old one unknown"
+        return self._result(Status.LOST if lost else status, reason, fit, keyframe)
 
     def _result(self, status: Status, reason: str, fit: Fit | None, keyframe: bool) -> TrackResult:
         assert self._motion is not None

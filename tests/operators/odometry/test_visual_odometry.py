@@ -362,6 +362,21 @@ def test_new_map_apart_is_joined_when_the_old_one_is_seen_again() -> None:
     assert errors(results[-2:], poses[-2:])[0] < 0.03
 
 
+def test_a_view_that_is_found_again_in_a_new_map_apart_says_nothing_of_the_old_one() -> None:
+    frames, poses = sequence(60, 1.5)
+    turned = se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))
+    shown = [*poses[:20], *poses[45:48]]
+    elsewhere = [(render(turned @ T, K_COLOR)[0], render(turned @ T, K_DEPTH)[1]) for T in shown]
+    blind = [black(without_depth(frames[0]))] * 20
+    back = follow([*frames[:10], *blind, *elsewhere[:20], *blind, *elsewhere[20:]])[-3:]
+
+    assert "again" in back[0].reason
+    for result in back:
+        assert result.status is Status.LOST
+        assert result.reason.endswith("a new map, its place in the old one unknown")
+        assert np.sqrt(np.trace(result.covariance[:3, :3])) > 0.3
+
+
 def mover_sequence(count: int) -> Sequence:
     """A wall-like body in front of a third of the view slides sideways by 4 cm a frame while the camera sways."""
     frames, poses = sequence(count, 3.0)
