@@ -14,5 +14,5 @@ class LiveSinkProcess(SinkProcess):
         let_others_begin()
 
     def _reached(self) -> dict[str, int]:
-        """How far it has taken what follows from each source: operators drop, so their streams say nothing of that."""
+        """Tells up to where it has taken what follows from each source: operators drop, so their streams do not say."""
         return dict(self._taken)

@@ -190,8 +190,8 @@ def _usual(buffer: Buffer, types: TypeOf) -> Envelope | None:
 
 
 def _described(data: bytes, types: TypeOf) -> _Described:
-    """What a small body says. Raises for anything that is rare, or wrong. Most bodies of a stream are equal: what they
-    say is kept."""
+    """Reads what a small body says. Raises for anything that is rare, or wrong. Most bodies of a stream are equal: what
+    they say is kept."""
     schema, header, arrays = _unpack_small(data)
     cls = types(schema)
     made = cls._made or cls.compiled()

@@ -98,7 +98,7 @@ class SecondTask(ABC, Generic[Image, Batch]):
 
     @abstractmethod
     def _batch(self, columns: list[Tensor], rngs: list[np.random.Generator]) -> Batch:
-        """What `loss` takes, of the rows of all chunks of a batch."""
+        """Joins the rows of all chunks of a batch into what `loss` takes."""
 
     def _gather(self, most: int, seed: int) -> None:
         """Takes at most so many rows of each image, and puts all in random order."""

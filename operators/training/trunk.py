@@ -6,9 +6,8 @@ trunks give other bits. The second network takes over the first one's, and both 
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 
 from operators.training.files import TrainingFileError, whole
 from operators.training.quantization import INT8
-from operators.weights.model_parts import ModelParts
+from operators.weights.model_parts import ModelParts, digest_of
 from operators.weights.network_file import KEY, TRUNK, read_facts
 
 _LINEAR = ("QuantizeLinear", "DequantizeLinear")
@@ -72,10 +71,10 @@ class _Graph:
         for node in graph.node:
             for name in node.input:
                 self._users.setdefault(name, []).append(node)
-        known = {name: _digest([name.encode()]) for name in ("", *(each.name for each in graph.input))}
+        known = {name: digest_of([name.encode()]).hex() for name in ("", *(each.name for each in graph.input))}
         for name, tensor in self._stored.items():
             values = onnx.numpy_helper.to_array(tensor)
-            known[name] = _digest([str((values.dtype, values.shape)).encode(), values.tobytes()])
+            known[name] = digest_of([str((values.dtype, values.shape)).encode(), values.tobytes()]).hex()
         self.alike: dict[str, str] = {}
         for node in graph.node:
             told = [node.op_type.encode(), *sorted(each.SerializeToString() for each in node.attribute)]
@@ -84,7 +83,7 @@ class _Graph:
                 taken = taken[:2]  # a bias is stored in steps that depend on a range
             elif node.op_type in _LINEAR and node.input[0] not in self._stored:
                 taken = taken[:1]
-            own = _digest([*told, *taken])
+            own = digest_of([*told, *taken]).hex()
             for k, name in enumerate(node.output):
                 known[name] = f"{own} {k}"
                 self.alike[known[name]] = name
@@ -152,10 +151,3 @@ class _Graph:
         import onnx
 
         self._stored[name].CopyFrom(onnx.numpy_helper.from_array(value, name))
-
-
-def _digest(parts: Sequence[bytes]) -> str:
-    found = hashlib.sha256()
-    for part in parts:
-        found.update(len(part).to_bytes(8, "little") + part)
-    return found.hexdigest()

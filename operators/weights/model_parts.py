@@ -115,17 +115,17 @@ class ModelParts:
         missing = [name for name in names if name not in self._digests]
         if missing:
             raise ValueError(f"the model has no inner value {missing[0]!r}")
-        return _digest([self._model.get(_OPERATOR_SETS, b""), *(self._digests[name] for name in names)]).hex()
+        return digest_of([self._model.get(_OPERATOR_SETS, b""), *(self._digests[name] for name in names)]).hex()
 
     @cached_property
     def _digests(self) -> dict[str, bytes]:
         """The digest of every value. In a model, nodes stand in an order in which they can be computed."""
-        known = {"": _digest([b"none"])}
-        known |= {name: _digest([b"input", each]) for name, each in self._inputs.items()}
-        known |= {name: _digest([b"constant", _nameless(each)]) for name, each in self._constants.items()}
+        known = {"": digest_of([b"none"])}
+        known |= {name: digest_of([b"input", each]) for name, each in self._inputs.items()}
+        known |= {name: digest_of([b"constant", _nameless(each)]) for name, each in self._constants.items()}
         for node in self._nodes:
-            own = _digest([b"node", node.arithmetic, *(known[name] for name in node.takes)])
-            known |= {name: _digest([own, bytes([k])]) for k, name in enumerate(node.gives)}
+            own = digest_of([b"node", node.arithmetic, *(known[name] for name in node.takes)])
+            known |= {name: digest_of([own, bytes([k])]) for k, name in enumerate(node.gives)}
         return known
 
 
@@ -145,7 +145,7 @@ def _nameless(tensor: bytes) -> bytes:
     return b"".join(each.serialized for each in fields(tensor) if each.number not in told)
 
 
-def _digest(parts: Iterable[bytes]) -> bytes:
+def digest_of(parts: Iterable[bytes]) -> bytes:
     """The digest of a list of byte strings: lists that read alike in a row differ."""
     found = hashlib.sha256()
     for part in parts:
