@@ -28,9 +28,9 @@ def described(gray: Gray, pixels: Pixels) -> tuple[Description, NDArray[np.int64
     keypoints = [cv2.KeyPoint(float(x), float(y), PATCH, 0.0, 0, 0, i) for i, (x, y) in enumerate(pixels.tolist())]
     kept, descriptors = cv2.SIFT.create().compute(gray, keypoints)
     if descriptors is None or not len(kept):
-        return Description(np.zeros((0, 2)), np.zeros((0, 128), np.float32)), np.zeros(0, np.int64)
+        return Description(np.zeros((0, 2)), np.zeros((0, 128), np.uint8)), np.zeros(0, np.int64)
     rows = np.array([k.class_id for k in kept], np.int64)
-    return Description(pixels[rows], np.asarray(descriptors, np.float32)), rows
+    return Description(pixels[rows], descriptors.astype(np.uint8)), rows
 
 
 def recognised(gray: Gray, known: MonoMap, views: Sequence[View], K: Matrix) -> tuple[Matrix, View] | None:

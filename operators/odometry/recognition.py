@@ -21,26 +21,30 @@ GROWTH = 1.6  # factor by which the same thing may look larger or smaller, where
 
 @dataclass(frozen=True, eq=False)
 class Description:
-    """Pixels (N, 2) of a working image, their descriptors (N, 128), and how many pixels (N,) each describes across."""
+    """Pixels (N, 2) of a working image, their descriptors (N, 128), and how many pixels (N,) each describes across.
+
+    SIFT's descriptors are whole numbers up to 255: as bytes a map of keyframes takes a quarter of the memory.
+    """
 
     pixels: Pixels
-    descriptors: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
     sizes: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
 
 
 def describe(gray: Gray) -> Description:
     points, descriptors = cv2.SIFT.create(COUNT, contrastThreshold=0.02).detectAndCompute(gray, None)
     if descriptors is None:
-        return Description(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+        return Description(np.zeros((0, 2)), np.zeros((0, 128), np.uint8))
     pixels, sizes = np.array([p.pt for p in points], np.float64), np.array([p.size for p in points], np.float64)
-    return Description(pixels, np.asarray(descriptors, np.float32), sizes)
+    return Description(pixels, descriptors.astype(np.uint8), sizes)
 
 
 def match(a: Description, b: Description) -> NDArray[np.int64]:
     """Returns pairs of indices (M, 2), each b once, that are distinctly nearest."""
     if len(a.descriptors) < 2 or len(b.descriptors) < 2:
         return np.zeros((0, 2), np.int64)
-    candidates = cv2.BFMatcher(cv2.NORM_L2).knnMatch(a.descriptors, b.descriptors, k=2)
+    here, there = a.descriptors.astype(np.float32), b.descriptors.astype(np.float32)
+    candidates = cv2.BFMatcher(cv2.NORM_L2).knnMatch(here, there, k=2)
     best: dict[int, tuple[float, int]] = {}
     for pair in candidates:
         if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance:
@@ -51,16 +55,17 @@ def match(a: Description, b: Description) -> NDArray[np.int64]:
 
 
 def match_of_size(
-    a: NDArray[np.float32], b: NDArray[np.float32], size_a: NDArray[np.float64], size_b: NDArray[np.float64], most: int
+    a: NDArray[np.uint8], b: NDArray[np.uint8], size_a: NDArray[np.float64], size_b: NDArray[np.float64], most: int
 ) -> NDArray[np.int64]:
-    """Returns pairs of indices (M, 2), each b once, that are distinctly nearest among those of a like size (metres).
+    """Returns pairs of indices (M, 2) of descriptors, each b once, that are distinctly nearest of a like size (metres).
 
     What is as large there as here leaves fewer rivals than all do, so more of the right ones are distinct. The nearest
     come first, at most `most` of them.
     """
     if len(a) < 2 or len(b) < 2:
         return np.zeros((0, 2), np.int64)
-    square = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
+    here, there = a.astype(np.float32), b.astype(np.float32)
+    square = (here * here).sum(axis=1)[:, None] + (there * there).sum(axis=1) - 2.0 * (here @ there.T)
     unlike = np.abs(np.log(size_a)[:, None] - np.log(size_b)) > np.log(GROWTH)
     square = np.where(unlike, np.float32(np.inf), np.maximum(square, 0.0))
     nearest = np.argmin(square, axis=1)

@@ -52,7 +52,7 @@ class Landmarks:
     pixels: Pixels
     points: Points
     sizes: NDArray[np.float64]
-    descriptors: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
 
     @staticmethod
     def of(description: Description, surface: Surface, camera: RgbdCamera) -> Landmarks:

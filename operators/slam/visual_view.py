@@ -64,7 +64,7 @@ class View:
         height, width = keyframe.gray.shape
         return View(
             described.pixels.astype(np.float32),
-            np.clip(np.rint(described.descriptors), 0, 255).astype(np.uint8),
+            described.descriptors,
             np.where(known[:, None], points, np.nan).astype(np.float32),
             keyframe.surface,
             keyframe.gray[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)],
@@ -87,7 +87,7 @@ class View:
 
     @cached_property
     def description(self) -> Description:
-        return Description(self.pixels.astype(np.float64), self.descriptors.astype(np.float32))
+        return Description(self.pixels.astype(np.float64), self.descriptors)
 
 
 @dataclass(frozen=True, eq=False)
