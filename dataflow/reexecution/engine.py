@@ -6,6 +6,7 @@ Verification, the completion of thin recordings and replays that begin in the mi
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
@@ -162,6 +163,8 @@ class Recomputation:
             end=end,
         )
         self._threads = graph.threads
+        self.wall = 0.0
+        """Seconds that `run` took from when all operators were set up."""
 
     def run(self, *, until: Callable[[], bool] = lambda: False, close: bool = True) -> Mapping[str, Verification]:
         """Makes the recorded firings, to the end or until `until()`, asked between them; then closes.
@@ -176,7 +179,10 @@ class Recomputation:
             limit_threads(self._threads)  # of libraries that were imported in setup()
             self._ready |= self.runners
             self._feed.setup()
-            if not self._drive(until):
+            began = time.monotonic()
+            done = self._drive(until)
+            self.wall = time.monotonic() - began
+            if not done:
                 return self.results()
         finally:
             if close:

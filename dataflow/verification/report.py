@@ -53,7 +53,7 @@ class VerifyReport:
     `stood_in` are the operators whose recorded streams were used instead, `stand_ins` those and the sources, with what
     their records say; `stored` the streams whose stored messages were compared with the records, `unchecked` those that
     could not be. `facts` are what differs between the machine that recorded and this one: (fact, then, now). `wall`:
-    seconds of re-execution, `total`: of everything; `span`: seconds of event time.
+    seconds of re-execution, operators' set-up not included; `total`: of everything; `span`: seconds of event time.
     `comparisons` hold, for the operators that differ, how their messages compare with the recorded ones; `repeated`,
     for culprits that were run twice, whether they differed alike. `digests` are (messages, stream digest) of what was
     made here, by stream; `outputs` the streams of each operator, `producers` the nodes that it takes from.

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from dataflow.chaos.plan import plan_of
+from dataflow.firing.recorded import RecordedRunner
 from dataflow.graph import load_graph
 from dataflow.recording import Recording, reader
 from dataflow.records.reading import FiringLog, recorded_firings
+from dataflow.reexecution import engine
 from dataflow.reexecution.engine import Recomputation, plan_feeding
 from dataflow.reexecution.recorded_run import ReplayError
 from dataflow.reexecution.warm_start import held_before
 from dataflow.supervision.run import replay, run
+from dataflow.sync import Entry
 from dataflow.verification.verify import verify
 
 HERE = Path(__file__).resolve().parent
@@ -159,6 +163,28 @@ def test_a_re_execution_from_the_middle_reads_only_what_it_needs(tmp_path: Path)
     assert len(read["test/left/constant"]) == 1
     assert state < min(read["test/merge/seen"]) <= begin
     assert min(read["test/right/fast"]) >= begin
+
+
+def test_setting_up_is_no_part_of_the_time_of_a_re_execution(recorded: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [0.0]
+    set_up = RecordedRunner.setup
+
+    def slow(runner: RecordedRunner) -> None:
+        clock[0] += 100.0
+        set_up(runner)
+
+    def made(stream: str, entry: Entry) -> None:
+        clock[0] += 0.001
+
+    monkeypatch.setattr(engine, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(RecordedRunner, "setup", slow)
+    graph = load_graph(HERE / "chaos.yaml", settings=["count=120"])
+    with Recording(recorded) as recording:
+        feeding = plan_feeding(recording, graph, ["tuned"])
+        work = Recomputation(recording, graph, feeding, FiringLog.read(recording), made=made)
+        work.run()
+
+    assert 0.0 < work.wall < 100.0
 
 
 def test_what_an_operator_held_is_found_without_reading_the_whole_recording(
