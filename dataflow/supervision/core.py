@@ -37,6 +37,7 @@ from dataflow.supervision.part import Part
 from dataflow.supervision.report import RunFailed, Status
 from dataflow.supervision.restarts import RestartPolicy
 from dataflow.supervision.run_state import Phase, Release, RunState
+from dataflow.supervision.shortened import shortened
 from dataflow.supervision.supervised import Supervised
 from dataflow.supervision.wording import how_it_ended
 
@@ -218,7 +219,7 @@ class Core:
             return  # it was late, which was said
         reached = process.reached()
         phase = f" while {run.status.phase}" + (f" ({reached})" if reached else "")
-        raise RunFailed(f"{process.describe()} {how}{phase}", "\n".join(list(process.words)[-20:]))
+        raise RunFailed(f"{process.describe()} {how}{phase}", "\n".join(shortened(process.words)[-20:]))
 
     # End
 

@@ -14,6 +14,7 @@ from dataflow.supervision.events import Moment
 from dataflow.supervision.life import WORKS, Life, Step
 from dataflow.supervision.plan import ProcessPlan, RunPlan, taken_keys
 from dataflow.supervision.report import OperatorCounts, Status
+from dataflow.supervision.shortened import shortened
 from dataflow.supervision.supervised import Supervised
 
 
@@ -104,8 +105,8 @@ class RunState:
         return taken_keys(self.graph, process.plan)
 
     def last_words(self, late: Collection[Supervised] = ()) -> str:
-        """Returns what processes said last; of those that are `late` all that is kept, where they are included."""
-        said = ((p, line) for p in self.processes.values() for line in list(p.words)[0 if p in late else -5 :])
+        """Returns what processes said last, stacks shortened; of those that are `late` all that is kept."""
+        said = ((p, line) for p in self.processes.values() for line in shortened(p.words)[0 if p in late else -5 :])
         lines = [f"[{p.label}] {line}" for p, line in said]
         return "\n".join(lines)
 
