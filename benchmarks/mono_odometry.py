@@ -1,9 +1,10 @@
-"""Monocular odometry on 7-Scenes and in simulated worlds: accuracy up to the scale, and in metres by wheels.
+"""Monocular odometry on 7-Scenes and in simulated worlds: accuracy up to the scale, and in metres by wheels or depth.
 
     python benchmarks/mono_odometry.py recorded                        7-Scenes' colour images
     python benchmarks/mono_odometry.py worlds office:21 corridor:22    simulated worlds, kind and seed, 30 s at 10 Hz
 
-ATE by evo over the frames that count as tracked; with scale (Sim(3)) and, where wheels give metres, without (SE(3)).
+ATE by evo over the frames that count as tracked; with scale (Sim(3)) and, where wheels or one depth image a second give
+metres, without (SE(3)), from the frame on in which metres are known.
 Simulated drives are rendered once and kept in --cache. One thread; rendering and decoding are not counted.
 """
 
@@ -30,7 +31,10 @@ from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
 from operators.geometry import se3  # noqa: E402
+from operators.geometry.extrinsics import transform_between  # noqa: E402
+from operators.odometry.camera import RgbdCamera  # noqa: E402
 from operators.odometry.mono_odometry import MonoOdometry  # noqa: E402
+from operators.odometry.mono_ranging import MetricDepth  # noqa: E402
 from operators.odometry.tracking import MEASURED  # noqa: E402
 
 Array = NDArray[np.float64]
@@ -38,12 +42,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """Grey images (N, H, W), true camera poses (N, 4, 4), stamps (N,), K; the camera by the wheels where there are."""
+    """Grey images (N, H, W), true camera poses (N, 4, 4), stamps (N,); the camera by the wheels where there are.
+
+    Depth images come at stamps of their own, by the camera's intrinsics and those of its neighbour.
+    """
 
     image: NDArray[np.uint8]
     truth: Array
     stamps: NDArray[np.int64]
-    K: Array
+    camera: RgbdCamera
+    depth: dict[int, NDArray[np.float32]]
     wheels: Array | None = None
 
 
@@ -53,17 +61,31 @@ def recorded(folder: Path) -> Drive:
         raise SystemExit(f"no frame-NNNNNN.color.jpg in {folder}: give a 7-Scenes folder with --data")
     images = [cv2.cvtColor(np.asarray(cv2.imread(str(f), cv2.IMREAD_COLOR_RGB)), cv2.COLOR_RGB2GRAY) for f in files]
     truth = [se3.orthonormalised(np.loadtxt(f.with_name(f.name.replace("color.jpg", "pose.txt")))) for f in files]
-    K = np.loadtxt(folder / "camera-intrinsics.txt")
-    K[0, 0] = K[1, 1] = 525.0
-    return Drive(np.array(images), np.array(truth), np.arange(len(files)) * (10**9 // 30), K)
+    K_depth = np.loadtxt(folder / "camera-intrinsics.txt")
+    K_color = K_depth.copy()
+    K_color[0, 0] = K_color[1, 1] = 525.0
+    stamps = np.arange(len(files)) * (10**9 // 30)
+    return Drive(np.array(images), np.array(truth), stamps, RgbdCamera(K_color, K_depth), _depths(files, stamps))
+
+
+def _depths(files: list[Path], stamps: NDArray[np.int64]) -> dict[int, NDArray[np.float32]]:
+    """Returns one depth image a second, metres; the sensor's 65535 is no return."""
+    found = {}
+    for k in range(0, len(files), 30):
+        file = files[k].with_name(files[k].name.replace("color.jpg", "depth.png"))
+        raw = np.asarray(cv2.imread(str(file), cv2.IMREAD_UNCHANGED))
+        found[int(stamps[k])] = np.where(raw == 65535, 0, raw / 1000.0).astype(np.float32)
+    return found
 
 
 def simulated(cache: Path, world: str, seed: int, seconds: int) -> Drive:
-    file = cache / f"{world}_{seed}_{seconds}s.npz"
+    file = cache / f"{world}_{seed}_{seconds}s_depth.npz"
     if not file.is_file():
         _render(file, world, seed, seconds)
     d = np.load(file)
-    return Drive(d["image"], d["truth"], d["stamps"], d["K"], d["wheels"])
+    camera = RgbdCamera(d["K"], d["K_depth"], d["T_depth_color"])
+    depth = dict(zip(d["depth_stamps"].tolist(), d["depth"], strict=True))
+    return Drive(d["image"], d["truth"], d["stamps"], camera, depth, d["wheels"])
 
 
 def _render(file: Path, world: str, seed: int, seconds: int) -> None:
@@ -74,14 +96,17 @@ def _render(file: Path, world: str, seed: int, seconds: int) -> None:
         seed=seed,
         duration=f"{seconds}s",
         color_camera={"rate": 10, "width": 640, "height": 480},
-        depth_camera={"rate": 0},
+        depth_camera={"rate": 1},
         wheels={"rate": 10},
         truth={"poses": 10, "boxes": False, "relations": 0, "activities": 0},
     )
     robot.setup()
     static: dict[str, Any] = dict(robot.static_outputs())
-    messages: list[dict[str, Any]] = [dict(m) for m in robot.stream()]
-    truth = np.array([m["ground_truth"].matrix() for m in messages])
+    sent: list[dict[str, Any]] = [dict(m) for m in robot.stream()]
+    messages, depths = [m for m in sent if "image" in m], [m["depth"] for m in sent if "depth" in m]
+    depth_frame, color_frame = depths[0].frame, messages[0]["image"].frame
+    T_depth_color = transform_between(static["extrinsics"], color_frame, depth_frame)
+    truth = np.array([m["ground_truth"].matrix() @ T_depth_color for m in messages])
     T_base_camera = invert(messages[0]["true_base"].matrix()) @ truth[0]
     file.parent.mkdir(parents=True, exist_ok=True)
     np.savez(
@@ -90,6 +115,10 @@ def _render(file: Path, world: str, seed: int, seconds: int) -> None:
         truth=truth,
         stamps=np.array([m["image"].stamp for m in messages], np.int64),
         K=static["image_info"].K,
+        K_depth=static["depth_info"].K,
+        T_depth_color=T_depth_color,
+        depth=np.array([d.data for d in depths]),
+        depth_stamps=np.array([d.stamp for d in depths], np.int64),
         wheels=np.array([m["wheel_odometry"].matrix() @ T_base_camera for m in messages]),
     )
 
@@ -103,22 +132,27 @@ def ate(estimate: Array, truth: Array, scaled: bool) -> float:
     return float(100 * ape.get_statistic(metrics.StatisticsType.rmse))
 
 
-def show(name: str, drive: Drive, wheels: bool) -> None:
-    odometry = MonoOdometry(drive.K)
+def show(name: str, drive: Drive, metres: str) -> None:
+    """Prints the row of a drive whose metres come from "wheels", from "depth", or from nothing ("unknown")."""
+    odometry = MonoOdometry(drive.camera.K_color)
     results, spent = [], []
     for k, (image, stamp) in enumerate(zip(drive.image, drive.stamps.tolist(), strict=True)):
-        told = drive.wheels[k] if wheels and drive.wheels is not None else None
+        told = drive.wheels[k] if metres == "wheels" and drive.wheels is not None else None
+        seen = drive.depth.get(stamp) if metres == "depth" else None
+        given = None if seen is None else MetricDepth(stamp, seen, drive.camera)
         begun = time.process_time()
-        results.append(odometry.track(image, stamp, told))
+        results.append(odometry.track(image, stamp, told, given))
         spent.append(1e3 * (time.process_time() - begun))
     good = np.array([r.track.status in MEASURED for r in results])
-    poses = np.array([r.track.T_world_camera for r in results])[good]
-    words = dict(Counter(str(r.track.status) for r in results))
-    metric = f"{ate(poses, drive.truth[good], scaled=False):.2f}" if wheels else "-"
+    known = good & np.array([r.scale.known for r in results])
+    poses = np.array([r.track.T_world_camera for r in results])
+    words = Counter(str(r.track.status) for r in results)
+    words += Counter(f"depth {r.ranged.use}" for r in results if r.ranged is not None)
+    metric, judged = ("-", good) if not known.any() else (f"{ate(poses[known], drive.truth[known], False):.2f}", known)
     path = float(np.linalg.norm(np.diff(drive.truth[:, :3, 3], axis=0), axis=1).sum())
-    cells = [f"{path:.1f}", f"{ate(poses, drive.truth[good], scaled=True):.2f}", metric, f"{100 * good.mean():.1f}"]
+    cells = [f"{path:.1f}", f"{ate(poses[judged], drive.truth[judged], True):.2f}", metric, f"{100 * good.mean():.1f}"]
     cells += [f"{value:.1f}" for value in (np.mean(spent), np.median(spent), np.percentile(spent, 95))]
-    print(f"| {name} | {'wheels' if wheels else 'unknown'} | {' | '.join(cells)} |  {words}", flush=True)
+    print(f"| {name} | {metres} | {' | '.join(cells)} |  {dict(words)}", flush=True)
 
 
 def main() -> None:
@@ -134,12 +168,13 @@ def main() -> None:
     print("| drive | scale | path m | ATE Sim(3) cm | ATE SE(3) cm | tracked % | mean ms | median | p95 |")
     print("| --- | --- |" + " ---: |" * 7)
     if arguments.what == "recorded":
-        show("7-Scenes", recorded(arguments.data), wheels=False)
+        for metres in ("unknown", "depth"):
+            show("7-Scenes", recorded(arguments.data), metres)
     for name in arguments.worlds:
         kind, _, seed = name.partition(":")
         drive = simulated(arguments.cache, kind, int(seed), arguments.seconds)
-        for wheels in (False, True):
-            show(f"{kind} {seed}", drive, wheels)
+        for metres in ("unknown", "wheels", "depth"):
+            show(f"{kind} {seed}", drive, metres)
 
 
 if __name__ == "__main__":

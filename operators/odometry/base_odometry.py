@@ -19,7 +19,8 @@ class BaseOdometry(Operator):
 
     A camera's own odometry begins at its optical frame, tilted as it is mounted. With the extrinsics this gives a frame
     whose z is up where the robot stood level at first, and whose origin is on the floor. A pose that is not finite
-    gives none, and is counted.
+    gives none, and is counted; so does one without a scale (infinite variances) of a sensor beside the base, since
+    where the base is cannot be told until the scale is known.
     """
 
     sensor: In[Odometry] = In(doc="pose of a sensor in the frame where that sensor began")
@@ -33,13 +34,11 @@ class BaseOdometry(Operator):
         self._counts: Counter[str] = Counter()
 
     def process(self, sensor: Odometry, extrinsics: Transforms) -> Odometry | None:
-        """Raises ValueError where the extrinsics do not hold the sensor, or a pose without scale is beside the base."""
+        """Raises ValueError where the extrinsics do not hold the sensor."""
         T_base_sensor = transform_between(extrinsics, sensor.child_frame, self.base_frame)
         if _without_scale(sensor) and T_base_sensor[:3, 3].any():
-            raise ValueError(
-                f"{sensor.child_frame!r} is posed without a scale (its positions have infinite variances), so where "
-                f"{self.base_frame!r} is beside it cannot be told"
-            )
+            self._counts["poses without scale"] += 1
+            return None
         if not (np.isfinite(sensor.position).all() and np.isfinite(sensor.orientation).all()):
             self._counts["poses not finite"] += 1
             return None

@@ -11,6 +11,7 @@ import numpy as np
 from operators.odometry.keyframe import Keyframe
 from operators.odometry.motion import Motion
 from operators.odometry.noise import Noise
+from operators.odometry.plain import fields_of
 from operators.odometry.rgbd_odometry import State
 from operators.odometry.surface import Surface
 from operators.odometry.watch import Watch
@@ -19,12 +20,12 @@ from operators.odometry.watch import Watch
 def to_plain(state: State) -> dict[str, Any]:
     """Numbers, arrays, lists and mappings; `from_plain` is the inverse."""
     return {
-        "motion": None if state.motion is None else _fields_of(state.motion),
+        "motion": None if state.motion is None else fields_of(state.motion),
         "covariance": state.covariance,
-        "keyframes": [_fields_of(k) | {"surface": _fields_of(k.surface)} for k in state.keyframes],
+        "keyframes": [fields_of(k) | {"surface": fields_of(k.surface)} for k in state.keyframes],
         "shapes": None if state.shapes is None else [list(shape) for shape in state.shapes],
-        "noise": _fields_of(state.noise),
-        "watch": _fields_of(state.watch),
+        "noise": fields_of(state.noise),
+        "watch": fields_of(state.watch),
         "recalls": state.recalls,
         "apart_since": state.apart_since,
     }
@@ -50,7 +51,3 @@ def _keyframe(values: Mapping[str, Any]) -> Keyframe:
     names = {field.name for field in fields(Keyframe)}
     known = {"ages": np.zeros(len(values["pixels"]), np.int64)} | {k: v for k, v in values.items() if k in names}
     return Keyframe(**(known | {"surface": Surface(**values["surface"])}))
-
-
-def _fields_of(value: Motion | Keyframe | Surface | Noise | Watch) -> dict[str, Any]:
-    return {field.name: getattr(value, field.name) for field in fields(value)}

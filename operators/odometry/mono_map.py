@@ -12,6 +12,7 @@ from operators.geometry.se3 import Matrix
 from operators.odometry.features import Gray, Mask
 from operators.odometry.keyframe import view_distance
 from operators.odometry.mono_adjustment import Views, adjust
+from operators.odometry.tracking import scaled_covariance
 from operators.odometry.two_view import triangulate
 
 Numbers = NDArray[np.int64]
@@ -158,6 +159,12 @@ class MonoMap:
             T[:3, 3] = centre + factor * (T[:3, 3] - centre)
             views.append(replace(view, T_world_camera=T))
         return MonoMap(tuple(views), self.numbers, centre + factor * (self.points - centre))
+
+    def in_metres(self, factor: float, centre: Points) -> "MonoMap":
+        """Scales the map about a place (3,), and its poses' covariances with it: its unit was not known before."""
+        known = self.resized(factor, centre)
+        views = tuple(replace(v, covariance=scaled_covariance(v.covariance, factor)) for v in known.views)
+        return replace(known, views=views)
 
     def _seen_by(self, views: Sequence[View]) -> tuple[Views, Numbers]:
         """Returns the sightings of points that two of some views saw, and the numbers of these points."""

@@ -2,7 +2,7 @@
 
 Corners are tracked by Lucas-Kanade from frame to frame. Two views of them give the first points; the pose then comes by
 RANSAC PnP from the points, and keyframes triangulate new ones and are adjusted together. One camera sees no scale: the
-map has a unit of its own until another odometry tells how far the camera came.
+map has a unit of its own until another odometry tells how far the camera came, or a depth image how far points are.
 """
 
 from dataclasses import dataclass, field, replace
@@ -12,18 +12,19 @@ from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
 from operators.geometry.pinhole import project
-from operators.geometry.se3 import Matrix
+from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.features import detect_corners
 from operators.odometry.keyframe import view_distance
 from operators.odometry.mono_beginning import first_map
 from operators.odometry.mono_map import MonoMap, View
 from operators.odometry.mono_pose import PosedView, refined, solved
+from operators.odometry.mono_ranging import MetricDepth, Ranged, RangingMemory, RangingUse, pose_at, ranged
 from operators.odometry.mono_relocalizer import recognised
 from operators.odometry.mono_scale import Scale
 from operators.odometry.mono_settings import MonoOdometryConfig
 from operators.odometry.mono_tracks import MonoFrame, Tracks, from_view, observe
 from operators.odometry.motion import Motion
-from operators.odometry.tracking import Status, TrackResult, moved_covariance
+from operators.odometry.tracking import Status, TrackResult, moved_covariance, scaled_covariance
 from operators.odometry.two_view import Unsolved
 from operators.odometry.watch import Watch
 
@@ -44,6 +45,8 @@ class MonoState:
     tracks: Tracks | None = None
     following: int = 0  # number of the next new corner
     scale: Scale = field(default_factory=Scale)
+    origin: Vector = field(default_factory=lambda: np.zeros(3))  # where the map began
+    ranging: RangingMemory = field(default_factory=RangingMemory)
     T_reference: Matrix | None = None  # the reference's camera at the last frame
     watch: Watch = field(default_factory=Watch)
     shape: tuple[int, ...] | None = None
@@ -52,10 +55,11 @@ class MonoState:
 
 @dataclass(frozen=True, eq=False)
 class MonoResult:
-    """The pose of one frame in the map's unit, and how well that is known to be a metre."""
+    """The pose of one frame in the map's unit, how well that is known to be a metre, and what a depth image said."""
 
     track: TrackResult
     scale: Scale
+    ranged: Ranged | None = None
 
 
 class MonoOdometry:
@@ -68,21 +72,25 @@ class MonoOdometry:
         self.config = config or MonoOdometryConfig()
         self._state = MonoState()
 
-    def track(self, image: NDArray[np.uint8], stamp: int, T_reference: Matrix | None = None) -> MonoResult:
+    def track(
+        self, image: NDArray[np.uint8], stamp: int, T_reference: Matrix | None = None, depth: MetricDepth | None = None
+    ) -> MonoResult:
         """Returns the pose of the next frame: (H, W) or (H, W, 3) RGB uint8, nanoseconds.
 
-        `T_reference` (4, 4), metres, is where another odometry has the camera, in any frame that does not jump. Raises
-        ValueError for a wrong shape or type, a size that changed, or a stamp that does not increase.
+        `T_reference` (4, 4), metres, is where another odometry has the camera, in any frame that does not jump.
+        `depth` is of this stamp, or of one after the last frame's; its camera's K_color is that of the image as given.
+        One that was given before says nothing new. Raises ValueError for a wrong shape or type, a size that changed, or
+        a stamp that does not increase.
         """
         frame = self._look(image, stamp, T_reference)
         if self._state.motion is None:
             self._set(motion=Motion(stamp, np.eye(4), np.zeros(6)))
-        if not self._state.map.begun:
-            result = self._initialise(frame)
-        else:
-            result = self._go_on(frame)
+        before = self._state
+        result = self._go_on(frame) if before.map.begun else self._initialise(frame)
         self._set(T_reference=T_reference)
-        return MonoResult(result, self._state.scale)
+        if depth is None or depth.stamp <= before.ranging.stamp:
+            return MonoResult(result, self._state.scale)
+        return self._ranged(frame, result, depth, before)
 
     def _go_on(self, frame: MonoFrame) -> TrackResult:
         # 1. Predict the pose by the reference, or else by the motion so far.
@@ -133,7 +141,10 @@ class MonoOdometry:
         if isinstance(begun, Unsolved):
             return str(begun)
         motion = Motion(frame.stamp, begun.tracks.T_world_camera, np.zeros(6))
-        self._set(map=begun.map, beginning=None, scale=begun.scale, tracks=begun.tracks, motion=motion, turns=0)
+        origin = first.T_world_camera[:3, 3]
+        self._set(
+            map=begun.map, beginning=None, scale=begun.scale, origin=origin, tracks=begun.tracks, motion=motion, turns=0
+        )
         return None
 
     # -- the steps ---------------------------------------------------------------------------------------
@@ -196,15 +207,12 @@ class MonoOdometry:
         grown = grown.without(wrong)
         T = grown.newest.T_world_camera
         factor, scale = state.scale.corrected(grown.views[-config.window :], config.reference_sigma)
-        if factor != 1.0:
-            grown = grown.resized(factor, T[:3, 3])
-        velocity = state.motion.velocity * np.repeat([factor, 1.0], 3)
         self._set(
             map=grown,
-            scale=scale,
             tracks=replace(tracks.only(~np.isin(tracks.numbers, wrong)), T_world_camera=T),
-            motion=replace(state.motion, T_world_camera=T, velocity=velocity),
+            motion=replace(state.motion, T_world_camera=T),
         )
+        self._rescale(factor, scale)
 
     def _recall(self, frame: MonoFrame, T_predicted: Matrix) -> tuple[Tracks, PosedView] | None:
         """Looks for the view in the map, the nearest keyframe first and the others by turns."""
@@ -258,6 +266,44 @@ class MonoOdometry:
         assert self._state.motion is not None
         lost = self._state.motion.blind_s > config.patience_s
         return self._result(Status.LOST if lost else Status.PREDICTED, reason, 0)
+
+    # -- the scale ---------------------------------------------------------------------------------------
+
+    def _ranged(self, frame: MonoFrame, result: TrackResult, depth: MetricDepth, before: MonoState) -> MonoResult:
+        """Takes the scale from a depth image; the pose is that of a result, or lies between it and the one before."""
+        state = self._state
+        rows, known = state.map.find(np.zeros(0, np.int64) if state.tracks is None else state.tracks.numbers)
+        T = pose_at(depth.stamp, result, before.motion if before.map.begun else None)
+        given = replace(depth, camera=replace(depth.camera, K_color=frame.K))
+        told = ranged(given, state.map.points[rows[known]], T, state.scale, state.ranging, self.config.ranging)
+        self._set(ranging=told.memory)
+        self._rescale(told.factor, told.scale)
+        if told.use is RangingUse.FOUND:
+            result = self._result(result.status, result.reason, result.inliers, result.keyframe)
+        return MonoResult(result, self._state.scale, told)
+
+    def _rescale(self, factor: float, scale: Scale) -> None:
+        """Brings the map to metres: about the camera, so that its pose stays; where they are known for the first time,
+        about the place where the map began."""
+        state = self._state
+        assert state.motion is not None
+        if factor == 1.0 and scale == state.scale:
+            return
+        T, velocity = state.motion.T_world_camera, state.motion.velocity * np.repeat([factor, 1.0], 3)
+        if scale.known and not state.scale.known:
+            T = T.copy()
+            T[:3, 3] = state.origin + factor * (T[:3, 3] - state.origin)
+            self._set(
+                map=state.map.in_metres(factor, state.origin), covariance=scaled_covariance(state.covariance, factor)
+            )
+        elif factor != 1.0:
+            self._set(map=state.map.resized(factor, T[:3, 3]))
+        assert state.tracks is not None
+        self._set(
+            scale=scale,
+            tracks=replace(state.tracks, T_world_camera=T),
+            motion=replace(state.motion, T_world_camera=T, velocity=velocity),
+        )
 
     # -- corners -----------------------------------------------------------------------------------------
 

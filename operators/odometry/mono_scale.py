@@ -1,4 +1,4 @@
-"""The scale of a monocular map: unknown, or learnt from an odometry that measures metres."""
+"""The scale of a monocular map: unknown, or learnt from what measures metres."""
 
 from __future__ import annotations
 
@@ -20,9 +20,13 @@ LARGEST = 1.3  # factor by which one correction may change a known scale
 
 @dataclass(frozen=True)
 class Scale:
-    """Uncertainty of the map's unit as a metre: standard deviation of its logarithm, infinite if not known at all."""
+    """Uncertainty of the map's unit as a metre: standard deviation of its logarithm, infinite if not known at all.
+
+    `past` is the same of the way so far, beside that: it came about with a unit that was found to be another.
+    """
 
     sigma: float = float("inf")
+    past: float = 0.0
 
     @property
     def known(self) -> bool:
@@ -38,13 +42,20 @@ class Scale:
         if told is None:
             return 1.0, believed
         factor, metres = told
-        sigma = float(np.hypot(share, ROUGH / metres))
+        return believed.weighed(factor, float(np.hypot(share, ROUGH / metres)), share)
+
+    def weighed(self, factor: float, sigma: float, share: float) -> tuple[float, Scale]:
+        """Returns the factor that brings the map to metres, and the scale then, where a source measured one.
+
+        `sigma`: standard deviation of the logarithm of that measurement; `share`: the part of it that stays the same
+        from one to the next.
+        """
         if not self.known:
             return factor, Scale(sigma)
-        gain = believed.sigma**2 / (believed.sigma**2 + sigma**2)
+        gain = self.sigma**2 / (self.sigma**2 + sigma**2)
         step = float(np.clip(factor, 1.0 / LARGEST, LARGEST) ** gain)
-        # The reference's own error of scale is no fresh one each time: nothing gets surer than that.
-        return step, Scale(max(float(np.sqrt(1.0 - gain)) * believed.sigma, share))
+        # A source's own error of scale is no fresh one each time: nothing gets surer by it than that.
+        return step, replace(self, sigma=max(float(np.sqrt(1.0 - gain)) * self.sigma, min(share, self.sigma)))
 
 
 def ratio(views: Sequence[View]) -> tuple[float, float] | None:

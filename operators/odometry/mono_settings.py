@@ -6,6 +6,21 @@ from operators.odometry.two_view import TwoViewConfig
 
 
 @dataclass(frozen=True)
+class RangingConfig:
+    """Settings of a scale that is taken from depth images."""
+
+    near: float = 0.3  # metres: smaller depths are no return
+    far: float = 6.0  # metres: larger depths are no return
+    surface_width: int = 160  # the depth image is reduced by whole factors to no less than this
+    min_points: int = 15  # points of the map with a depth that a scale may rest on
+    sigma: float = 0.01  # share by which all depths may be wrong alike
+
+    def __post_init__(self) -> None:
+        if not 0 < self.near < self.far:
+            raise ValueError(f"RangingConfig needs 0 < near < far metres, got near={self.near}, far={self.far}")
+
+
+@dataclass(frozen=True)
 class MonoOdometryConfig:
     """Settings; the defaults suit a hand-held or robot-borne camera at 10 to 60 Hz."""
 
@@ -27,6 +42,7 @@ class MonoOdometryConfig:
     patience_s: float = 0.5  # of prediction until the state is lost
     give_up_s: float = 3.0  # of being lost until a new map begins
     reference_sigma: float = 0.02  # share by which the reference's ways may be wrong
+    ranging: RangingConfig = field(default_factory=RangingConfig)
 
     def __post_init__(self) -> None:
         if self.min_inliers < 8:

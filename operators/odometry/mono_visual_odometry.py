@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dataflow.messages import CameraInfo, Diagnostics, Image, Odometry, Transforms
+from dataflow.messages import CameraInfo, DepthImage, Diagnostics, Image, Odometry, Transforms
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry import se3
 from operators.geometry.calibration import check_calibration
@@ -18,9 +18,11 @@ from operators.geometry.se3 import Matrix
 from operators.odometry.emission import outputs
 from operators.odometry.mono_memory import from_plain, to_plain
 from operators.odometry.mono_odometry import MonoOdometry, MonoResult, MonoState
-from operators.odometry.mono_settings import MonoOdometryConfig
+from operators.odometry.mono_ranging import MetricDepth
+from operators.odometry.mono_settings import MonoOdometryConfig, RangingConfig
 from operators.odometry.tracking import Status, TrackResult
 from operators.odometry.two_view import TwoViewConfig
+from operators.odometry.visual_odometry import camera_of
 
 
 class MonoVisualOdometry(Operator):
@@ -31,12 +33,21 @@ class MonoVisualOdometry(Operator):
     optical frame comes at every frame, and `status` says what it rests on, as VisualOdometry's does. A lost camera
     looks for its view among the keyframes; after `give_up` it begins a new map where the prediction puts it.
 
-    One camera sees no scale. Without `scale` the poses are in a unit of the map's own (about the depth of the first
-    view), and the message says so: its frame is `unscaled_frame`, the variances of its position are infinite, and it
-    has no linear velocity. With `scale`, an odometry in metres of anything rigidly attached, the map is brought to
-    metres over the ways between its keyframes and kept there, and the covariance holds what is left. Wheels are the
-    simplest such odometry: their way is right to a percent or two at any speed, whereas an inertial sensor needs
-    excitation and the level, and depth another camera.
+    One camera sees no scale. Without `scale` and `depth` the poses are in a unit of the map's own (about the depth of
+    the first view), and the message says so: its frame is `unscaled_frame`, the variances of its position are infinite,
+    and it has no linear velocity. Two inputs give metres, each alone or both together:
+
+    - `scale`, an odometry in metres of anything rigidly attached, over the ways between keyframes. Wheels are the
+      simplest: their way is right to a percent or two at any speed, whereas an inertial sensor needs excitation and
+      the level.
+    - `depth`, an image in metres every now and then, over the points of the map that it shows: the median of what their
+      depths are by what they are in the map. It may be of another camera and another rate, and need not cover the view.
+
+    The first that tells brings the map to metres and the path to `odometry_frame`, which begins where the map did;
+    from then on the scale is a state with a variance that grows from keyframe to keyframe, and what it is corrected by
+    moves the map about the camera, so that no pose jumps. Depth that contradicts a known scale is left out, until five
+    images in succession do so alike; the way so far then counts as wrong by that factor. `status` tells how well the
+    scale is known and what became of each depth image, and the covariance of the position holds what is left.
 
     Methods: Mur-Artal et al., "ORB-SLAM", 2015 (initialisation); Strasdat et al., "Scale drift-aware large scale
     monocular SLAM", 2010.
@@ -47,7 +58,13 @@ class MonoVisualOdometry(Operator):
     scale: Sampled[Odometry] = Sampled(
         required=False, max_age="200ms", doc="an odometry in metres, of wheels for instance, that gives the scale"
     )
-    extrinsics: Sampled[Transforms] = Sampled(required=False, doc="holds the camera on the body that `scale` poses")
+    extrinsics: Sampled[Transforms] = Sampled(
+        required=False, doc="holds the camera on the body that `scale` poses, and the depth camera beside it"
+    )
+    depth: Sampled[DepthImage] = Sampled(
+        required=False, doc="depth in metres that gives the scale, each image once: of an image's stamp, or between two"
+    )
+    depth_info: Sampled[CameraInfo] = Sampled(required=False, doc="calibration of the depth camera")
     odometry: Out[Odometry] = Out(doc="the camera, with covariance and velocity as far as the scale is known")
     status: Out[Diagnostics] = Out(
         doc="initialising, tracking, relocalised, predicted or lost, with the reason; at every frame"
@@ -69,6 +86,10 @@ class MonoVisualOdometry(Operator):
     patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
     give_up: float = Param(3.0, ge=0, doc="time of being lost until a new map begins", unit="s")
     scale_sigma: float = Param(0.02, gt=0, doc="share by which the ways of `scale` may be wrong")
+    depth_sigma: float = Param(0.01, gt=0, doc="share by which all depths of `depth` may be wrong alike")
+    depth_near: float = Param(0.3, gt=0, doc="smaller depths are no return", unit="m")
+    depth_far: float = Param(6.0, gt=0, doc="larger depths are no return", unit="m")
+    depth_points: int = Param(15, ge=5, doc="fewest points of the map with a depth that a scale may rest on")
 
     _tracker: MonoOdometry | None = None
     _restored: MonoState | None = None
@@ -82,13 +103,18 @@ class MonoVisualOdometry(Operator):
         image_info: CameraInfo,
         scale: Odometry | None = None,
         extrinsics: Transforms | None = None,
+        depth: DepthImage | None = None,
+        depth_info: CameraInfo | None = None,
     ) -> dict[str, Any]:
         """Raises ValueError where an image does not fit its calibration, that changes, or `scale` poses what no
         transform relates."""
         check_calibration("image", image, image_info)
         T_reference = None if scale is None else _camera_by(scale, image, extrinsics)
-        result = self._tracking(image_info).track(image.data, image.stamp, T_reference)
+        given = None if depth is None else _metric(depth, depth_info, image_info, extrinsics)
+        result = self._tracking(image_info).track(image.data, image.stamp, T_reference, given)
         self._frames[result.track.status.value] += 1
+        if result.ranged is not None:
+            self._frames[f"depth {result.ranged.use.value}"] += 1
         return self._told(result, image.frame)
 
     def on_reset(self, input: str) -> None:
@@ -106,7 +132,7 @@ class MonoVisualOdometry(Operator):
         self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
 
     def summary(self) -> Mapping[str, float | int]:
-        """Returns the number of frames of each status."""
+        """Returns the number of frames of each status, and of depth images by what became of them."""
         return dict(self._frames)
 
     def _told(self, result: MonoResult, frame: str) -> dict[str, Any]:
@@ -116,6 +142,8 @@ class MonoVisualOdometry(Operator):
             return {"status": told["status"]}
         status: Diagnostics = told["status"]
         text = f"scale known to {100 * result.scale.sigma:.0f} %" if known else "scale unknown"
+        if result.ranged is not None:
+            text += f", {result.ranged.text}"
         told["status"] = status.replace(messages=(f"{status.messages[0]}; {text}",))
         if not known:
             odometry: Odometry = told["odometry"]
@@ -148,6 +176,9 @@ class MonoVisualOdometry(Operator):
             patience_s=self.patience,
             give_up_s=self.give_up,
             reference_sigma=self.scale_sigma,
+            ranging=RangingConfig(
+                near=self.depth_near, far=self.depth_far, min_points=self.depth_points, sigma=self.depth_sigma
+            ),
         )
 
 
@@ -166,6 +197,16 @@ def _camera_by(odometry: Odometry, image: Image, extrinsics: Transforms | None) 
     return np.asarray(T @ transform_between(extrinsics, image.frame, odometry.child_frame))
 
 
+def _metric(
+    depth: DepthImage, depth_info: CameraInfo | None, image_info: CameraInfo, extrinsics: Transforms | None
+) -> MetricDepth:
+    """Returns a depth image with its place beside the camera. Raises ValueError where nothing tells that."""
+    if depth_info is None:
+        raise ValueError("depth is connected, but not depth_info, without which its pixels have no rays")
+    check_calibration("depth", depth, depth_info)
+    return MetricDepth(depth.stamp, depth.data, camera_of(image_info, depth_info, extrinsics))
+
+
 def _with_scale(result: MonoResult) -> TrackResult:
     """Returns the track with what an error of the scale does to the way from the origin."""
     track = result.track
@@ -173,5 +214,5 @@ def _with_scale(result: MonoResult) -> TrackResult:
         return track
     away = track.T_world_camera[:3, :3].T @ track.T_world_camera[:3, 3]
     covariance = track.covariance.copy()
-    covariance[:3, :3] += result.scale.sigma**2 * np.outer(away, away)
+    covariance[:3, :3] += (result.scale.sigma**2 + result.scale.past**2) * np.outer(away, away)
     return replace(track, covariance=covariance)

@@ -43,3 +43,9 @@ def moved_covariance(covariance: Matrix, T_world_a: Matrix, T_world_b: Matrix) -
     """Carries a pose error (6, 6) of a, right perturbation, along rigidly to b."""
     A = se3.adjoint(invert(T_world_b) @ T_world_a)
     return A @ covariance @ A.T
+
+
+def scaled_covariance(covariance: Matrix, factor: float) -> Matrix:
+    """Returns the covariance (6, 6) of a pose whose unit of length is another."""
+    by = np.repeat([factor, 1.0], 3)
+    return np.asarray(covariance * np.outer(by, by))

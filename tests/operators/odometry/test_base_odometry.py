@@ -54,19 +54,23 @@ def test_extrinsics_without_the_sensor_are_refused() -> None:
         play(BaseOdometry(), {"sensor": [seen(np.eye(4))], "extrinsics": [other]}, static=["extrinsics"])
 
 
-def test_a_pose_without_scale_turns_and_is_refused_beside_the_base() -> None:
+def test_a_pose_without_scale_turns_and_gives_none_beside_the_base() -> None:
     unknown = np.diag([np.inf, np.inf, np.inf, 1e-4, 4e-4, 9e-4])
     sensor = Odometry.from_matrix(np.eye(4), stamp=5, frame="odom", child_frame="camera", pose_covariance=unknown)
     turned = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     here = Transforms.from_matrix(turned, stamp=0, frame="base_link", child_frame="camera")
-    covariance = BaseOdometry().process(sensor, here).pose_covariance
+    operator = BaseOdometry()
+    operator.setup()
+    posed = operator.process(sensor, here)
+    assert posed is not None
+    covariance = posed.pose_covariance
     assert covariance is not None
     assert np.isinf(np.diag(covariance)[:3]).all()
     np.testing.assert_allclose(np.diag(covariance)[3:], [9e-4, 1e-4, 4e-4])
     turned[0, 3] = 0.1
     beside = Transforms.from_matrix(turned, stamp=0, frame="base_link", child_frame="camera")
-    with pytest.raises(ValueError, match="without a scale"):
-        BaseOdometry().process(sensor, beside)
+    assert operator.process(sensor, beside) is None
+    assert operator.summary() == {"poses without scale": 1}
 
 
 def test_a_pose_that_is_not_finite_gives_none_and_is_counted() -> None:
