@@ -1,4 +1,8 @@
-"""Drift and time of stereo odometry on a KITTI odometry folder, one thread; decoding is excluded."""
+"""Stereo odometry on a KITTI odometry folder: drift and time, and what it makes of black images; one thread.
+
+python benchmarks/stereo_odometry.py           drift and time; decoding is excluded
+python benchmarks/stereo_odometry.py gaps      black images in the drive, and where the car is taken to be after
+"""
 
 from __future__ import annotations
 
@@ -19,6 +23,7 @@ import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
+from operators.odometry.stereo_adjustment import StereoRig  # noqa: E402
 from operators.odometry.stereo_odometry import StereoOdometry  # noqa: E402
 from operators.odometry.stereo_visual_odometry import rig_of  # noqa: E402
 from operators.odometry.tracking import MEASURED  # noqa: E402
@@ -54,21 +59,52 @@ def turning(path: list[Matrix], first: int, last: int) -> Matrix:
     return np.array([1e3 * cv2.Rodrigues((invert(a) @ b)[:3, :3])[0].ravel() for a, b in pairwise(path)][first:last])
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "kitti_odometry_06"
-    parser.add_argument(
-        "--data", type=Path, default=data, help="a KITTI odometry sequence (default: the project's data)"
-    )
-    cv2.setNumThreads(1)
-    folder = parser.parse_args().data
+BEGINS, LENGTHS, AFTER = (16, 22, 28), (6, 10, 16), 10  # first black pair, how many, pairs that follow, at 10 Hz
+WRONG = 0.5  # metres
+
+
+def gaps(steps: list[Any], rig: StereoRig) -> None:
+    """Prints where a car is said to be after black images: it went on, or drives backwards over where it had been."""
+    print("| after the gap | gaps | pairs | said to be known | right | wrong | worst m | first known after, pairs |")
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
+    for name in ("it went on", "it comes back"):
+        count, known, wrong, worst, firsts = 0, 0, 0, 0.0, list[str]()
+        for begin in BEGINS:
+            for length in LENGTHS:
+                ahead = range(begin + length, min(begin + length + AFTER, len(steps)))
+                after = ahead if name == "it went on" else range(begin - 3, begin - 3 - AFTER, -1)
+                off = _after(steps, rig, begin, length, list(after))
+                said = [k for k, metres in enumerate(off) if metres is not None]
+                firsts.append(str(said[0]) if said else "-")
+                metres = [m for m in off if m is not None]
+                count, known = count + len(off), known + len(metres)
+                wrong, worst = wrong + sum(m > WRONG for m in metres), max([worst, *metres])
+        cells = f"{len(firsts)} | {count} | {known} | {known - wrong} | {wrong} | {worst:.2f}"
+        print(f"| {name} | {cells} | {' '.join(firsts)} |", flush=True)
+
+
+def _after(steps: list[Any], rig: StereoRig, begin: int, length: int, after: list[int]) -> list[float | None]:
+    """Returns by how many metres each pose after a gap is off, from the last before it; None where none is claimed."""
+    odometry, period = StereoOdometry(rig), 10**8
+    for k in range(begin):
+        last = odometry.track(steps[k]["left"].data, steps[k]["right"].data, k * period).T_world_camera
+    black = np.zeros_like(steps[0]["left"].data)
+    for k in range(begin, begin + length):
+        odometry.track(black, black, k * period)
+    T_world_truth = last @ invert(steps[begin - 1]["ground_truth"].matrix())
+    off: list[float | None] = []
+    for k, i in enumerate(after):
+        found = odometry.track(steps[i]["left"].data, steps[i]["right"].data, (begin + length + k) * period)
+        error = (T_world_truth @ steps[i]["ground_truth"].matrix())[:3, 3] - found.T_world_camera[:3, 3]
+        claimed = found.status in MEASURED and "unknown" not in found.reason
+        off.append(float(np.linalg.norm(error)) if claimed else None)
+    return off
+
+
+def drifts(steps: list[Any], rig: StereoRig) -> None:
+    """Prints drift and time forwards, backwards and from later pairs, and by how much turns differ from the truth."""
     print("| pairs | end point % | last pose aligned % | 10-40 m segments % | tracked | offset px | ms | CPU ms |")
     print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
-    source = KittiOdometry(path=str(folder))
-    source.setup()
-    statics = source.static_outputs()
-    rig = rig_of(statics["left_info"], statics["right_info"])  # type: ignore[arg-type]
-    steps: list[Any] = list(source.stream())
     whole: dict[str, list[Matrix]] = {}
     for name, chosen in (("all", steps), ("from 10", steps[10:]), ("from 12", steps[12:]), ("backwards", steps[::-1])):
         odometry = StereoOdometry(rig)
@@ -97,6 +133,26 @@ def main() -> None:
     ):
         off = [turning(a, *part) - turning(b, *part) for part in ((0, 12), (12, 50))]
         print(f"| {name} | {np.sqrt(np.mean(off[0] ** 2)):.2f} | {np.sqrt(np.mean(off[1] ** 2)):.2f} |")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", choices=["drift", "gaps"], nargs="?", default="drift")
+    data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "kitti_odometry_06"
+    parser.add_argument(
+        "--data", type=Path, default=data, help="a KITTI odometry sequence (default: the project's data)"
+    )
+    cv2.setNumThreads(1)
+    arguments = parser.parse_args()
+    source = KittiOdometry(path=str(arguments.data))
+    source.setup()
+    statics = source.static_outputs()
+    rig = rig_of(statics["left_info"], statics["right_info"])  # type: ignore[arg-type]
+    steps: list[Any] = list(source.stream())
+    if arguments.what == "gaps":
+        gaps(steps, rig)
+    else:
+        drifts(steps, rig)
 
 
 if __name__ == "__main__":

@@ -14,12 +14,15 @@ from operators.odometry.camera import RgbdCamera
 from operators.odometry.features import Gray
 from operators.odometry.frame import Frame
 from operators.odometry.keyframe import Keyframe
+from operators.odometry.surface import DepthNoise
 
 STRIDE = 2  # patches of the view's surface between points that are compared
-NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so much more by the square of the depth
+NEAR, NEAR_PER_SQUARE = 0.03, 0.01  # metres by which depths may differ, and so much more by the square of the depth;
+# where depth is noisier than that, by its standard deviation
 FEWEST = 300  # points that a view must have in common with the map
 OVERLAP, AGREEMENT, LIKENESS = 0.3, 0.5, 0.45  # the least of a view that is recognised (see the benchmark)
 TOGETHER = 1.25  # the least of agreement and likeness in sum
+USUAL_NOISE = DepthNoise()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +57,20 @@ def seeing(points: Points, T_world_camera: Matrix, keyframes: Sequence[Keyframe]
     return [keyframes[i] for i in order.tolist() if seen[i]]
 
 
-def gathered(frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Evidence:
+def gathered(
+    frame: Frame,
+    T_world_camera: Matrix,
+    keyframes: Sequence[Keyframe],
+    camera: RgbdCamera,
+    noise: DepthNoise = USUAL_NOISE,
+) -> Evidence:
     """Compares a frame at a pose with keyframes, by the colour camera of whose images K_color is."""
+    slack = max(NEAR_PER_SQUARE, noise.quadratic)
     points = frame.surface.points(STRIDE)
     here = _sampled(_levelled(frame.gray), points, camera)
     met, same, pairs = 0, 0, [np.zeros((0, 2))]
     for keyframe in keyframes:
-        moved, on, known = _compared(points, T_world_camera, keyframe)
+        moved, on, known = _compared(points, T_world_camera, keyframe, slack)
         met += int(np.count_nonzero(known))
         same += int(np.count_nonzero(on))
         there = _sampled(_levelled(keyframe.gray), moved[on], camera)
@@ -79,7 +89,7 @@ def _correlation(pairs: NDArray[np.float64]) -> float:
 
 
 def _compared(
-    points: Points, T_world_camera: Matrix, keyframe: Keyframe
+    points: Points, T_world_camera: Matrix, keyframe: Keyframe, slack: float = NEAR_PER_SQUARE
 ) -> tuple[Points, NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns points (N, 3) in a keyframe's camera, which lie on its surface, and which are where it has one."""
     moved = transform_points(keyframe.T_camera_world @ T_world_camera, points)
@@ -91,7 +101,7 @@ def _compared(
     inverse = keyframe.surface.inverse_depth[np.clip(v, 0, h - 1), np.clip(u, 0, w - 1)]
     known = inside & (inverse > 0)
     off = np.abs(1.0 / np.where(known, inverse, 1.0) - z)
-    return moved, known & (off < NEAR + NEAR_PER_SQUARE * z * z), known
+    return moved, known & (off < NEAR + slack * z * z), known
 
 
 def _levelled(gray: Gray) -> NDArray[np.float32]:

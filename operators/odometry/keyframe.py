@@ -1,6 +1,7 @@
 """Keyframes: views with a known pose that later frames are measured against."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -55,3 +56,11 @@ def view_distance(T_a: Matrix, T_b: Matrix, depth: float) -> float:
     way, trace = T[:3, 3].copy(), float(T[0, 0]) + float(T[1, 1]) + float(T[2, 2])
     cosine = min(max((trace - 1.0) / 2.0, -1.0), 1.0)
     return float(math.sqrt(way.dot(way)) / depth + np.arccos(cosine))
+
+
+def redundant(poses: Sequence[Matrix], recent: int, depth: float = 2.0) -> int:
+    """Returns the index of the old pose, before the `recent` newest, whose neighbours in time see most nearly what it
+    sees of a scene at a depth; the first is the last to be one."""
+    old = poses[: max(len(poses) - recent, 1)]
+    gaps = [view_distance(poses[i - 1], poses[i + 1], depth) for i in range(1, len(old))]
+    return 1 + int(np.argmin(gaps)) if gaps else 0

@@ -7,7 +7,7 @@ import numpy as np
 
 from operators.geometry.pinhole import project
 from operators.geometry.se3 import Matrix, orthonormalised
-from operators.odometry.keyframe import Keyframe, view_distance
+from operators.odometry.keyframe import Keyframe, redundant, view_distance
 from operators.odometry.surface import Surface
 
 RECENT = 5  # newest keyframes, never forgotten
@@ -40,7 +40,7 @@ class LocalMap:
         times their memory, and are made anew of those few keyframes that are near again."""
         self.keyframes.append(keyframe)
         if len(self.keyframes) > self.capacity:
-            del self.keyframes[self._redundant()]
+            del self.keyframes[redundant([k.T_world_camera for k in self.keyframes], RECENT)]
         for older in self.keyframes[:-RECENT]:
             older.surface.let_go()
 
@@ -96,12 +96,3 @@ class LocalMap:
             np.maximum.at(seen, v[inside] * w + u[inside], (1.0 / points[inside, 2]).astype(np.float32))
         inverse = seen.reshape(h, w)
         return Surface(np.where(inverse > 0, inverse, cv2.dilate(inverse, np.ones((3, 3), np.uint8))), like.K)
-
-    def _redundant(self) -> int:
-        """Returns the index of the old keyframe whose neighbours in time see most nearly what it sees."""
-        old = self.keyframes[: max(len(self.keyframes) - RECENT, 1)]
-        gaps = [
-            view_distance(self.keyframes[i - 1].T_world_camera, self.keyframes[i + 1].T_world_camera, 2.0)
-            for i in range(1, len(old))
-        ]
-        return 1 + int(np.argmin(gaps)) if gaps else 0

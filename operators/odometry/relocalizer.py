@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ from operators.odometry.keyframe import Keyframe, view_distance
 from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
 from operators.odometry.recognition import Description, describe, match, match_of_size
-from operators.odometry.surface import Surface
+from operators.odometry.surface import DepthNoise, Surface
 
 PAIRS = 60  # features of one keyframe that are paired
 FEWEST = 8  # different features of a view that must agree on its pose for a look at what else supports it
@@ -34,6 +35,9 @@ TYPICAL_DEPTH = 2.0  # metres
 SPARSE = 4  # patches of the view's surface between points by which these are chosen
 FEWEST_PIXELS = 7  # features that a pose may be solved from without depth
 RECALL_PIXELS = 3.0  # working pixels by which such a feature may be off
+RECALL_NEAR, RECALL_OTHERS = 3, 5  # keyframes, near the prediction and elsewhere, that a lost view is compared with
+RECALL_EVERY = 3  # frames, while a new map is tracked for longer than
+RECALL_ALWAYS_S = 1.0  # seconds, for which every frame is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,14 +85,17 @@ def recognised(
         compared = LocalMap(VIEWS)
         compared.keyframes = views
         fit = fitter.refine(frame, sighting, motion, T_predicted, compared, segment)
-        if (view := believed(frame, fit, there, fitter.camera)) is not None:
+        view = believed(frame, fit.T_world_camera, there, fitter.camera, fitter.config.depth_noise)
+        if view is not None:
             yield fit, view
 
 
-def believed(frame: Frame, fit: Fit, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Keyframe | None:
+def believed(
+    frame: Frame, T_world_camera: Matrix, keyframes: Sequence[Keyframe], camera: RgbdCamera, noise: DepthNoise
+) -> Keyframe | None:
     """Returns the keyframe that sees most of a view, if shape and brightness make sure of its pose; else nothing."""
-    views = seeing(frame.surface.points(SPARSE), fit.T_world_camera, keyframes, VIEWS)
-    return views[-1] if views and gathered(frame, fit.T_world_camera, views, camera).certain else None
+    views = seeing(frame.surface.points(SPARSE), T_world_camera, keyframes, VIEWS)
+    return views[-1] if views and gathered(frame, T_world_camera, views, camera, noise).certain else None
 
 
 def common(seen: Landmarks, keyframes: Sequence[Keyframe], camera: RgbdCamera) -> Sighting | None:
@@ -138,9 +145,26 @@ def recalls(gray: Gray, keyframes: Sequence[Keyframe], camera: RgbdCamera, fewes
     return sorted(found, key=lambda recall: -len(recall.pixels))
 
 
-def candidates(keyframes: Sequence[Keyframe], T_predicted: Matrix, near: int, others: int, turn: int) -> list[Keyframe]:
-    """Returns those nearest to a predicted view and, in turns, others: all are tried within a few frames."""
-    ranked = sorted(keyframes, key=lambda k: view_distance(k.T_world_camera, T_predicted, TYPICAL_DEPTH))
+def recall_due(stamp: int, apart_since: int | None, recalls: int) -> bool:
+    """Returns whether a new map that is tracked, begun at a stamp and searched for so often, is searched for now."""
+    return apart_since is not None and (stamp - apart_since < RECALL_ALWAYS_S * 1e9 or recalls % RECALL_EVERY == 0)
+
+
+class Posed(Protocol):
+    """Stands for anything with a pose."""
+
+    @property
+    def T_world_camera(self) -> Matrix: ...
+
+
+K = TypeVar("K", bound=Posed)
+
+
+def candidates(
+    keyframes: Sequence[K], T_predicted: Matrix, near: int, others: int, turn: int, depth: float = TYPICAL_DEPTH
+) -> list[K]:
+    """Returns those nearest to a predicted view of a scene at a depth and, in turns, others: all in a few frames."""
+    ranked = sorted(keyframes, key=lambda k: view_distance(k.T_world_camera, T_predicted, depth))
     rest = ranked[near:]
     take = min(others, len(rest))
     return [*ranked[:near], *(rest[(turn * take + i) % len(rest)] for i in range(take))]

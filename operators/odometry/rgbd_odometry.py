@@ -26,15 +26,19 @@ from operators.odometry.local_map import LocalMap
 from operators.odometry.motion import Motion
 from operators.odometry.movers import Movers
 from operators.odometry.noise import Noise
-from operators.odometry.relocalizer import believed, candidates, recognised
+from operators.odometry.relocalizer import (
+    RECALL_NEAR,
+    RECALL_OTHERS,
+    believed,
+    candidates,
+    recall_due,
+    recognised,
+)
 from operators.odometry.settings import RgbdOdometryConfig
 from operators.odometry.tracking import Status, TrackResult, moved_covariance
 from operators.odometry.watch import Watch
 
 TOP_SPEED = 3.0  # m/s that a recognised pose may ask of the camera
-RECALL_NEAR, RECALL_OTHERS = 3, 5  # keyframes, near the prediction and elsewhere, that a lost view is compared with
-RECALL_EVERY = 3  # frames, while a new map is tracked for longer than
-RECALL_ALWAYS_S = 1.0  # seconds, for which every frame is tried
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +147,7 @@ class RgbdOdometry:
         gap = self._motion.blind_s + (frame.stamp - self._motion.stamp) * 1e-9 > self.config.patience_s
         if gap and frame.image_flaw is None and frame.depth_flaw is None:
             there = [k for k in self._map.keyframes if k.segment == self._map.newest.segment]
-            return believed(frame, fit, there, self.camera) is not None
+            return believed(frame, fit.T_world_camera, there, self.camera, self.config.depth_noise) is not None
         return fit.inliers >= self.config.min_inliers or (fit.depth_agrees and fit.weakest_sigma < 0.05)
 
     def _recall(self, frame: Frame, T_predicted: Matrix, *, measured: bool) -> tuple[Fit, Keyframe] | None:
@@ -153,7 +157,8 @@ class RgbdOdometry:
             self._recalls = 0
             return None
         self._recalls += 1
-        if frame.image_flaw is not None or (measured and not self._recall_due(frame.stamp)):
+        waits = measured and not recall_due(frame.stamp, self._apart_since, self._recalls)
+        if frame.image_flaw is not None or waits:
             return None
         others = self._map.elsewhere if measured else self._map.keyframes
         chosen = candidates(others, T_predicted, RECALL_NEAR, RECALL_OTHERS, self._recalls)
@@ -162,11 +167,6 @@ class RgbdOdometry:
             if not here or self._plausible(frame.stamp, found.T_world_camera, T_predicted):
                 return found, known
         return None
-
-    def _recall_due(self, stamp: int) -> bool:
-        """Returns whether a new map that is tracked is searched for its place now."""
-        assert self._apart_since is not None
-        return stamp - self._apart_since < RECALL_ALWAYS_S * 1e9 or self._recalls % RECALL_EVERY == 0
 
     def _followed(self, frame: Frame, fit: Fit) -> TrackResult:
         """Takes up a pose that was measured against the newest keyframes."""

@@ -76,6 +76,37 @@ class Sightings:
     points: NDArray[np.int64]
     pixels: NDArray[np.float64]
 
+    @staticmethod
+    def none() -> "Sightings":
+        return Sightings(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
+
+    def also(self, frame: int, points: NDArray[np.int64], pixels: NDArray[np.float64]) -> "Sightings":
+        """Adds what one frame sees: points (N,) at pixels (N, 3)."""
+        return Sightings(
+            np.concatenate([self.frames, np.full(len(points), frame)]),
+            np.concatenate([self.points, points]),
+            np.concatenate([self.pixels, pixels]),
+        )
+
+    def of_points(self, kept: NDArray[np.int64]) -> "Sightings":
+        """Returns the sightings of the points kept, numbered anew."""
+        number = np.full(max(int(self.points.max(initial=-1)), int(kept.max(initial=-1))) + 1, -1, np.int64)
+        number[kept] = np.arange(len(kept))
+        there = number[self.points] >= 0
+        return Sightings(self.frames[there], number[self.points[there]], self.pixels[there])
+
+    def without_first(self) -> "Sightings":
+        """Returns the sightings of all frames but the first."""
+        later = self.frames > 0
+        return Sightings(self.frames[later] - 1, self.points[later], self.pixels[later])
+
+    def fitting(self, squared: NDArray[np.float64], count: int) -> NDArray[np.bool_]:
+        """Returns which of `count` points are seen, and in the mean of their squared errors (S,) fit."""
+        total = np.zeros(count)
+        times = np.bincount(self.points, minlength=count)
+        np.add.at(total, self.points, squared)
+        return np.asarray((times > 0) & (total < 12.0 * np.maximum(times, 1)), np.bool_)
+
 
 @dataclass(frozen=True, eq=False)
 class Adjusted:

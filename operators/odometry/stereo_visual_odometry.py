@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 from dataflow.messages import CameraInfo, Diagnostics, Image, Odometry
@@ -12,10 +11,10 @@ from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.geometry.calibration import check_calibration
 from operators.geometry.stereo import rectified_pair
 from operators.odometry.emission import outputs
-from operators.odometry.motion import Motion
-from operators.odometry.stereo_adjustment import Sightings, StereoRig
-from operators.odometry.stereo_odometry import StereoOdometry, StereoOdometryConfig, StereoState
-from operators.odometry.watch import Watch
+from operators.odometry.stereo_adjustment import StereoRig
+from operators.odometry.stereo_memory import from_plain, to_plain
+from operators.odometry.stereo_odometry import StereoOdometry, StereoState
+from operators.odometry.stereo_settings import StereoOdometryConfig
 
 
 class StereoVisualOdometry(Operator):
@@ -25,8 +24,14 @@ class StereoVisualOdometry(Operator):
     VisualOdometry's does. The images must be rectified: rows of the two correspond. A constant error of the
     disparities, as an imperfect rectification leaves it, is estimated on the way.
 
+    Now and then a pair is kept. After a gap longer than `patience` a pose counts only if shape and brightness of what
+    the view and pairs kept both see agree with it. Where corners cannot be followed across the gap, the view is looked
+    for among these pairs; one that is not found begins a new map at the predicted pose, which is lost, for `give_up`,
+    and then tracked although its place is unknown, until a view of the old map puts it there.
+
     Methods: Lucas and Kanade, "An iterative image registration technique", 1981, in time and across the pair; RANSAC
-    PnP; a window of frames adjusted as in Triggs et al., "Bundle adjustment, a modern synthesis", 2000.
+    PnP; a window of frames adjusted as in Triggs et al., "Bundle adjustment, a modern synthesis", 2000. Views are found
+    again as VisualOdometry's are (Lowe's SIFT, a clique of pairs), with depth by semi-global matching.
     """
 
     left: In[Image] = In(doc="left image, rectified, grey or colour")
@@ -41,6 +46,8 @@ class StereoVisualOdometry(Operator):
     min_inliers: int = Param(15, ge=6, doc="fewest agreeing corners that a pose may rest on")
     window: int = Param(8, ge=3, le=30, doc="frames adjusted together")
     patience: float = Param(0.5, ge=0, doc="time without a measurement until tracking counts as lost", unit="s")
+    give_up: float = Param(2.0, ge=0, doc="time in a new map until it counts as tracking although apart", unit="s")
+    keyframes: int = Param(30, ge=1, doc="pairs kept to find the place again")
 
     _tracker: StereoOdometry | None = None
     _calibration: tuple[CameraInfo, CameraInfo] | None = None
@@ -63,11 +70,11 @@ class StereoVisualOdometry(Operator):
 
     def snapshot(self) -> Mapping[str, Any]:
         state = self._restored if self._tracker is None else self._tracker.snapshot()
-        return {} if state is None else _to_plain(state) | {"frames": dict(self._frames)}
+        return {} if state is None else to_plain(state) | {"frames": dict(self._frames)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Taken up with the first pair, which brings the calibration."""
-        self._restored = _from_plain(state) if state else None
+        self._restored = from_plain(state) if state else None
         self._frames = Counter({status: int(count) for status, count in state.get("frames", {}).items()})
 
     def summary(self) -> Mapping[str, float | int]:
@@ -79,7 +86,12 @@ class StereoVisualOdometry(Operator):
         given = (left_info, right_info)
         if self._tracker is None:
             config = StereoOdometryConfig(
-                corners=self.corners, min_inliers=self.min_inliers, window=self.window, patience_s=self.patience
+                corners=self.corners,
+                min_inliers=self.min_inliers,
+                window=self.window,
+                patience_s=self.patience,
+                give_up_s=self.give_up,
+                keyframes=self.keyframes,
             )
             self._tracker = StereoOdometry(rig_of(left_info, right_info), config)
             if self._restored is not None:
@@ -94,37 +106,3 @@ class StereoVisualOdometry(Operator):
 def rig_of(left: CameraInfo, right: CameraInfo) -> StereoRig:
     """Returns the rig that two calibrations describe. Raises ValueError where they are no rectified pair."""
     return StereoRig(*rectified_pair(left, right))
-
-
-def _to_plain(state: StereoState) -> dict[str, Any]:
-    return {
-        "motion": None if state.motion is None else _fields_of(state.motion),
-        "covariance": state.covariance,
-        "left": state.left,
-        "watch": [_fields_of(watch) for watch in state.watch],
-        "poses": state.poses,
-        "points": state.points,
-        "pixels": state.pixels,
-        "seen": _fields_of(state.seen),
-        "offset": state.offset,
-    }
-
-
-def _from_plain(values: Mapping[str, Any]) -> StereoState:
-    motion = values["motion"]
-    first, second = (Watch(**watch) for watch in values["watch"])
-    return StereoState(
-        motion=None if motion is None else Motion(**motion),
-        covariance=values["covariance"],
-        left=values["left"],
-        watch=(first, second),
-        poses=values["poses"],
-        points=values["points"],
-        pixels=values["pixels"],
-        seen=Sightings(**values["seen"]),
-        offset=float(values["offset"]),
-    )
-
-
-def _fields_of(value: Motion | Watch | Sightings) -> dict[str, Any]:
-    return {field.name: getattr(value, field.name) for field in fields(value)}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from made_hallway import RIG, SIZE, Gray, K, Matrix, Pair, driving, sequence
 
 from dataflow.firing.snapshots import pack_state, unpack_state
 from dataflow.messages import CameraInfo, Image
@@ -17,68 +16,11 @@ from dataflow.messages.geometry import invert
 from operators.geometry import se3
 from operators.odometry import StereoVisualOdometry
 from operators.odometry.stereo_adjustment import Sightings, StereoRig, adjust
-from operators.odometry.stereo_odometry import StereoOdometry, StereoOdometryConfig
+from operators.odometry.stereo_odometry import StereoOdometry
+from operators.odometry.stereo_settings import StereoOdometryConfig
 from operators.odometry.stereo_visual_odometry import rig_of
 from operators.odometry.tracking import Status, TrackResult
 from operators.sources import KittiOdometry
-
-Gray = NDArray[np.uint8]
-Matrix = NDArray[np.float64]
-
-SIZE = (480, 200)
-K = np.array([[300.0, 0.0, 239.5], [0.0, 300.0, 99.5], [0.0, 0.0, 1.0]])
-RIG = StereoRig(K, 0.5)
-HALLWAY = np.array([[-4.0, -2.5, -5.0], [4.0, 1.5, 30.0]])  # opposite corners, metres; y is down
-
-
-def texture() -> Gray:
-    """Smooth random spots: corners at every scale."""
-    rng = np.random.default_rng(4)
-    layers = [
-        cv2.resize(rng.random((n, n), np.float32), (1024, 1024), interpolation=cv2.INTER_CUBIC) for n in (16, 64, 256)
-    ]
-    return np.clip((sum(layers) / 3.0 - 0.5) * 400 + 128, 0, 255).astype(np.uint8)
-
-
-TEXTURE = texture()
-
-
-def render(T_world_camera: Matrix) -> Gray:
-    """The hallway from inside, by casting a ray through every pixel."""
-    u, v = np.meshgrid(np.arange(SIZE[0], dtype=np.float32), np.arange(SIZE[1], dtype=np.float32))
-    rays = np.stack([(u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones_like(u)], axis=-1)
-    d = rays @ T_world_camera[:3, :3].T + 1e-9
-    o = T_world_camera[:3, 3]
-    reach = np.maximum((HALLWAY[0] - o) / d, (HALLWAY[1] - o) / d)
-    axis, z = reach.argmin(axis=-1), reach.min(axis=-1)
-    p = o + d * z[..., None]
-    across = np.where(axis == 0, p[..., 1], p[..., 0])
-    along = np.where(axis == 2, p[..., 1], p[..., 2])
-    side = 211 * axis + 97 * (np.take_along_axis(d, axis[..., None], -1)[..., 0] > 0)
-    map_x, map_y = (across * 60 + side) % 1023, (along * 60 + 2 * side) % 1023
-    return cv2.remap(TEXTURE, map_x.astype(np.float32), map_y.astype(np.float32), cv2.INTER_LINEAR)
-
-
-def driving(count: int) -> list[Matrix]:
-    """T_world_camera of a car that goes ahead 0.4 m a frame and swerves; the first is the identity."""
-    s = np.arange(count)
-    return [se3.exp(np.array([0.3 * np.sin(0.2 * i), 0.0, 0.4 * i, 0.0, 0.05 * np.sin(0.25 * i), 0.0])) for i in s]
-
-
-Pair = tuple[Gray, Gray]
-
-
-@cache
-def sequence(count: int) -> tuple[list[Pair], list[Matrix]]:
-    poses = driving(count)
-    across = np.eye(4)
-    across[0, 3] = RIG.baseline
-    rng = np.random.default_rng(3)
-
-    def noisy(gray: Gray) -> Gray:
-        return np.clip(gray + rng.normal(0, 1.5, gray.shape), 0, 255).astype(np.uint8)
-
-    return [(noisy(render(T)), noisy(render(T @ across))) for T in poses], poses
 
 
 def follow(pairs: list[Pair]) -> list[TrackResult]:
