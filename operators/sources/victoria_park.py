@@ -39,6 +39,10 @@ class VictoriaPark(Source):
     Lines are `ODOMETRY i j dx dy dturn` and `LANDMARK i k x y`, each followed by the upper triangle of its covariance,
     row by row. Poses follow one another; the file has no times, so a pose comes every `period`. A pose's twist
     covariance is that of the step that led to it.
+
+    No truth comes with it: the file holds odometry and sightings alone. Where the truck was is known only by satellite
+    fixes that the original logs have for parts of the way; the trees were never surveyed. What estimates are compared
+    with is the optimum over all measurements of the file, which another solver finds.
     """
 
     odometry: Out[Odometry] = Out(doc="dead reckoning, with the twist and the covariance of each step")
