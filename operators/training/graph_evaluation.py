@@ -133,13 +133,14 @@ def data_settings(parameters: Mapping[str, Any], data: Sequence[str]) -> list[st
     """Returns `NAME=FOLDER` for every `FOLDER` or `NAME=FOLDER`. Raises ValueError where no parameter is for it."""
     made = []
     for entry in data:
-        name, _, _ = entry.partition("=")
-        if name in parameters and "=" in entry:
+        name, equals, _ = entry.partition("=")
+        if name in parameters and equals:
             made.append(entry)
             continue
-        able = [known for known in DATA_NAMES if known in parameters]
+        able, listed = [known for known in DATA_NAMES if known in parameters], ", ".join(parameters) or "none"
+        if equals and name.isidentifier() and not Path(entry).exists():
+            raise ValueError(f"--data {entry}: the graph has no parameter {name!r}; its parameters: {listed}")
         if len(able) != 1:
-            listed = ", ".join(parameters) or "none"
             which = f"both {' and '.join(able)}" if able else f"none of {', '.join(DATA_NAMES)}"
             raise ValueError(f"--data {entry}: the graph has {which}: say NAME={entry}; its parameters: {listed}")
         made.append(f"{able[0]}={entry}")

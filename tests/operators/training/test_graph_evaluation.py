@@ -81,9 +81,16 @@ def test_only_a_recording_by_itself_is_replayed(data: list[str], found: tuple[No
     ],
 )
 def test_data_is_given_to_the_parameter_that_is_for_it(
-    parameters: dict[str, int], data: list[str], found: list[str]
+    parameters: dict[str, int], data: list[str], found: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    (tmp_path / "a=b").mkdir()
+    monkeypatch.chdir(tmp_path)
     assert data_settings(parameters, data) == found
+
+
+def test_data_for_a_parameter_that_a_graph_has_not_is_no_folder_of_that_name() -> None:
+    with pytest.raises(ValueError, match=r"no parameter 'modle'; its parameters: data, model"):
+        data_settings({"data": 1, "model": 2}, ["modle=x.onnx"])
 
 
 def test_a_graph_that_comes_with_dataflow_is_called_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
