@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,7 +71,7 @@ def fit_cuboid(
     `noise` is that of ranges at one metre, m; it grows by the square. Points are `raw` that are of single views.
     After Nicholson, Milford and Suenderhauf, "QuadricSLAM", 2018, and Yang and Scherer, "CubeSLAM", 2019.
     """
-    logs, spreads, along = _priors(usual)
+    logs, spreads, along = _priors(tuple(usual))
     ways = len(logs)
     if before is None:
         x, forms = _starts(start, views, logs), np.arange(ways)
@@ -90,7 +91,8 @@ def fit_cuboid(
     outline = _ELLIPSE if usual and usual[0].round else _SIGNS
     inset = usual[0].inset if usual else 0.0
     noise *= (_TAIL_ROUND if outline is _ELLIPSE else _TAIL_FLAT) if raw else _TAIL
-    P, eyes = np.concatenate([v.P for v in views]), np.stack([v.eye for v in views])
+    P, eyes = np.stack([v.P for v in views], axis=1), np.stack([v.eye for v in views])
+    places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
     weights = edges / (_PIXELS + _SHARE * sides) / np.sqrt(max(1.0, len(views) / _ALIKE))
@@ -102,7 +104,7 @@ def fit_cuboid(
         image[np.isnan(image)] = 0.0
         turn = ((rows[..., 6] - headings[:, None]) / turns[:, None]).reshape(-1, 1)
         size = ((rows[..., 3:6] - logs[:, None]) / spreads[:, None]).reshape(-1, 3)
-        parts = [image, _surface(flat, points, eyes, noise, inset), turn, size]
+        parts = [image, _surface(flat, places, len(points), noise, inset), turn, size]
         return np.concatenate(parts, axis=1).reshape(*rows.shape[:2], -1)
 
     askew = np.where((forms < ways) & (heading is not None), _ASKEW, 0.0)
@@ -154,7 +156,8 @@ def _along(points: Array, yaw: float) -> Box:
     return (low + high) / 2 @ turn, high - low, yaw
 
 
-def _priors(usual: Sequence[Usual]) -> tuple[Array, Array, NDArray[np.bool_]]:
+@lru_cache(maxsize=64)  # as many classes
+def _priors(usual: tuple[Usual, ...]) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Returns the usual log sizes (A, 3), their spreads, with the sides on the ground either way round, and which of
     them (A,) always lie along the room.
     """
@@ -193,56 +196,62 @@ def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:
     """
     rows = boxes.copy()
     rows[:, 3:6] = np.log(np.maximum(boxes[:, 3:6], 1e-3))
-    image = _images(rows, P, _SIGNS)[:, 0]
+    image = _images(rows, P[:, None], _SIGNS)[:, 0]
     if rounded.any():
-        image[rounded] = _images(rows[rounded], P, _ELLIPSE)[:, 0]
+        image[rounded] = _images(rows[rounded], P[:, None], _ELLIPSE)[:, 0]
     return image
 
 
 def _images(rows: Array, P: Array, outline: Array) -> Array:
-    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (V * 3, 4), NaN where partly behind the camera.
+    """Returns the image boxes (K, V, 4) of boxes (K, 7) in views (3, V, 4), NaN where partly behind the camera.
 
-    `outline` (C, 3) are the places in a box of side 1 that are looked at.
+    `outline` (C, 3) are the places in a box of side 1 that are looked at: the first axis of what is worked with, along
+    which extremes are found many times as fast.
     """
     c, s = np.cos(rows[:, 6]), np.sin(rows[:, 6])
-    local = outline[None] * np.exp(rows[:, None, 3:6])
-    corners = np.empty_like(local)
-    corners[..., 0] = c[:, None] * local[..., 0] - s[:, None] * local[..., 1]
-    corners[..., 1] = s[:, None] * local[..., 0] + c[:, None] * local[..., 1]
-    corners[..., 2] = local[..., 2]
-    corners += rows[:, None, :3]
-    seen = (corners.reshape(-1, 3) @ P[:, :3].T + P[:, 3]).reshape(len(rows), len(outline), -1, 3)
-    depth = np.maximum(seen[..., 2], 1e-6)
-    uv = seen[..., :2] / depth[..., None]
-    image = np.concatenate([uv.min(axis=1), uv.max(axis=1)], axis=-1)
-    image[depth.min(axis=1) < _NEAREST] = np.nan
-    return np.asarray(image)
+    x, y, z = outline.T[..., None] * np.exp(rows.T[3:6, None])
+    places = np.empty((3, len(outline), len(rows)))
+    np.subtract(c * x, s * y, out=places[0])
+    np.add(s * x, c * y, out=places[1])
+    places[2] = z
+    places += rows.T[:3, None]
+    seen = places.reshape(3, -1).T @ P[..., :3].reshape(-1, 3).T
+    seen += P[..., 3].ravel()
+    seen = seen.reshape(len(outline), len(rows), 3, -1)
+    depth = np.maximum(seen[:, :, 2], 1e-6)
+    uv = seen[:, :, :2] / depth[:, :, None]
+    image = np.concatenate([np.minimum.reduce(uv, axis=0), np.maximum.reduce(uv, axis=0)], axis=1).transpose(0, 2, 1)
+    image[np.minimum.reduce(depth, axis=0) < _NEAREST] = np.nan
+    return image
 
 
-def _surface(rows: Array, points: Array, eyes: Array, noise: float, inset: float) -> Array:
+def _surface(rows: Array, places: Array, count: int, noise: float, inset: float) -> Array:
     """Returns by how much the points' extents differ from the sides of boxes (K, 7): (K, 6), in standard deviations.
 
-    Sides that no view sees may be farther out than the points.
+    `places` (3, N) are `count` points, then the eyes. Sides that no view sees may be farther out than the points.
     """
     c, s = np.cos(rows[:, 6, None]), np.sin(rows[:, 6, None])
-    count, half = len(points), np.exp(rows[:, 3:6]) / 2
-    places = np.concatenate([points, eyes])
-    x, y = places[None, :, 0] - rows[:, :1], places[None, :, 1] - rows[:, 1:2]
-    local = np.stack([c * x + s * y, c * y - s * x, places[None, :, 2] - rows[:, 2:3]], axis=1)
+    half = np.exp(rows[:, 3:6]) / 2
+    x, y = places[0] - rows[:, :1], places[1] - rows[:, 1:2]
+    local = np.empty((len(rows), 3, places.shape[1]))
+    np.add(c * x, s * y, out=local[:, 0])
+    np.subtract(c * y, s * x, out=local[:, 1])
+    np.subtract(places[2], rows[:, 2:3], out=local[:, 2])
     cut = count // 40
     low, high = _extents(local[..., :count], cut)
     residual = np.concatenate([low + half, half - high], axis=1)
     eye = local[..., count:]
-    way = np.abs(eye).sum(axis=2) / len(eyes)
+    eyes = eye.shape[2]
+    way = np.abs(eye).sum(axis=2) / eyes
     stray = noise * way * way  # along each axis, by how much of the distance lies along it
     residual[:, :3] += stray
     residual[:, 3:] += stray
     if inset:
         residual -= inset * np.concatenate([half, half], axis=1)
     sides = half[..., None]
-    shown = np.concatenate([(eye < -sides).mean(axis=2), (eye > sides).mean(axis=2)], axis=1) > 0.3
+    shown = np.concatenate([np.add.reduce(eye < -sides, axis=2), np.add.reduce(eye > sides, axis=2)], axis=1)
     # positive: the side is beyond the points
-    return np.asarray(np.where(shown, residual, np.minimum(residual, 0)) / _INSIDE)
+    return np.asarray(np.where(shown / eyes > 0.3, residual, np.minimum(residual, 0)) / _INSIDE)
 
 
 def _extents(values: Array, cut: int) -> tuple[Array, Array]:

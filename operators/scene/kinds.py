@@ -32,6 +32,11 @@ class Kinds:
         self.carriers, self.portable = frozenset(carriers), frozenset(portable)
         self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
         self._largest = {i: max((max(u.size) for u in self.usual.get(i, ())), default=0.0) for i in self.movers}
+        self._sizes = {
+            i: (np.log([u.size for u in usual]), _ODD * np.array([u.spread for u in usual]))
+            for i, usual in self.usual.items()
+            if usual and i not in self.movers
+        }
 
     def vote(self, class_id: int, score: float) -> float:
         """Returns how much a label with a score counts for its class."""
@@ -66,11 +71,12 @@ class Kinds:
 
     def may_be_so_large(self, object: MapObject) -> bool:
         """Tells whether an object has a size that things of its class may have, seen in part or whole."""
-        usual = self.usual.get(object.class_id)
-        if not usual or object.class_id in self.movers:
+        known = self._sizes.get(object.class_id)
+        if known is None:
             return True
-        size = np.log(np.maximum([*np.sort(object.size[:2]), object.size[2]], 1e-3))
-        return any((size - np.log(u.size) <= _ODD * np.array(u.spread)).all() for u in usual)
+        width, depth, height = object.size.tolist()
+        size = np.log([max(min(width, depth), 1e-3), max(width, depth, 1e-3), max(height, 1e-3)])
+        return bool((size - known[0] <= known[1]).all(axis=1).any())
 
     def near_side(self, points: Array, class_id: int, eye: Array, noise: float) -> Array:
         """Returns one view's points (N, 3) without those that are farther behind most than such a thing is deep.

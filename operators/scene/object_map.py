@@ -110,8 +110,9 @@ class ObjectMap:
 
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that are surely there, by rising id."""
-        s, there = self._settings, (o for _, o in sorted(self.objects.items()) if self._kinds.may_be_so_large(o))
-        return [o for o in there if o.evidence >= s.confirm and o.views >= s.views]
+        s = self._settings
+        sure = [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
+        return [o for o in sure if self._kinds.may_be_so_large(o)]
 
     def _joined(
         self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
