@@ -17,6 +17,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from operators.cloud.clustering import level_axes
 from operators.cloud.filtering import Voxels
 from operators.cloud.normals import estimate_normals
 
@@ -234,16 +235,8 @@ def _absorbed(scene: Scene, free: Mask, members: Indices, normal: Array, d: floa
 
 def covered_area(points: Array, normal: Array, cell: float) -> float:
     """Returns the area of the cells of a square grid in the plane that hold points, m²."""
-    flat = np.floor(points @ in_plane(normal).T / cell).astype(np.int64)
-    return len(np.unique(flat, axis=0)) * cell * cell
-
-
-def in_plane(normal: Array) -> Array:
-    """Returns two unit vectors (2, 3) that span the plane."""
-    helper = np.eye(3)[int(np.argmin(np.abs(normal)))]
-    x = np.cross(helper, normal)
-    x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(normal, x)])
+    column, row = np.floor(points @ level_axes(normal).T / cell).astype(np.int64).T
+    return len(np.unique((column << 32) + row)) * cell * cell
 
 
 def _level_part(normals: Array, up: Array) -> Array:

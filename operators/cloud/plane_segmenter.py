@@ -13,9 +13,10 @@ from dataflow.messages import Boxes3D, Diagnostics, Odometry, Planes, PointCloud
 from dataflow.messages.diagnostics import Level
 from dataflow.messages.geometry import matrix_to_quaternion
 from dataflow.operator import In, Operator, Out, Param, Sampled
+from operators.cloud.clustering import level_axes
 from operators.cloud.filtering import finite
 from operators.cloud.gravity import standing, told, unit
-from operators.cloud.plane_search import Plane, Scene, Search, find_planes, in_plane, tolerances
+from operators.cloud.plane_search import Plane, Scene, Search, find_planes, tolerances
 from operators.cloud.surfaces import SURFACES, Rules, Surface, recognised
 from operators.cloud.wall_directions import WallDirections
 from operators.status import counted_status
@@ -196,7 +197,7 @@ class PlaneSegmenter(Operator):
 
 def _turned(up: Array) -> Array:
     """Returns a rotation (3, 3) that takes `up` (3,) to z."""
-    x, y = in_plane(up)
+    x, y = level_axes(up)
     return np.stack([x, y, up])
 
 

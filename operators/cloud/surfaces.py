@@ -9,7 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from operators.cloud.plane_search import ASKEW, Plane, Scene, covered_area, in_plane
+from operators.cloud.clustering import level_axes
+from operators.cloud.plane_search import ASKEW, Plane, Scene, covered_area
 
 Array = NDArray[np.float64]
 
@@ -48,7 +49,7 @@ class Rectangle:
 
 def rectangle(plane: Plane, points: Array, up: Array) -> Rectangle:
     """Returns the smallest rectangle around the points on a plane; that of an upright plane stands on its x side."""
-    axes = in_plane(plane.normal) if plane.kind == "level" else _upright_axes(plane.normal, up)
+    axes = level_axes(plane.normal) if plane.kind == "level" else _upright_axes(plane.normal, up)
     flat = points @ axes.T
     if plane.kind == "level":
         (u, v), (width, depth), angle = cv2.minAreaRect(flat.astype(np.float32))

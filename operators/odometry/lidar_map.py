@@ -7,6 +7,7 @@ the sensor do not pull a pose towards rest, as they pull methods that pair point
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -30,6 +31,17 @@ _HASH = np.array([73856093, 19349663, 83492791], np.uint32)
 _SLOTS = 1 << 20
 
 
+class _Slots(threading.local):
+    """Numbers (_SLOTS,) of each thread, which are written before they are read: the memory of new ones would have to be
+    cleared by the kernel at each use."""
+
+    def __init__(self) -> None:
+        self.numbers = np.empty(_SLOTS, np.int32)
+
+
+_slots = _Slots()
+
+
 def thinned(points: NDArray[np.floating[Any]], size: float) -> Rows:
     """Returns the indices of the first point (N, 3) in each cube of a grid.
 
@@ -37,7 +49,7 @@ def thinned(points: NDArray[np.floating[Any]], size: float) -> Rows:
     """
     cell = np.floor(points * points.dtype.type(1 / size)).astype(np.int32).view(np.uint32)
     slot = (cell[:, 0] * _HASH[0] ^ cell[:, 1] * _HASH[1] ^ cell[:, 2] * _HASH[2]) & np.uint32(_SLOTS - 1)
-    first = np.empty(_SLOTS, np.int32)  # what is read of it was written before
+    first = _slots.numbers
     number = np.arange(len(points), dtype=np.int32)
     first[slot[::-1]] = number[::-1]
     return np.flatnonzero(first[slot] == number)

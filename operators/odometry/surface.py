@@ -133,7 +133,7 @@ class Surface:
         known = self.inverse_depth[self.inverse_depth > 0]
         return float(1.0 / np.median(known)) if known.size else 2.0
 
-    @property
+    @cached_property
     def coverage(self) -> float:
         """Share of the grid that has a patch."""
         return float(np.count_nonzero(self.inverse_depth)) / self.inverse_depth.size

@@ -107,8 +107,14 @@ class Cells:
     def doubt(self, confirmed: NDArray[np.bool_], shown: Cells, weight: int) -> None:
         """Counts the confirmed voxels that are not near those which the object showed in the same view, as `weight`."""
         rows = np.flatnonzero(confirmed)
-        if len(shown) and len(rows):
-            self.other[rows[~shown.near_each(self.points[rows], 1.5 * self.side)]] += weight
+        if not (len(shown) and len(rows)):
+            return
+        reach = 1.5 * self.side
+        same = np.minimum(np.searchsorted(shown._keys, self._keys[rows]), len(shown) - 1)
+        apart = self.points[rows] - shown.points[same]  # most are near what is shown in their own voxel
+        rows = rows[np.einsum("ij,ij->i", apart, apart) >= reach * reach]
+        if len(rows):
+            self.other[rows[~shown.near_each(self.points[rows], reach)]] += weight
 
     def near_each(self, points: Array, distance: float) -> NDArray[np.bool_]:
         """Tells which points (N, 3) lie within a distance of a voxel's mean."""

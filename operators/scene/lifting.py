@@ -148,7 +148,7 @@ def lift(
         found = _object(seen, np.sort(rows), (left, upper, right, lower), s)
         if found is not None:
             candidates.append((k, *found))
-    owned = _divided(seen.pixels, boxes, candidates, bodies)
+    owned = _divided(seen.places[:2], boxes, candidates, bodies)
     level = level_axes(seen.up)
     kept = [
         Lifted(k, own, value, *upright_box(seen.points[own], seen.up, level))
@@ -189,18 +189,19 @@ def _body(
 def _divided(
     pixels: Array, boxes: Array, candidates: Sequence[tuple[int, Indices, float]], bodies: Collection[int]
 ) -> list[Indices]:
-    """Returns what each candidate (box, points, overlap) keeps of its points: each goes to one.
+    """Returns what each candidate (box, points, overlap) keeps of its points, at `pixels` (2, N): each goes to one.
 
     Of boxes around the same thing the better one gets all. Of others a much smaller one does, since it is in front;
     else each point goes to the box whose middle is nearer, as measured by the boxes' sides.
     """
-    owner = np.full(len(pixels), -1)
-    distance = np.zeros(len(pixels))
+    owner = np.full(pixels.shape[1], -1)
+    distance = np.zeros(pixels.shape[1])
     middles, sides = (boxes[:, :2] + boxes[:, 2:]) / 2, np.maximum(boxes[:, 2:] - boxes[:, :2], 1.0)
     order = sorted(range(len(candidates)), key=lambda c: (-candidates[c][2], candidates[c][0]))
     for c in order:
         k, points, _ = candidates[c]
-        away = np.abs((pixels[points] - middles[k]) / sides[k]).max(axis=1)
+        across, down = np.abs((pixels.take(points, axis=1) - middles[k, :, None]) / sides[k, :, None])
+        away = np.maximum(across, down)
         before = owner[points]
         wins = before < 0
         for rival in np.unique(before[~wins]).tolist():
@@ -240,8 +241,7 @@ def _object(
     points = seen.points[rows]
     ranges = np.sort(np.sqrt(np.einsum("ij,ij->i", points, points)))
     reach = s.reach + s.reach_growth * float(ranges[len(ranges) // 2])
-    whole = _part(seen, rows)
-    value = _overlap(whole.image, box)
+    value = _overlap(_image(seen, *seen.places[:2].take(rows, axis=1)), box)
     if value >= _WHOLE and float(np.diff(ranges).max()) <= reach:
         return rows, value  # nothing to divide
     voxels = Voxels.by_size(points.astype(np.float32), reach / 2)
@@ -320,15 +320,19 @@ def _groups(linked: Sequence[int]) -> NDArray[np.intp]:
 
 
 def _part(seen: Seen, rows: Indices) -> _Part:
-    places = seen.places.take(rows, axis=1)
-    low, high = places.min(axis=1), places.max(axis=1)
-    (left, upper), (right, lower) = low[:2].tolist(), high[:2].tolist()
-    cut = len(rows) // 100  # one in a hundred may stray
-    if cut:
-        uv = np.partition(places[:2], (cut, len(rows) - 1 - cut), axis=1)
-        (left, upper), (right, lower) = uv[:, cut].tolist(), uv[:, len(rows) - 1 - cut].tolist()
-    g = seen.grain
-    return _Part(rows, (left - g, upper - g, right + g, lower + g), np.stack([low[2:], high[2:]]))
+    u, v, *space = seen.places.take(rows, axis=1)
+    bounds = np.array([[values.min() for values in space], [values.max() for values in space]])
+    return _Part(rows, _image(seen, u, v), bounds)
+
+
+def _image(seen: Seen, u: Array, v: Array) -> tuple[float, float, float, float]:
+    """Returns the box in the image around pixels, columns `u` (N,) and lines `v`, of which one in a hundred may stray."""
+    cut, g = len(u) // 100, seen.grain
+    if not cut:
+        return float(u.min()) - g, float(v.min()) - g, float(u.max()) + g, float(v.max()) + g
+    last = len(u) - 1 - cut
+    u, v = np.partition(u, (cut, last)), np.partition(v, (cut, last))
+    return float(u[cut]) - g, float(v[cut]) - g, float(u[last]) + g, float(v[last]) + g
 
 
 def _overlap(first: tuple[float, float, float, float], second: tuple[float, float, float, float]) -> float:

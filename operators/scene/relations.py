@@ -108,7 +108,11 @@ def relations_of(
 
 def _gaps(centers: Array, radii: Array) -> Array:
     """Returns how far spheres, or circles, are apart (N, N); below 0 where they overlap."""
-    return np.asarray(np.sqrt(((centers[None] - centers[:, None]) ** 2).sum(axis=2)) - radii - radii[:, None])
+    square = np.zeros((len(centers), len(centers)))
+    for along in centers.T:
+        apart = along - along[:, None]
+        square += apart * apart
+    return np.asarray(np.sqrt(square) - radii - radii[:, None])
 
 
 def _pairs(things: Sequence[Body], near: NDArray[np.bool_]) -> dict[int, list[Body]]:
