@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from dataflow.messages import Transforms
@@ -18,13 +20,18 @@ def transform_between(extrinsics: Transforms | None, source: str, target: str) -
     """
     if extrinsics is None or source == target:
         return np.eye(4)
-    T_target_source = _between(extrinsics, source, target)
+    return _between(extrinsics, source, target).copy()
+
+
+@lru_cache(maxsize=64)  # extrinsics are seldom others than at the last firing; messages are equal by digest
+def _between(extrinsics: Transforms, source: str, target: str) -> Matrix:
+    T_target_source = _found(extrinsics, source, target)
     if not np.isfinite(T_target_source).all():
         raise ValueError(f"extrinsics hold a transform between {source!r} and {target!r} that is not finite")
     return T_target_source
 
 
-def _between(extrinsics: Transforms, source: str, target: str) -> Matrix:
+def _found(extrinsics: Transforms, source: str, target: str) -> Matrix:
     known = list(zip(extrinsics.frames, extrinsics.child_frames, strict=True))
     if (target, source) in known:
         return np.asarray(extrinsics.matrices()[known.index((target, source))])

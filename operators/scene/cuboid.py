@@ -73,11 +73,12 @@ def fit_cuboid(
     """
     logs, spreads, along = _priors(tuple(usual))
     ways = len(logs)
+    eyes = np.stack([v.eye for v in views])
     if before is None:
-        x, forms = _starts(start, views, logs), np.arange(ways)
+        x, forms = _starts(start, eyes, logs), np.arange(ways)
         if heading is not None:
             turned = _nearest_turn(start[2], heading)
-            x = np.concatenate([x, _starts(_along(points, turned), views, logs)])
+            x = np.concatenate([x, _starts(_along(points, turned), eyes, logs)])
             forms = np.concatenate([forms[~along], forms + ways])
             x = x[forms]
         headings = x[:, 6].copy()
@@ -91,7 +92,7 @@ def fit_cuboid(
     outline = _ELLIPSE if usual and usual[0].round else _SIGNS
     inset = usual[0].inset if usual else 0.0
     noise *= (_TAIL_ROUND if outline is _ELLIPSE else _TAIL_FLAT) if raw else _TAIL
-    P, eyes = np.stack([v.P for v in views], axis=1), np.stack([v.eye for v in views])
+    P = np.stack([v.P for v in views], axis=1)
     places = np.concatenate([points, eyes]).T.copy()
     boxes, edges = np.stack([v.box for v in views]), np.stack([v.edges for v in views])
     sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
@@ -172,21 +173,19 @@ def _priors(usual: tuple[Usual, ...]) -> tuple[Array, Array, NDArray[np.bool_]]:
     return np.log([row[0] for row in rows]), np.array([row[1] for row in rows]), np.array([row[2] for row in rows])
 
 
-def _starts(start: Box, views: Sequence[ImageView], logs: Array) -> Array:
-    """Returns the beginnings (A, 7): boxes that are as deep as usual away from the viewers."""
+def _starts(start: Box, eyes: Array, logs: Array) -> Array:
+    """Returns the beginnings (A, 7): boxes that are as deep as usual away from the viewers, at `eyes` (V, 3)."""
     center, size, yaw = start
-    eye = np.mean([v.eye for v in views], axis=0)
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    along = axes @ (center - eye)[:2]
+    along = axes @ (center - eyes.mean(axis=0))[:2]
     deep = int(np.argmax(np.abs(along)))
-    rows = []
-    for usual in np.exp(logs):
-        own, middle = np.maximum(size, 0.01), center.copy()
-        lack = max(0.0, float(usual[deep] - own[deep]))
-        own[deep] += lack
-        middle[:2] += axes[deep] * np.sign(along[deep]) * lack / 2
-        rows.append([*middle, *np.log(own), yaw])
-    return np.array(rows)
+    sizes = np.tile(np.maximum(size, 0.01), (len(logs), 1))
+    lack = np.maximum(np.exp(logs)[:, deep] - sizes[:, deep], 0.0)
+    sizes[:, deep] += lack
+    rows = np.empty((len(logs), 7))
+    rows[:, :3], rows[:, 3:6], rows[:, 6] = center, np.log(sizes), yaw
+    rows[:, :2] += axes[deep] * np.sign(along[deep]) * lack[:, None] / 2
+    return rows
 
 
 def image_boxes(boxes: Array, P: Array, rounded: NDArray[np.bool_]) -> Array:

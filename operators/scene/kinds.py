@@ -32,8 +32,8 @@ class Kinds:
         self.carriers, self.portable = frozenset(carriers), frozenset(portable)
         self.movers, self.usual, self._telling = frozenset(movers), dict(usual), dict(telling or {})
         self._largest = {i: max((max(u.size) for u in self.usual.get(i, ())), default=0.0) for i in self.movers}
-        self._sizes = {
-            i: (np.log([u.size for u in usual]), _ODD * np.array([u.spread for u in usual]))
+        self._most = {
+            i: [[size * math.exp(_ODD * spread) for size, spread in zip(u.size, u.spread, strict=True)] for u in usual]
             for i, usual in self.usual.items()
             if usual and i not in self.movers
         }
@@ -71,12 +71,13 @@ class Kinds:
 
     def may_be_so_large(self, object: MapObject) -> bool:
         """Tells whether an object has a size that things of its class may have, seen in part or whole."""
-        known = self._sizes.get(object.class_id)
-        if known is None:
+        most = self._most.get(object.class_id)
+        if most is None:
             return True
         width, depth, height = object.size.tolist()
-        size = np.log([max(min(width, depth), 1e-3), max(width, depth, 1e-3), max(height, 1e-3)])
-        return bool((size - known[0] <= known[1]).all(axis=1).any())
+        if width > depth:
+            width, depth = depth, width
+        return any(width <= most_w and depth <= most_d and height <= most_h for most_w, most_d, most_h in most)
 
     def near_side(self, points: Array, class_id: int, eye: Array, noise: float) -> Array:
         """Returns one view's points (N, 3) without those that are farther behind most than such a thing is deep.
