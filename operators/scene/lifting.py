@@ -326,7 +326,7 @@ def _part(seen: Seen, rows: Indices) -> _Part:
 
 
 def _image(seen: Seen, u: Array, v: Array) -> tuple[float, float, float, float]:
-    """Returns the box in the image around pixels, columns `u` (N,) and lines `v`, of which one in a hundred may stray."""
+    """Returns the box around pixels, columns `u` (N,) and lines `v`, of which one in a hundred may stray."""
     cut, g = len(u) // 100, seen.grain
     if not cut:
         return float(u.min()) - g, float(v.min()) - g, float(u.max()) + g, float(v.max()) + g

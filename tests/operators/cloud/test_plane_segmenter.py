@@ -11,6 +11,8 @@ from dataflow.messages import Boxes3D, Diagnostics, Planes, PointCloud, Pose
 from dataflow.messages.geometry import invert, transform_points
 from dataflow.testing import play
 from operators.cloud import PlaneSegmenter
+from operators.cloud.clustering import level_axes
+from operators.cloud.plane_search import covered_area
 
 HEIGHT = 1.2
 """Of the sensor above the floor, metres."""
@@ -238,3 +240,12 @@ def test_clouds_within_the_period_are_left_out_and_a_restored_operator_knows_the
     restored.restore(operator.snapshot())
     assert not operator.process(*given[3])
     assert not restored.process(*given[3])
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1.0), (0.6, 0, 0.8), (-0.36, 0.48, -0.8)])
+def test_the_area_of_a_plane_is_that_of_the_cells_that_hold_points(normal: tuple[float, float, float]) -> None:
+    points = np.random.default_rng(6).uniform(-3, 3, (500, 3))
+    axes = level_axes(np.array(normal))
+    np.testing.assert_allclose(axes @ np.array([*axes, normal]).T, np.eye(3)[:2], atol=1e-12)
+    cells = {tuple(cell) for cell in np.floor(points @ axes.T / 0.25).astype(int).tolist()}
+    assert covered_area(points, np.array(normal), 0.25) == len(cells) * 0.25 * 0.25

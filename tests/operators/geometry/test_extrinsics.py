@@ -91,3 +91,13 @@ def test_a_transform_that_is_not_finite_is_named() -> None:
     for source, target in (("color", "depth"), ("depth", "color")):
         with pytest.raises(ValueError, match=f"transform between '{source}' and '{target}' that is not finite"):
             transform_between(broken, source, target)
+
+
+def test_who_writes_into_a_transform_changes_it_for_nobody_else() -> None:
+    extrinsics = transforms("depth", "color", T_depth_color)
+    transform_between(extrinsics, "color", "depth")[:] = 0
+    again = transforms("depth", "color", T_depth_color)  # another message of the same value
+    for told in (extrinsics, again):
+        np.testing.assert_allclose(transform_between(told, "color", "depth"), T_depth_color, atol=1e-12)
+    other = transforms("depth", "color", np.eye(4))
+    np.testing.assert_allclose(transform_between(other, "color", "depth"), np.eye(4), atol=1e-12)

@@ -274,6 +274,9 @@ def test_a_map_knows_the_planes_of_its_points_and_forgets_what_is_far() -> None:
 def test_thinning_keeps_the_first_point_of_a_cube() -> None:
     points = np.array([[0.1, 0, 0], [0.2, 0.1, 0], [1.1, 0, 0], [0.3, 0, 0], [-0.1, 0, 0]])
     assert thinned(points, 0.5).tolist() == [0, 2, 4]
+    others = np.random.default_rng(0).uniform(-2, 2, (2000, 3))  # written where those before were, in part
+    assert len(thinned(others, 0.5)) <= 8**3
+    assert thinned(points, 0.5).tolist() == [0, 2, 4]
 
 
 @pytest.mark.data

@@ -75,3 +75,13 @@ def test_voxels_that_others_have_too_are_theirs_unless_too_few_would_be_left() -
     cells, half, most = Cells.of(grid, SIDE), Cells.of(grid[grid[:, 0] > 0.4], SIDE), Cells.of(grid[5:], SIDE)
     assert {*keys_of(cells.sure([half, Cells(SIDE)]), SIDE)} == {*keys_of(grid[grid[:, 0] < 0.4], SIDE)}
     assert len(cells.sure([most])) == len(cells.sure()) == len(grid)
+
+
+def test_voxels_are_doubted_that_are_confirmed_and_not_near_what_is_shown() -> None:
+    rng = np.random.default_rng(4)
+    cells, shown = (Cells.of(rng.uniform(-0.5, 0.5, (count, 3)), SIDE) for count in (900, 200))
+    confirmed = rng.random(len(cells)) < 0.6
+    apart = np.linalg.norm(cells.points[:, None] - shown.points[None], axis=2).min(axis=1)
+    cells.doubt(confirmed, shown, 3)
+    np.testing.assert_array_equal(cells.other, 3.0 * (confirmed & (apart >= 1.5 * SIDE)))
+    assert 0 < np.count_nonzero(cells.other) < np.count_nonzero(confirmed)

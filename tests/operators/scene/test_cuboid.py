@@ -11,7 +11,7 @@ from dataflow.messages.geometry import invert
 from operators.scene.box_overlap import shared_volume, upright_iou
 from operators.scene.cells import standing_box
 from operators.scene.class_sizes import CLASS_SIZES
-from operators.scene.cuboid import Box, ImageView, fit_cuboid, image_boxes
+from operators.scene.cuboid import Box, ImageView, _images, _surface, fit_cuboid, image_boxes
 
 K = np.array([[FOCAL, 0, 159.5], [0, FOCAL, 119.5], [0, 0, 1.0]])
 ALL = np.ones(4, np.bool_)
@@ -115,3 +115,46 @@ def test_a_shelf_lies_along_the_room_where_views_of_what_is_beside_it_would_turn
     off = [abs(np.remainder(yaw + np.pi / 4, np.pi / 2) - np.pi / 4) for yaw in (free, along)]
     assert off[0] > 0.2
     assert off[1] < 0.05
+
+
+def boxes_and_views(count: int, views: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Boxes (K, 7), centre, log sizes and heading, and views (3, V, 4); some of the boxes are partly behind."""
+    rng = np.random.default_rng(views)
+    rows = rng.normal([0, 0, 2.0, -1, -1, -1, 0], 0.4, (count, 7))
+    rows[0, 2] = -3.0
+    P = np.stack([np.column_stack([K @ np.eye(3), rng.normal(0, 0.3, 3)]) for _ in range(views)], axis=1)
+    return rows, P
+
+
+@pytest.mark.parametrize(("count", "views"), [(64, 1), (8, 16), (5, 3)])
+def test_images_of_boxes_hold_the_corners_as_each_view_projects_them(count: int, views: int) -> None:
+    rows, P = boxes_and_views(count, views)
+    outline = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+    found = _images(rows, P, outline)
+    for k, row in enumerate(rows):
+        c, s = np.cos(row[6]), np.sin(row[6])
+        corners = (outline * np.exp(row[3:6])) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]]) + row[:3]
+        for v in range(views):
+            seen = corners @ P[:, v, :3].T + P[:, v, 3]
+            if seen[:, 2].min() < 0.1:
+                assert np.isnan(found[k, v]).all()
+                continue
+            uv = seen[:, :2] / seen[:, 2:]
+            np.testing.assert_allclose(found[k, v], [*uv.min(axis=0), *uv.max(axis=0)], rtol=1e-12)
+    assert 0 < np.isnan(found).sum() < found.size
+
+
+@pytest.mark.parametrize("count", [12, 45])  # all points, and all but the outermost
+def test_sides_are_compared_with_the_extents_of_points_in_the_axes_of_their_box(count: int) -> None:
+    rng = np.random.default_rng(count)
+    rows, points, eyes = boxes_and_views(9, 1)[0], rng.normal([0, 0, 2.0], 0.5, (count, 3)), rng.normal(0, 1, (4, 3))
+    found = _surface(rows, np.concatenate([points, eyes]).T.copy(), count, 0.01, 0.1)
+    for k, row in enumerate(rows):
+        c, s = np.cos(row[6]), np.sin(row[6])
+        turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+        own, seen = np.sort((points - row[:3]) @ turn.T, axis=0), (eyes - row[:3]) @ turn.T
+        half, cut = np.exp(row[3:6]) / 2, count // 40
+        beyond = np.concatenate([own[cut] + half, half - own[-1 - cut]])
+        beyond += np.tile(0.01 * np.abs(seen).mean(axis=0) ** 2, 2) - 0.1 * np.tile(half, 2)
+        shown = np.concatenate([(seen < -half).mean(axis=0), (seen > half).mean(axis=0)]) > 0.3
+        np.testing.assert_allclose(found[k], np.where(shown, beyond, np.minimum(beyond, 0)) / 0.02, atol=1e-9)

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from operators.scene.cells import Cells
+from operators.scene.class_sizes import Usual
 from operators.scene.kinds import Kinds
 from operators.scene.map_object import MapObject
 from operators.scene.matching import MapSettings
@@ -71,3 +72,18 @@ def test_only_small_things_of_classes_that_move_or_are_taken_may_leave() -> None
     assert Kinds([], {}, None, (), [CRATE]).may_leave(crate)
     ball.size = np.full(3, 0.8)
     assert not KINDS.may_leave(ball)
+
+
+def test_an_object_is_too_large_for_its_class_four_spreads_beyond_every_usual_size() -> None:
+    usual = (Usual((0.1, 0.2, 0.3), (0.1, 0.2, 0.3)), Usual((0.3, 0.4, 0.1), (0.1, 0.1, 0.1)))
+    kinds, crate, rng = Kinds([BALL], {CRATE: usual, BALL: usual}), thing(1.0, CRATE), np.random.default_rng(0)
+    told = []
+    for _ in range(300):
+        crate.size = np.exp(rng.uniform(-3, 0.5, 3))
+        logs = np.log([*np.sort(crate.size[:2]), crate.size[2]])
+        told.append(kinds.may_be_so_large(crate))
+        assert told[-1] == any((logs - np.log(u.size) <= 4 * np.array(u.spread)).all() for u in usual)
+    assert 0 < sum(told) < len(told)
+    ball = thing(1.0, BALL)
+    ball.size = np.full(3, 9.0)
+    assert kinds.may_be_so_large(ball)  # what moves is told by its motion
