@@ -35,6 +35,9 @@ OVERLAYS: tuple[type[Message], ...] = (Detections2D, SegmentationMap, Tracks)
 HEAVY: tuple[type[Message], ...] = (*COLOR, *DEPTH, *OVERLAYS, PointCloud)
 """Types that make up nearly all of a file: images, what is drawn over them, and clouds."""
 
+_IMAGES: tuple[type[Message], ...] = (*COLOR, *DEPTH, SegmentationMap)
+_PICTURES = {type_.SCHEMA for type_ in _IMAGES}
+
 _TRUTH = {"true", "truth", "groundtruth", "gt"}
 
 
@@ -138,7 +141,11 @@ def is_truth(stream: str) -> bool:
 
 
 def _calibration(image: str, infos: list[str], images: list[str], graph: Graph | None) -> str | None:
-    """The calibration of an image: of its own operator, else of an image it was made from, else of the same device."""
+    """The calibration of an image: of its own operator, else of an image it was made from, else of the same device.
+
+    What an operator makes of no image, such as a plot, is no camera's and has none."""
+    if graph is not None and _drawn(image, graph):
+        return None
     near = [info for info in infos if _operator(info) == _operator(image)]
     if not near and graph is not None:
         for stream in _upstream(image, graph):
@@ -152,6 +159,15 @@ def _calibration(image: str, infos: list[str], images: list[str], graph: Graph |
         if not near and len(infos) == 1:
             near = infos
     return max(near, key=lambda info: (_likeness(_port(info), _port(image)), -len(info)), default=None)
+
+
+def _drawn(image: str, graph: Graph) -> bool:
+    """Tells whether an operator makes an image of messages none of which is an image."""
+    if image not in graph.streams:
+        return False
+    taken = [stream for streams in graph.producer(image)[0].inputs.values() for stream in streams]
+    made = {name for stream in taken if stream in graph.streams for name in graph.streams[stream].types}
+    return bool(taken) and all(stream in graph.streams for stream in taken) and not made & _PICTURES
 
 
 def _decoded(shown: Mapping[str, type[Message]], graph: Graph) -> dict[str, str]:

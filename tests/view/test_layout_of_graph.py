@@ -120,3 +120,28 @@ def test_truth_stands_aside_for_what_is_estimated() -> None:
     only_true = {name: type_ for name, type_ in types.items() if name.startswith("r/robot")}
     assert layout(only_true, made).aside == {"r/robot/scene"}, "true boxes are all there is to see"
     assert layout(types, made).panels == ("world", "log")
+
+
+def test_a_plot_is_no_image_of_a_camera_and_has_no_calibration() -> None:
+    types: dict[str, type[Message]] = {
+        "r/robot/image": Image,
+        "r/robot/info": CameraInfo,
+        "r/odometry/odometry": Odometry,
+        "r/plots/picture": Image,
+        "r/blurred/image": Image,
+    }
+    nodes = [
+        node("robot", {}, "image", "info"),
+        node("odometry", {"image": "r/robot/image"}, "odometry"),
+        node("plots", {"estimate": "r/odometry/odometry"}, "picture"),
+        node("blurred", {"image": "r/robot/image"}, "image"),
+    ]
+
+    shown = layout(types, linked(types, nodes, View()))
+
+    assert {camera.image: camera.info for camera in shown.cameras} == {
+        "r/robot/image": "r/robot/info",
+        "r/plots/picture": None,
+        "r/blurred/image": "r/robot/info",
+    }
+    assert shown.planes["r/plots/picture"] != shown.planes["r/robot/image"]
