@@ -10,6 +10,8 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,13 +25,34 @@ import numpy as np  # noqa: E402
 from numpy.typing import NDArray  # noqa: E402
 
 from dataflow.messages.geometry import invert  # noqa: E402
+from operators.geometry.extrinsics import transform_between  # noqa: E402
 from operators.odometry.stereo_adjustment import StereoRig  # noqa: E402
 from operators.odometry.stereo_odometry import StereoOdometry  # noqa: E402
 from operators.odometry.stereo_visual_odometry import rig_of  # noqa: E402
 from operators.odometry.tracking import MEASURED  # noqa: E402
-from operators.sources import KittiOdometry  # noqa: E402
+from operators.sources import KittiOdometry, SimulatedRobot  # noqa: E402
 
 Matrix = NDArray[np.float64]
+PERIOD = 100_000_000  # nanoseconds
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """Left and right images (H, W), true poses (4, 4) of the left camera, the rig; 10 Hz."""
+
+    left: list[NDArray[np.uint8]]
+    right: list[NDArray[np.uint8]]
+    truth: list[Matrix]
+    rig: StereoRig
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """First black pairs, how many, and the metres from which on a pose is wrong."""
+
+    begins: tuple[int, ...]
+    lengths: tuple[int, ...]
+    wrong: float
 
 
 def drift(estimate: list[Matrix], truth: list[Matrix]) -> tuple[float, float]:
@@ -59,46 +82,83 @@ def turning(path: list[Matrix], first: int, last: int) -> Matrix:
     return np.array([1e3 * cv2.Rodrigues((invert(a) @ b)[:3, :3])[0].ravel() for a, b in pairwise(path)][first:last])
 
 
-BEGINS, LENGTHS, AFTER = (16, 22, 28), (6, 10, 16), 10  # first black pair, how many, pairs that follow, at 10 Hz
-WRONG = 0.5  # metres
+AFTER = 10  # pairs that follow a gap, at 10 Hz
+STREET = Gaps((16, 22, 28), (6, 10, 16), 0.5)
+ROOM = Gaps((60, 120, 180), (10, 20, 80), 0.2)
 
 
-def gaps(steps: list[Any], rig: StereoRig) -> None:
-    """Prints where a car is said to be after black images: it went on, or drives backwards over where it had been."""
-    print("| after the gap | gaps | pairs | said to be known | right | wrong | worst m | first known after, pairs |")
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
-    for name in ("it went on", "it comes back"):
+def gaps(name: str, drive: Drive, tried: Gaps, ways: Sequence[str]) -> None:
+    """Prints where a robot is said to be after black images: it goes on, or comes back over where it had been."""
+    for way in ways:
         count, known, wrong, worst, firsts = 0, 0, 0, 0.0, list[str]()
-        for begin in BEGINS:
-            for length in LENGTHS:
-                ahead = range(begin + length, min(begin + length + AFTER, len(steps)))
-                after = ahead if name == "it went on" else range(begin - 3, begin - 3 - AFTER, -1)
-                off = _after(steps, rig, begin, length, list(after))
+        for begin in tried.begins:
+            odometry, last = _before(drive, begin)
+            for length in tried.lengths:
+                ahead = range(begin + length, min(begin + length + AFTER, len(drive.left)))
+                after = ahead if way == "went on" else range(begin - 3, begin - 3 - AFTER, -1)
+                off = _after(odometry, last, drive, begin, length, list(after))
                 said = [k for k, metres in enumerate(off) if metres is not None]
                 firsts.append(str(said[0]) if said else "-")
                 metres = [m for m in off if m is not None]
                 count, known = count + len(off), known + len(metres)
-                wrong, worst = wrong + sum(m > WRONG for m in metres), max([worst, *metres])
+                wrong, worst = wrong + sum(m > tried.wrong for m in metres), max([worst, *metres])
         cells = f"{len(firsts)} | {count} | {known} | {known - wrong} | {wrong} | {worst:.2f}"
-        print(f"| {name} | {cells} | {' '.join(firsts)} |", flush=True)
+        print(f"| {name}, {way} | {cells} | {' '.join(firsts)} |", flush=True)
 
 
-def _after(steps: list[Any], rig: StereoRig, begin: int, length: int, after: list[int]) -> list[float | None]:
-    """Returns by how many metres each pose after a gap is off, from the last before it; None where none is claimed."""
-    odometry, period = StereoOdometry(rig), 10**8
+def _before(drive: Drive, begin: int) -> tuple[StereoOdometry, Matrix]:
+    """Returns an odometry after the pairs before a gap, and its last pose."""
+    odometry, T = StereoOdometry(drive.rig), np.eye(4)
     for k in range(begin):
-        last = odometry.track(steps[k]["left"].data, steps[k]["right"].data, k * period).T_world_camera
-    black = np.zeros_like(steps[0]["left"].data)
+        T = odometry.track(drive.left[k], drive.right[k], k * PERIOD).T_world_camera
+    return odometry, T
+
+
+def _after(
+    before: StereoOdometry, last: Matrix, drive: Drive, begin: int, length: int, after: list[int]
+) -> list[float | None]:
+    """Returns by how many metres each pose after a gap is off, from the last before it; None where none is claimed."""
+    odometry = StereoOdometry(drive.rig)
+    odometry.restore(before.snapshot())
+    black = np.zeros_like(drive.left[0])
     for k in range(begin, begin + length):
-        odometry.track(black, black, k * period)
-    T_world_truth = last @ invert(steps[begin - 1]["ground_truth"].matrix())
+        odometry.track(black, black, k * PERIOD)
+    T_world_truth = last @ invert(drive.truth[begin - 1])
     off: list[float | None] = []
     for k, i in enumerate(after):
-        found = odometry.track(steps[i]["left"].data, steps[i]["right"].data, (begin + length + k) * period)
-        error = (T_world_truth @ steps[i]["ground_truth"].matrix())[:3, 3] - found.T_world_camera[:3, 3]
+        found = odometry.track(drive.left[i], drive.right[i], (begin + length + k) * PERIOD)
+        error = (T_world_truth @ drive.truth[i])[:3, 3] - found.T_world_camera[:3, 3]
         claimed = found.status in MEASURED and "unknown" not in found.reason
         off.append(float(np.linalg.norm(error)) if claimed else None)
     return off
+
+
+def simulated(cache: Path, world: str) -> Drive:
+    """Returns 30 s of a simulated robot's stereo pair at 10 Hz, rendered once."""
+    kind, _, seed = world.partition(":")
+    file = cache / f"stereo_{kind}_{seed}.npz"
+    if not file.is_file():
+        robot = SimulatedRobot(
+            world=kind, seed=int(seed), duration="30s", color_camera={"rate": 0}, depth_camera={"rate": 0},
+            stereo={"rate": 10, "width": 640, "height": 480},
+            truth={"poses": 10, "boxes": False, "relations": 0, "activities": 0},
+        )  # fmt: skip
+        robot.setup()
+        static: dict[str, Any] = dict(robot.static_outputs())
+        T = transform_between(static["extrinsics"], static["left_info"].frame, "base_link")
+        sent: list[dict[str, Any]] = [dict(m) for m in robot.stream()]
+        rig = rig_of(static["left_info"], static["right_info"])
+        file.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(
+            file,
+            left=np.array([m["left"].data for m in sent]),
+            right=np.array([m["right"].data for m in sent]),
+            truth=np.array([m["true_base"].matrix() @ T for m in sent]),
+            K=rig.K,
+            baseline=rig.baseline,
+        )
+    d = np.load(file)
+    return Drive(list(d["left"]), list(d["right"]), list(d["truth"]), StereoRig(d["K"], float(d["baseline"])))
 
 
 def drifts(steps: list[Any], rig: StereoRig) -> None:
@@ -138,19 +198,32 @@ def drifts(steps: list[Any], rig: StereoRig) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["drift", "gaps"], nargs="?", default="drift")
+    parser.add_argument("worlds", nargs="*", default=[], help="KIND:SEED of simulated worlds, for gaps")
+    parser.add_argument("--cache", type=Path, default=Path("out") / "stereo_odometry", help="folder of rendered drives")
     data = Path(os.environ.get("PERCEPTION_DATA") or REPOSITORY.parent / "shared" / "data") / "kitti_odometry_06"
     parser.add_argument(
         "--data", type=Path, default=data, help="a KITTI odometry sequence (default: the project's data)"
     )
     cv2.setNumThreads(1)
     arguments = parser.parse_args()
+    if arguments.what == "gaps":
+        print(
+            "| after the gap | gaps | pairs | said to be known | right | wrong | worst m | first known after, pairs |"
+        )
+        print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
+    for world in arguments.worlds:
+        gaps(world.replace(":", " "), simulated(arguments.cache, world), ROOM, ("went on",))
+    if arguments.worlds:
+        return
     source = KittiOdometry(path=str(arguments.data))
     source.setup()
     statics = source.static_outputs()
     rig = rig_of(statics["left_info"], statics["right_info"])  # type: ignore[arg-type]
     steps: list[Any] = list(source.stream())
     if arguments.what == "gaps":
-        gaps(steps, rig)
+        left, right = [step["left"].data for step in steps], [step["right"].data for step in steps]
+        drive = Drive(left, right, [step["ground_truth"].matrix() for step in steps], rig)
+        gaps("street", drive, STREET, ("went on", "came back"))
     else:
         drifts(steps, rig)
 
