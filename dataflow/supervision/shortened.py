@@ -9,7 +9,7 @@ from typing import Final
 _THREAD: Final = re.compile(r"(Current thread|Thread) 0x[0-9a-f]+ .*\(most recent call first\):$")
 _FRAME: Final = re.compile(r'  File "(?P<file>.*)", line \d+ in (?P<function>.*)$')
 _CALL: Final = "dataflow/firing/calls.py"
-"""Where the engine calls an operator: what lies outside of it is the same for all."""
+"""File in which the engine calls an operator: what lies outside of it is the same for all."""
 _UNSAID: Final = ("<frozen importlib", "<frozen runpy")
 _LISTENER: Final = ("dataflow/process/main.py", "_listen")
 """The thread that waits for what the supervisor says: every process has it, and it is never what is late."""
