@@ -75,6 +75,9 @@ def test_a_reference_that_comes_later_brings_the_map_to_metres() -> None:
     assert results[-1].scale.known
     way = np.linalg.norm(results[-1].track.T_world_camera[:3, 3] - results[-6].track.T_world_camera[:3, 3])
     assert way == pytest.approx(float(np.linalg.norm(truth[-1][:3, 3] - truth[-6][:3, 3])), rel=0.05)
+    # The way before is in metres, too: the position counts from where the map began.
+    since = float(np.linalg.norm(results[-1].track.T_world_camera[:3, 3]))
+    assert since == pytest.approx(float(np.linalg.norm(truth[-1][:3, 3])), rel=0.05)
 
 
 def test_black_images_are_predicted_then_lost_and_the_map_is_found_again() -> None:
