@@ -200,8 +200,7 @@ def _divided(
     order = sorted(range(len(candidates)), key=lambda c: (-candidates[c][2], candidates[c][0]))
     for c in order:
         k, points, _ = candidates[c]
-        across, down = np.abs((pixels.take(points, axis=1) - middles[k, :, None]) / sides[k, :, None])
-        away = np.maximum(across, down)
+        away = np.maximum(*np.abs((pixels.take(points, axis=1) - middles[k, :, None]) / sides[k, :, None]))
         before = owner[points]
         wins = before < 0
         for rival in np.unique(before[~wins]).tolist():
