@@ -18,7 +18,7 @@ import numpy as np
 from sensed_worlds import Mapper, World, in_view, sensed
 
 from dataflow.messages import Detections2D, SceneGraph, SegmentationMap
-from operators.scene.scoring import MOVERS, NodeScore, PlainlySeen, score_nodes
+from operators.scene.scoring import NodeScore, PlainlySeen, score_nodes
 
 IOU, VISIBLE, PIXELS, IMAGES = 0.25, 0.6, 200, 5
 
@@ -49,8 +49,12 @@ def chosen(objects: Detections2D, rows: Any) -> Detections2D:
     )
 
 
+def plainly_seen() -> PlainlySeen:
+    return PlainlySeen(VISIBLE, PIXELS, IMAGES)
+
+
 def seen(world: World) -> PlainlySeen:
-    counts = PlainlySeen(VISIBLE, PIXELS, IMAGES)
+    counts = plainly_seen()
     for frame in world.frames:
         counts.add(frame.objects)
     return counts
@@ -58,11 +62,8 @@ def seen(world: World) -> PlainlySeen:
 
 def scored(world: World, nodes: SceneGraph) -> NodeScore:
     """Scores a map at the end of the drive; movers count that were in view in the last 2 s."""
-    truth, counts = world.frames[-1].scene, seen(world)
-    names = dict(zip(truth.ids.tolist(), (truth.class_names[c] for c in truth.class_ids), strict=True))
-    recent = truth.stamp - 2_000_000_000
-    must = {i for i in counts.countable() if i in names and (names[i] not in MOVERS or counts.last[i] >= recent)}
-    return score_nodes(nodes, truth, must, IOU)
+    truth = world.frames[-1].scene
+    return score_nodes(nodes, truth, seen(world).must(truth), IOU)
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from dataflow.messages import Detections2D, Odometry, Pose, SceneGraph
 from dataflow.messages.geometry import invert, quaternion_from_yaw, transform_points, yaw_of
 from dataflow.operator import Batch, In, Operator, Param, Sampled
-from operators.scene.scoring import MOVERS, NodeScore, PlainlySeen, RelationScore, score_nodes
+from operators.scene.scoring import NodeScore, PlainlySeen, RelationScore, score_nodes
 
 
 class SceneGraphMetrics(Operator):
@@ -61,11 +61,7 @@ class SceneGraphMetrics(Operator):
         if self._T_true_graph is None:
             self._T_true_graph = true_pose.matrix() @ invert(pose.matrix())
         mine = _moved(graph, self._T_true_graph)
-        names = dict(zip(truth.ids.tolist(), (truth.class_names[c] for c in truth.class_ids), strict=True))
-        since = truth.stamp - round(self.recent * 1e9)
-        must = {
-            i for i in self._seen.countable() if i in names and (names[i] not in MOVERS or self._seen.last[i] >= since)
-        }
+        must = self._seen.must(truth, self.recent)
         self._last = score_nodes(mine, truth, must, self.iou)
         self._relations.add(mine, truth, self._last.match, must, self._last.ignored)
         self._graphs += 1

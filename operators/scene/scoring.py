@@ -40,8 +40,18 @@ class PlainlySeen:
         self._plain.update(objects.ids[plain].tolist())
 
     def countable(self) -> set[int]:
-        """Returns the ids of objects that a map must have."""
+        """Returns the ids of objects that were seen so often by now."""
         return {i for i, n in self._plain.items() if n >= self._images}
+
+    def must(self, truth: SceneGraph, recent: float = 2.0) -> set[int]:
+        """Returns the ids of objects that a map must have at the time of the true graph.
+
+        Those that were seen so often by then; movers only where they were in view in the last `recent` seconds.
+        """
+        names = dict(zip(truth.ids.tolist(), (truth.class_names[c] for c in truth.class_ids), strict=True))
+        since = truth.stamp - round(recent * 1e9)
+        known = (i for i in self.countable() if i in names)
+        return {i for i in known if names[i] not in MOVERS or self.last[i] >= since}
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from dataflow.messages import SceneGraph
+from dataflow.messages import Detections2D, SceneGraph
 from operators.scene.relations import FLOOR
-from operators.scene.scoring import RelationScore, score_nodes
+from operators.scene.scoring import PlainlySeen, RelationScore, score_nodes
 
 CLASSES = ("floor", "mug", "table", "ball")
 
@@ -75,3 +75,28 @@ def test_what_is_mapped_scores_by_itself() -> None:
     relations.add(mine, TRUTH, score_nodes(mine, TRUTH, {11}).match, {11})
     assert relations.f1("mapped") == 0.0
     assert np.isnan(relations.f1("all"))
+
+
+def in_image(second: int, ids: list[int]) -> Detections2D:
+    return Detections2D(
+        stamp=second * 1_000_000_000,
+        frame="camera",
+        width=100,
+        height=100,
+        class_names=("thing",),
+        boxes=np.tile(np.array([0, 0, 50, 50], np.float32), (len(ids), 1)),
+        scores=np.ones(len(ids), np.float32),
+        class_ids=np.zeros(len(ids), np.int32),
+        ids=np.array(ids, np.int64),
+        visible=np.ones(len(ids), np.float32),
+        pixel_counts=np.full(len(ids), 2500, np.int64),
+    )
+
+
+def test_a_map_must_have_what_was_plainly_seen_by_then_and_movers_while_they_are_in_view() -> None:
+    """The table (12) is seen from the third second on, the ball (13) up to the fourth, the mug (11) always."""
+    seen, must = PlainlySeen(images=3), []
+    for second in range(8):
+        seen.add(in_image(second, [11, *([12] if second >= 3 else []), *([13] if second <= 4 else [])]))
+        must.append(seen.must(TRUTH.replace(stamp=second * 1_000_000_000)))
+    assert must == [set(), set(), {11, 13}, {11, 13}, {11, 13}, {11, 12, 13}, {11, 12, 13}, {11, 12}]
