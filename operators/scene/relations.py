@@ -37,6 +37,11 @@ PREDICATES = (
 FLOOR, ROBOT, ROOM = 0, -1, -2
 """Ids of nodes that are not objects."""
 
+AT_ONCE = frozenset({"left_of", "in_front_of"})
+"""Predicates told from where the robot is, which changes as it turns: a mean over time would tell where it looked."""
+
+_STEEP = 12.5  # by so much the score of these rises, by the share of the larger difference by which it leads
+
 SURFACE = -10
 """Ids below this are surfaces other than the floor: walls, table tops, ceilings."""
 
@@ -204,7 +209,8 @@ def _beside(
 ) -> None:
     """Finds near, and of things near each other which is left of or in front of the other.
 
-    `seen` are how far ahead and how far left each is for the robot; empty without one.
+    `seen` are how far ahead and how far left each is for the robot; empty without one. That of the two whose difference
+    is the larger one, and at least `side`, has a score from 0.5 on; that of the other falls fast.
     """
     apart = boxes.gap(first, second)
     if apart > 1.2 * rules.near:
@@ -213,16 +219,12 @@ def _beside(
     if not seen or apart > rules.near:
         return
     x, y = (a - b for a, b in zip(seen[first.id], seen[second.id], strict=True))
-    larger, smaller = max(abs(x), abs(y)), min(abs(x), abs(y))
-    if larger < rules.side:
-        return
-    score = min(1.0, 0.5 + 0.5 * (larger - smaller) / larger + 0.25 * min(1.0, larger / rules.side - 1))
-    if abs(y) >= abs(x):
-        a, b = (first.id, second.id) if y > 0 else (second.id, first.id)
-        found[a, "left_of", b] = score
-    else:
-        a, b = (first.id, second.id) if x < 0 else (second.id, first.id)
-        found[a, "in_front_of", b] = score
+    for predicate, own, other in (("left_of", y, abs(x)), ("in_front_of", -x, abs(y))):
+        least = max(other, rules.side)
+        score = 0.5 + _STEEP * (abs(own) - least) / least
+        if score > 0:
+            a, b = (first.id, second.id) if own > 0 else (second.id, first.id)
+            found[a, predicate, b] = min(1.0, score)
 
 
 def _contact(
@@ -270,7 +272,10 @@ def _moving(found: dict[Relation, float], agent: Body, other: Body, rules: Relat
 
 
 class Hysteresis:
-    """Smooths scores over time: a relation begins where its mean reaches `begin` and ends where it falls to `end`."""
+    """Smooths scores over time: a relation begins where its mean reaches `begin` and ends where it falls to `end`.
+
+    Those of `AT_ONCE` do so by the score of the moment.
+    """
 
     def __init__(self, begin: float, end: float, seconds: float) -> None:
         self._begin, self._end, self._seconds = begin, end, seconds
@@ -287,9 +292,12 @@ class Hysteresis:
         if self._stamp is not None:
             share = 1 - float(np.exp(-(stamp - self._stamp) * 1e-9 / self._seconds))
         self._stamp = stamp
-        means = {r: before + share * (now.get(r, 0.0) - before) for r, before in self._means.items()}
+        means = {
+            r: now.get(r, 0.0) if r[1] in AT_ONCE else before + share * (now.get(r, 0.0) - before)
+            for r, before in self._means.items()
+        }
         for relation in sorted(now.keys() - means.keys()):
-            means[relation] = share * now[relation]
+            means[relation] = now[relation] if relation[1] in AT_ONCE else share * now[relation]
         began = sorted(r for r in now if r not in self._held and means[r] >= self._begin)
         ended = [r for r in self._held if means[r] <= self._end]
         for relation in began:

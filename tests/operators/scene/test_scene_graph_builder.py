@@ -145,6 +145,30 @@ def test_left_and_front_are_those_of_the_robots_view() -> None:
     assert (2, "in_front_of", 1) not in found
 
 
+def test_left_and_front_are_those_of_the_view_of_the_moment() -> None:
+    """The robot turns by a quarter between two graphs, and back by less than a degree past the bisector."""
+    ahead: Thing = (1, "box", (2.0, 0, 0.1), (0.2, 0.2, 0.2))
+    beside: Thing = (2, "box", (2.0, 0.4, 0.1), (0.2, 0.2, 0.2))
+    nodes = [room(k, [ahead, beside]) for k in range(4)]
+    turns = quaternion_from_yaw(np.radians([0.0, 90.0, 45.3, 44.0]))
+    poses = [robot(k).replace(orientation=turns[k]) for k in range(4)]
+    found = [relations(m) for m in play(SceneGraphBuilder(), {"nodes": nodes, "robot": poses})["graph"]]
+    spatial = [{r for r in each if r[1] in ("left_of", "in_front_of")} for each in found]
+    left, front = (2, "left_of", 1), (1, "in_front_of", 2)
+    assert spatial == [{left}, {front}, {front}, {left}]
+    assert all(each[1, "near", 2] > 0.5 for each in found)
+
+
+def test_of_two_things_on_the_bisector_that_holds_which_held_before() -> None:
+    ahead: Thing = (1, "box", (2.0, 0, 0.1), (0.2, 0.2, 0.2))
+    beside: Thing = (2, "box", (2.0, 0.4, 0.1), (0.2, 0.2, 0.2))
+    nodes = [room(k, [ahead, beside]) for k in range(6)]
+    turns = quaternion_from_yaw(np.radians([30.0, 44.9, 45.1, 44.9, 45.1, 60.0]))
+    poses = [robot(k).replace(orientation=turns[k]) for k in range(6)]
+    found = [relations(m) for m in play(SceneGraphBuilder(), {"nodes": nodes, "robot": poses})["graph"]]
+    assert [(2, "left_of", 1) in each for each in found] == [True] * 5 + [False]
+
+
 def test_relations_begin_and_end_with_hysteresis() -> None:
     """A mug that flickers between table and air keeps its relation; one that is gone for good loses it."""
     lifted: Thing = (2, "mug", (2, 0.2, 1.3), (0.1, 0.08, 0.1))
