@@ -14,7 +14,8 @@ class Usual:
 
     What is `round` has the outline of an ellipse, as seen from above. What is leafy shows points that are inside its
     box, by the share `inset` of half its side. What stands on the floor may have so much of its `foot`
-    hidden, metres; 0 for what does not. What lies `along` the room does so always: it stands at a wall or in one.
+    hidden, metres; 0 for what does not. What lies `along` the room does so always: it stands at a wall or in one. What
+    stands in `rows` often has others of its class beside it.
     """
 
     size: tuple[float, float, float]
@@ -23,6 +24,7 @@ class Usual:
     inset: float = 0.0
     foot: float = 0.0
     along: bool = False
+    rows: bool = False
 
 
 CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
@@ -32,7 +34,7 @@ CLASS_SIZES: dict[str, tuple[Usual, ...]] = {
     ),
     "chair": (Usual((0.47, 0.50, 0.96), (0.16, 0.13, 0.12), foot=0.2),),
     "table": (Usual((0.60, 1.50, 0.75), (0.40, 0.40, 0.16), foot=0.2),),
-    "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25), foot=0.2, along=True),),
+    "shelf": (Usual((0.31, 1.04, 1.43), (0.12, 0.20, 0.25), foot=0.2, along=True, rows=True),),
     "door": (Usual((0.18, 1.06, 2.13), (0.50, 0.10, 0.05), foot=0.2, along=True),),
     "monitor": (Usual((0.20, 0.56, 0.48), (0.10, 0.12, 0.10)),),
     "plant": (

@@ -65,6 +65,10 @@ class Kinds:
     def is_round(self, object: MapObject) -> bool:
         return any(u.round for u in self.usual.get(object.class_id, ()))
 
+    def in_rows(self, class_id: int) -> bool:
+        """Tells whether things of a class often stand side by side."""
+        return any(u.rows for u in self.usual.get(class_id, ()))
+
     def foot(self, object: MapObject) -> float:
         """Returns how much of an object's foot may be hidden, metres; 0 where its class does not stand on the floor."""
         return max((u.foot for u in self.usual.get(object.class_id, ())), default=0.0)

@@ -48,7 +48,8 @@ class MapSettings:
 class Observation:
     """One object as seen once: points (N, 3) in the world, class, score, and mean colour (3,) in [0, 1] if known.
 
-    `image` is what the image shows of it, where there is one; those of one time share `P`.
+    `image` is what the image shows of it, where there is one; those of one time share `P`. Where its box holds more
+    than the object, `part` is what is the object's.
     """
 
     points: Array
@@ -56,6 +57,12 @@ class Observation:
     score: float
     color: Array | None = None
     image: ImageView | None = None
+    part: ImageView | None = None
+
+    @property
+    def own_image(self) -> ImageView | None:
+        """What the image shows of the object alone."""
+        return self.image if self.part is None else self.part
 
 
 def alike_mover(each: Observation, cells: Cells, object: MapObject, stamp: int, s: MapSettings) -> float:

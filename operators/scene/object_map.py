@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from operators.scene.matching import (
 from operators.scene.merging import are_one, may_be_one, merge, smaller_in_place
 from operators.scene.presence import has_left, look_at
 from operators.scene.range_view import RangeView
+from operators.scene.side_by_side import image_of_part, largest_part
 from operators.tracking.assignment import assign
 
 Array = NDArray[np.float64]
@@ -41,9 +43,10 @@ class ObjectMap:
     An observation is of the object of its class whose box, seen from where it was seen, covers its own in the image,
     and to which its points are near; of a large one whose voxels it shares; of another class only where both cover each
     other. Colour decides near ties. Two objects that come to share their place, of one class or not, are one, unless
-    they are seen beside each other. Places that a view looks through lose voxels; an object whose place is empty, or
-    that is in plain view and not detected, loses evidence and at last goes. If one of its class and size appears
-    elsewhere, that is the same object, moved.
+    they are seen beside each other. What a view shows of things that stand in rows ends where it looks between two of
+    them. Places that a view looks through lose voxels; an object whose place is empty, or that is in plain view and not
+    detected, loses evidence and at last goes. If one of its class and size appears elsewhere, that is the same object,
+    moved.
     `movers` are classes whose place is that of their last view; they are joined by predicted place. Small ones (a ball)
     are as other things are until a view looks through their place and one of their class is near.
 
@@ -85,8 +88,8 @@ class ObjectMap:
             self._room.add(view.points)
         self._updates += 1
         self._heading = self._room.angle
-        near_sides = [self._kinds.near_side(each.points, each.class_id, view.origin, s.range_noise) for each in seen]
-        cells = Cells.of_each(near_sides, s.voxel)
+        seen = [self._alone(each, view) for each in seen]
+        cells = Cells.of_each([each.points for each in seen], s.voxel)
         joined = self._joined(seen, cells, stamp, view)
         in_hands = carried(seen, cells, joined, view, self.objects, self._kinds, s.views)
         for k, each in enumerate(seen):
@@ -113,6 +116,17 @@ class ObjectMap:
         s = self._settings
         sure = [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
         return [o for o in sure if self._kinds.may_be_so_large(o)]
+
+    def _alone(self, each: Observation, view: RangeView) -> Observation:
+        """Returns an observation without what is behind the thing, or is another one of its class beside it."""
+        points = self._kinds.near_side(each.points, each.class_id, view.origin, self._settings.range_noise)
+        part = None
+        if self._heading is not None and self._kinds.in_rows(each.class_id):
+            part = largest_part(points, self._heading, view, self._settings.margin)
+        if part is None:
+            return replace(each, points=points)
+        own = None if each.image is None else image_of_part(each.image, points, part)
+        return replace(each, points=points[part], part=own)
 
     def _joined(
         self, seen: Sequence[Observation], cells: Sequence[Cells], stamp: int, view: RangeView
@@ -175,7 +189,8 @@ class ObjectMap:
             return
         object.cells.add(cells)
         object.velocity = np.zeros(3)
-        new = each.image is not None and object.look(each.image, cells.points) and len(object.images) not in (2, 4)
+        image = each.own_image
+        new = image is not None and object.look(image, cells.points) and len(object.images) not in (2, 4)
         if object.class_id != voted:
             object.form = -1
         if new or not object.images or object.class_id != voted:
@@ -195,8 +210,9 @@ class ObjectMap:
             made.color = each.color
         made.view = _direction(eye, cells)
         made.center = cells.middle
-        if each.image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
-            made.look(each.image, cells.points)
+        image = each.own_image
+        if image is not None and not self._kinds.is_mover(made):  # one view alone tells less than the points
+            made.look(image, cells.points)
         self._fit(made)
         self.objects[made.id] = made
         self._next += 1

@@ -30,10 +30,10 @@ class SceneGraphBuilder(Operator):
     Nodes are the room (id -2), the robot (-1), surfaces (the floor is 0, walls and table tops count from -11 down),
     objects and agents. The map's floor says how high things stand; without one it is made up from them. Relations are
     worked out from upright boxes, scored, and begin and end with hysteresis: on, in, under, above, near, left_of and
-    in_front_of (of things near each other, as the robot sees them at that moment), part_of, sitting_on, holding, facing,
-    approaching, and heads_for, whose score is the probability that the agent is going there. supports, right_of and
-    behind are inverses and asked for as such. Activities come from a recogniser, or where there is none or it does not
-    know, from motion and contact.
+    in_front_of (of things near each other, as the robot sees them at that moment), part_of, sitting_on, holding,
+    facing, approaching, and heads_for, whose score is the probability that the agent is going there. supports, right_of
+    and behind are inverses and asked for as such. Activities come from a recogniser, or where there is none or it does
+    not know, from motion and contact.
 
     Method: layers after Armeni et al., "3D scene graph", 2019, and Hughes et al., "Hydra", 2022; goals after Ramirez
     and Geffner, "Probabilistic plan recognition using off-the-shelf classical planners", 2010.
@@ -56,7 +56,9 @@ class SceneGraphBuilder(Operator):
     robot_frame: str | None = Param(None, doc="frame of the robot, x ahead; none means the one that `robot` poses")
     begin: float = Param(0.5, gt=0, lt=1, doc="mean score at which a relation begins")
     end: float = Param(0.25, gt=0, lt=1, doc="and at which it ends")
-    smoothing: float = Param(0.4, gt=0, doc="time constant of that mean, which left_of and in_front_of do not have", unit="s")
+    smoothing: float = Param(
+        0.4, gt=0, doc="time constant of that mean; left_of and in_front_of go by the score of the moment", unit="s"
+    )
     near: float = Param(0.5, gt=0, doc="gap up to which things are near each other", unit="m")
     side: float = Param(0.15, gt=0, doc="least difference for left_of and in_front_of", unit="m")
     agents: list[str] = Param(["person", "robot", "ball"], doc="classes that act")
