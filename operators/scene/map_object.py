@@ -77,6 +77,11 @@ class MapObject:
         return 1 / (1 + math.exp(-self.evidence))
 
     @property
+    def label(self) -> float:
+        """Mean over its views of what labels of its class count, others counting as 0."""
+        return float(self.votes[self.class_id]) / self.views
+
+    @property
     def longest(self) -> float:
         """Length of the longest side of the box."""
         return float(max(self.size.tolist()))

@@ -24,7 +24,11 @@ _SLACK = 0.02  # of the distance, by which points stray
 
 @dataclass(frozen=True)
 class MapSettings:
-    """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square."""
+    """Lengths in metres, times in seconds, evidence in log odds; noise of ranges at one metre, grows by the square.
+
+    `label` is the mean of what labels of its class count, over its views, from which a mug, a bottle or a ball is
+    given: other things are often called so, but not surely.
+    """
 
     voxel: float = 0.03
     margin: float = 0.1
@@ -36,6 +40,7 @@ class MapSettings:
     missed: float = 0.12
     miss_angle: float = 0.03
     gain: float = 0.3
+    label: float = 0.35
     reach: float = 0.12
     range_noise: float = 0.0012
     mover_reach: float = 0.5

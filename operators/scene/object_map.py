@@ -115,7 +115,8 @@ class ObjectMap:
         """Returns the objects that are surely there, by rising id."""
         s = self._settings
         sure = [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
-        return [o for o in sure if self._kinds.may_be_so_large(o)]
+        called = (o for o in sure if o.label >= s.label or not self._kinds.may_leave(o))
+        return [o for o in called if self._kinds.may_be_so_large(o)]
 
     def _alone(self, each: Observation, view: RangeView) -> Observation:
         """Returns an observation without what is behind the thing, or is another one of its class beside it."""

@@ -234,6 +234,31 @@ def test_a_thing_larger_than_any_of_its_class_is_not_given(length: float, given:
     assert len(known.confirmed()) == given
 
 
+@pytest.mark.parametrize(
+    ("class_id", "score", "given"), [(MUG, 0.32, 0), (MUG, 0.4, 1), (BOX, 0.32, 1)], ids=["unsure", "sure", "a box"]
+)
+def test_what_is_seldom_surely_called_a_mug_is_not_given_as_one(class_id: int, score: float, given: int) -> None:
+    known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE, portable=[MUG])
+    for k in range(12):
+        T = looking(0.4 * np.sin(k))
+        seen = [replace(observation(THING, class_id, T), score=score)]
+        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
+    assert len(known.objects) == 1
+    assert len(known.confirmed()) == given
+
+
+@pytest.mark.parametrize(("mugs", "balls", "given"), [(12, 0, 1), (6, 6, 0), (3, 9, 1)])
+def test_what_is_called_a_mug_and_a_ball_alike_is_given_as_neither(mugs: int, balls: int, given: int) -> None:
+    """Labels of 0.6: by turns, that is a mean of 0.3 for each class."""
+    known = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE, portable=[MUG])
+    labels = [MUG, BALL] * min(mugs, balls) + [MUG if mugs > balls else BALL] * abs(mugs - balls)
+    for k, label in enumerate(labels):
+        T = looking(0.4 * np.sin(k))
+        seen = [replace(observation(THING, label, T), score=0.6)]
+        known.update((k + 1) * SECOND // 4, seen, RangeView(np.zeros((0, 3)), T, 0.012))
+    assert len(known.confirmed()) == given
+
+
 @pytest.mark.parametrize(("foot", "reaches_down"), [(0.2, True), (0.0, False)])
 def test_furniture_reaches_down_to_the_floor_where_its_class_stands_there(foot: float, reaches_down: bool) -> None:
     known = ObjectMap(3, [], MapSettings(), {BOX: (Usual((0.5, 0.5, 0.8), (0.3, 0.3, 0.3), foot=foot),)})
