@@ -112,7 +112,7 @@ def causes(
     """Returns the figures of a map, and the cause of every miss and every false object."""
     nodes = maps[-1]
     score = scored(world, nodes)
-    true, label = boxes_of(world.frames[-1].scene)
+    true, _ = boxes_of(world.frames[-1].scene)
     mine, labels = boxes_of(nodes)
     rows: list[Row] = []
     for name, i in score.missed:
@@ -148,12 +148,18 @@ def causes(
         rows.append(("missed: " + cause, name, (i, counts, round(best, 2), round(gap, 2), tentative, *extent)))
     rows += [("false: double", name, (i, *_told(mine[i]))) for name, i in score.doubles]
     for name, i, best, gap in score.wrong:
-        box = mine[i]
-        stands = {label[t] for t, other in true.items() if t > 0 and upright_iou(other, box) >= 0.2}
-        near_one = gap < 0.5 * float(box[1].max()) + 0.2
-        cause = "another class" if stands - {name} else "displaced" if near_one else "phantom"
-        rows.append(("false: " + cause, name, (i, best, gap, stands, *_told(box))))
+        cause = false_cause(world.frames[-1].scene, mine[i], name)
+        rows.append(("false: " + cause, name, (i, best, gap, *_told(mine[i]))))
     return score, rows
+
+
+def false_cause(truth: SceneGraph, box: Box, name: str) -> str:
+    """Returns what a false object of a class is: of another class than what stands there, displaced, or a phantom."""
+    true, label = boxes_of(truth)
+    stands = {label[t] for t, other in true.items() if t > 0 and upright_iou(other, box) >= 0.2}
+    away = (float(np.linalg.norm(true[t][0] - box[0])) for t in true if t > 0 and label[t] == name)
+    near_one = min(away, default=9.0) < 0.5 * float(box[1].max()) + 0.2
+    return "another class" if stands - {name} else "displaced" if near_one else "phantom"
 
 
 def _told(box: Box) -> tuple[object, ...]:

@@ -170,9 +170,9 @@ class RelationScore:
         not count though no true one matches them.
         """
         of, wanted = match | {FLOOR: FLOOR}, {*must, FLOOR}
-        known, ours = set(of.values()), _triples(graph)
-        true = {_ordered(t) for t in _triples(truth)}
-        mine = {_ordered((of[s], p, of[o])) for s, p, o in ours if s in of and o in of}
+        known, ours = set(of.values()), triples(graph)
+        true = {ordered(t) for t in triples(truth)}
+        mine = {ordered((of[s], p, of[o])) for s, p, o in ours if s in of and o in of}
         for triple in mine | {t for t in true if t[0] in known and t[2] in known}:
             kind = "hit" if triple in mine and triple in true else "false" if triple in mine else "miss"
             self.counts[f"mapped {kind} {triple[1]}"] += 1
@@ -192,12 +192,14 @@ class RelationScore:
         return 2 * hit / (2 * hit + false + miss) if hit + false + miss else float("nan")
 
 
-def _triples(graph: SceneGraph) -> set[Triple]:
+def triples(graph: SceneGraph) -> set[Triple]:
+    """Returns the relations that are scored, by ids of nodes: those between objects, and with the floor."""
     ids = graph.ids.tolist()
     rows = ((ids[s], p, ids[o]) for s, p, o in graph.relations() if p in PREDICATES)
     return {row for row in rows if min(row[0], row[2]) >= FLOOR}
 
 
-def _ordered(triple: Triple) -> Triple:
+def ordered(triple: Triple) -> Triple:
+    """Returns a relation with the lower id first where it holds both ways."""
     s, p, o = triple
     return (min(s, o), p, max(s, o)) if p == "near" else triple
