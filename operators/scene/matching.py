@@ -66,7 +66,7 @@ class Observation:
 
     @property
     def own_image(self) -> ImageView | None:
-        """What the image shows of the object alone."""
+        """Image of the object alone."""
         return self.image if self.part is None else self.part
 
 
