@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import json
+import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -48,9 +49,9 @@ LONGEST = 90
 """Characters of a default that stand in the table as they are."""
 
 GRAPHS_INTRODUCTION = """\
-Files of `graphs/`; what stands in a nested graph is counted to the graphs that hold it. Operators that are not listed
-are sources of recordings, videos and devices, what `PerceptionSystem` puts in place of sensors, and alternatives to
-those that are."""
+Files of `graphs/`; what stands in a nested graph is counted to the graphs that hold it, also where it is left out for
+want of an input, or since what it makes is given. Operators that are not listed are sources of recordings and what
+`PerceptionSystem` puts in place of sensors."""
 
 GRAPHS = Path(__file__).resolve().parent.parent / "graphs"
 
@@ -64,11 +65,14 @@ def graphs_of(folder: Path = GRAPHS) -> dict[str, list[str]]:
     return dict(sorted(found.items()))
 
 
-def _uses(file: Path) -> Iterator[str]:
-    for operator in YAML(typ="safe").load(file)["operators"].values():
-        use = operator["use"]
+def _uses(file: Path, given: Mapping[str, Any] | None = None) -> Iterator[str]:
+    """The operators of a file; one that a parameter names is that of the graph around it, else the parameter's own."""
+    graph = YAML(typ="safe").load(file)
+    values = {**graph.get("params", {}), **(given or {})}
+    for operator in graph["operators"].values():
+        use = re.sub(r"\$\{(\w+)\}", lambda name: str(values[name[1]]), operator["use"])
         if use.endswith(".yaml"):
-            yield from _uses(file.parent / use)
+            yield from _uses(file.parent / use, operator.get("params"))
         else:
             yield use
 
