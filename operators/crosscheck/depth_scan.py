@@ -111,6 +111,7 @@ def _residuals(depth: Depth, scale: float, K: Array, points: Array) -> tuple[Arr
     points, u, v = points[inside], u[inside], v[inside]
     around = [(0, 0), (-_STEP, 0), (_STEP, 0), (0, -_STEP), (0, _STEP)]
     z = np.stack([depth[v + dv, u + du] for du, dv in around]).astype(np.float64) / scale
+    z[~np.isfinite(z)] = 0
     centre = z[0]
     smooth = (np.abs(z[1:] - centre) < _SMOOTH * centre).all(axis=0) & (z > 0).all(axis=0)
     usable = smooth & (centre > _NEAR) & (centre < _FAR) & (np.abs(points[:, 2] - centre) < _REACH * centre)

@@ -71,6 +71,7 @@ def test_rims_are_pixels_in_front_of_something() -> None:
     depth = np.full((40, 40), 3.0, np.float32)
     depth[10:20, 10:20] = 1.0
     depth[0, :] = 0.0
+    depth[30:, :], depth[:, 30:] = np.inf, np.nan
     assert set(rims(depth, K)[:, 2]) == {1.0}
 
 
