@@ -277,9 +277,10 @@ def outputs_of(operator: Operator, returned: Outputs) -> dict[str, Message]:
 def _explain(cls: type[Operator], fault: Any) -> str:
     name = ".".join(str(part) for part in fault["loc"])
     fields = cls.spec.parameters.model_fields
-    if fault["type"] == "extra_forbidden":
+    of_parameter = len(fault["loc"]) == 1  # and not of a field within one
+    if fault["type"] == "extra_forbidden" and of_parameter:
         known = ", ".join(fields) or "none"
         return f"{cls.__name__} has no parameter {name!r}; its parameters: {known}"
-    if fault["type"] == "missing":
+    if fault["type"] == "missing" and of_parameter:
         return f"{cls.__name__}.{name} must be given: {fields[name].description}"
     return f"{cls.__name__}.{name}: {fault['msg']}, got {fault['input']!r}"

@@ -137,6 +137,8 @@ def test_a_missing_transform_is_named() -> None:
         ({"shape": "box", "size": (1, 0, 1)}, "size must be above 0"),
         ({"shape": "cylinder", "size": (1, 0.9, 1)}, "one diameter"),
         ({"shape": "ball", "size": (1, 1, 1)}, "'box' or 'cylinder'"),
+        ({"shape": "box"}, r"SelfFilter\.body\.0\.size: Field required, got {'shape': 'box'}"),
+        ({"shape": "box", "size": (1, 1, 1), "box": 1}, r"SelfFilter\.body\.0\.box: Extra inputs are not permitted"),
     ],
 )
 def test_a_part_that_is_no_body_is_named(part: Any, text: str) -> None:
