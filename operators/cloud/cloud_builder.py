@@ -19,6 +19,8 @@ class CloudBuilder(Operator):
     The images need not be registered: each point is projected into the colour camera. Without `extrinsics` the two
     cameras are taken to coincide. Points that the colour camera does not see are black. Both cameras are pinholes:
     lens distortion must have been removed.
+
+    Method: the pinhole camera and its inverse, Hartley and Zisserman, "Multiple view geometry", 2004, chapter 6.
     """
 
     stateless = True

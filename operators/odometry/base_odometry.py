@@ -21,6 +21,9 @@ class BaseOdometry(Operator):
     whose z is up where the robot stood level at first, and whose origin is on the floor. A pose that is not finite
     gives none, and is counted; so does one without a scale (infinite variances) of a sensor beside the base, since
     where the base is cannot be told until the scale is known.
+
+    Method: covariances to first order, Smith, Self and Cheeseman, "Estimating uncertain spatial relationships in
+    robotics", 1990.
     """
 
     sensor: In[Odometry] = In(doc="pose of a sensor in the frame where that sensor began")
