@@ -110,8 +110,7 @@ def _landmarks(name: str, sightings: LandmarkSightings, around: Surroundings) ->
     if sightings.covariances is None:
         raise ValueError(f"{name}: sightings have no covariances: how well a landmark was seen must be known")
     seen, spread = cartesian(sightings)
-    flat = np.asarray(around.landmarks.positions[:, :2])
-    placed = np.asarray((np.abs(flat) < _FARTHEST).all(axis=1))  # not where a coordinate is not finite
+    flat, placed = _placed_at(around.landmarks.positions)
     everywhere = flat[placed]
     known = {i: flat[k : k + 1] for k, i in enumerate(around.landmarks.ids.tolist()) if placed[k]}
     places = [known.get(i) if i >= 0 else everywhere for i in sightings.ids.tolist()]
@@ -123,14 +122,21 @@ def _objects(boxes: Boxes3D, around: Surroundings) -> Sightings:
         raise Unusable("no map of objects")
     _same_frame("objects", "their map", around.objects.frame, around.map_frame)
     by_class: dict[str, Array] = {}
+    flat, placed = _placed_at(around.objects.centers)
     labels = around.objects.labels()
     for label in set(labels):
-        chosen = [k for k, other in enumerate(labels) if other == label]
-        by_class[label] = np.asarray(around.objects.centers[chosen, :2])
+        chosen = [k for k, other in enumerate(labels) if other == label and placed[k]]
+        by_class[label] = flat[chosen]
     spread = boxes.covariances
     if spread is None:
         spread = np.tile(np.eye(3) * around.object_sigma**2, (boxes.count, 1, 1))
     return _sightings(boxes.centers, spread, [by_class.get(label) for label in boxes.labels()], boxes.frame, around)
+
+
+def _placed_at(positions: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Positions (N, 2) in the plane of what a map holds, and which of them (N,) are somewhere."""
+    flat = np.asarray(positions[:, :2])
+    return flat, np.asarray((np.abs(flat) < _FARTHEST).all(axis=1))  # not where a coordinate is not finite
 
 
 def _sightings(seen: Array, spread: Array, places: list[Array | None], frame: str, around: Surroundings) -> Sightings:

@@ -10,7 +10,15 @@ import numpy as np
 import pytest
 from made_room import Drive, mounts, room
 
-from dataflow.messages import LandmarkSightings, OccupancyGrid, PointCloud, Pose
+from dataflow.messages import (
+    Boxes3D,
+    LandmarkSightings,
+    LaserScan,
+    NavSatFix,
+    OccupancyGrid,
+    PointCloud,
+    Pose,
+)
 from dataflow.messages.geometry import quaternion_from_yaw, yaw_of
 from dataflow.testing import Played, play
 from operators.localization import ParticleFilterLocalizer
@@ -27,6 +35,20 @@ def localized(drive: Drive, sensors: dict[str, Any], **params: Any) -> tuple[Pla
         "extrinsics": [mounts()],
     }
     return play(operator, streams, static=("map", "landmark_map", "extrinsics"), paranoid=False), operator
+
+
+def chairs(centers: Any, stamp: int, frame: str) -> Boxes3D:
+    n = len(centers)
+    return Boxes3D(
+        stamp=stamp,
+        frame=frame,
+        class_names=("chair",),
+        centers=np.array(centers, np.float64),
+        sizes=np.full((n, 3), 0.5),
+        orientations=np.tile([0.0, 0, 0, 1], (n, 1)),
+        scores=np.ones(n, np.float32),
+        class_ids=np.zeros(n, np.int32),
+    )
 
 
 def errors(drive: Drive, poses: list[Any], since: float = 1.0) -> tuple[float, float, int]:
@@ -185,6 +207,61 @@ def test_what_cannot_be_used_is_counted_with_its_reason() -> None:
     assert operator.summary()["ignored, measurements/points: fewer than 8 points in the band"] == 1
     assert operator.summary()["ignored, measurements/seen: nothing of it is in the map"] == 1
     assert operator.summary()["poses waiting"] == 19
+
+
+COVARIANCE = np.diag([0.05**2, 0.05**2, 1.0, 1.0, 1.0, 0.01])
+NOWHERE = Pose(
+    stamp=300_000_000, frame="world", child_frame="base_link", position=[math.nan, 0, 0], orientation=[0, 0, 0, 1]
+)
+NO_FIX = NavSatFix(
+    stamp=300_000_000, frame="base_link", status="no_fix", latitude=math.nan, longitude=math.nan, altitude=math.nan
+)
+BLIND = LaserScan(
+    stamp=300_000_000, frame="base_link", angle_min=0.0, angle_max=3.0, ranges=[math.inf, math.nan, 0] * 40
+)
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (NOWHERE.replace(covariance=COVARIANCE), "not finite"),
+        (NO_FIX, "no fix"),
+        (BLIND, "fewer than 8 points in the band"),
+        (chairs([[1.0, 1.0, 0.5]], stamp=300_000_000, frame="base_link"), "no map of objects"),
+    ],
+    ids=["position", "satellites", "scan", "objects"],
+)
+def test_a_bad_measurement_beside_good_scans_is_counted_and_the_robot_is_followed(message: Any, reason: str) -> None:
+    drive = Drive(3.0)
+    played, operator = localized(drive, {"scan": drive.scans(), "bad": [message]})
+    assert operator.summary()[f"ignored, measurements/bad: {reason}"] == 1
+    assert errors(drive, played["pose"])[0] < 0.1
+
+
+@pytest.mark.parametrize("wrong", [np.nan, np.inf, 1e30])
+def test_an_object_of_the_map_that_is_nowhere_is_as_if_it_were_not_in_it(wrong: float) -> None:
+    drive = Drive(3.0)
+    places = [[2.0, 1.0, 0.5], [-2.0, 1.5, 0.5], [wrong, 0.0, 0.5]]
+    seen = []
+    for scan in drive.scans():
+        x, y, yaw = drive.pose(scan.stamp * 1e-9)
+        c, s = math.cos(yaw), math.sin(yaw)
+        at = [[c * (a - x) + s * (b - y), c * (b - y) - s * (a - x), z] for a, b, z in places[:2]]
+        seen.append(chairs(at, stamp=scan.stamp, frame="base_link"))
+    digests = []
+    for known in (places, places[:2]):
+        operator = ParticleFilterLocalizer(modality_particles=0)
+        streams = {
+            "odometry": drive.odometry(),
+            "measurements": {"scan": drive.scans(), "objects": seen},
+            "map": [drive.grid],
+            "object_map": [chairs(known, stamp=0, frame="world")],
+            "extrinsics": [mounts()],
+        }
+        played = play(operator, streams, static=("map", "object_map", "extrinsics"), paranoid=False)
+        assert errors(drive, played["pose"])[0] < 0.1
+        digests.append(played.digests())
+    assert digests[0] == digests[1]
 
 
 def test_odometry_and_rates_that_are_not_finite_or_late_are_counted_and_the_robot_is_followed() -> None:
