@@ -167,24 +167,25 @@ def ambiguous(worlds: list[str]) -> None:
 
 
 def measure() -> None:
-    """Time of single updates with 1,000 particles, in one thread."""
-    from operators.localization.monte_carlo import MonteCarlo
+    """CPU time of single updates with 1,000 particles, one thread, the look for another place included."""
+    from operators.localization.vote import Vote
 
     static, streams = drive("office", 21, seconds=20, kidnaps=())
     times: dict[str, list[float]] = {}
-    weigh, move = MonteCarlo.weigh, MonteCarlo.move
+    hear, move = Vote.hear, Vote.move
 
     def timed(name: str, method: Any) -> Any:
-        def call(self: Any, *arguments: Any) -> None:
-            began, injected = time.perf_counter(), self.injected
-            method(self, *arguments)
-            kind = name if name == "move" else f"weigh {type(arguments[1]).__name__}"
+        def call(self: Any, *arguments: Any) -> Any:
+            began, injected = time.process_time(), self.injected
+            result = method(self, *arguments)
+            kind = name if name == "move" else f"hear {type(arguments[2]).__name__}"
             kind += ", with injection" if self.injected > injected else ""
-            times.setdefault(kind, []).append(1e3 * (time.perf_counter() - began))
+            times.setdefault(kind, []).append(1e3 * (time.process_time() - began))
+            return result
 
         return call
 
-    MonteCarlo.weigh, MonteCarlo.move = timed("weigh", weigh), timed("move", move)  # type: ignore[method-assign]
+    Vote.hear, Vote.move = timed("hear", hear), timed("move", move)  # type: ignore[method-assign]
     localized(static, streams, SENSORS["both"], min_particles=1000, max_particles=1000, modality_particles=0)
     for kind, spans in sorted(times.items()):
         print(f"{kind}: median {np.median(spans):.2f} ms, 95 % {np.percentile(spans, 95):.2f} ms of {len(spans)}")
