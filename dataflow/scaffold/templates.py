@@ -304,6 +304,7 @@ README = Template("""\
 # $name
 
     python3 -m venv .venv && . .venv/bin/activate
+    pip install -e PATH/TO/robot-dataflow  # where it was cloned to
     pip install -e ".[dev]"
     pytest
     dataflow run graphs/$package.yaml --record out/run.mcap --view out/run.rrd

@@ -38,6 +38,11 @@ def test_a_project_passes_its_own_tests(tmp_path: Path) -> None:
     project = tmp_path / "my-robot"
 
     assert "pytest && dataflow run graphs/my_robot.yaml" in told
+    readme = (project / "README.md").read_text(encoding="utf-8")
+    assert [line.partition("#")[0].split()[-1] for line in readme.splitlines() if "pip" in line] == [
+        "PATH/TO/robot-dataflow",
+        '".[dev]"',
+    ]
     for kind in KINDS:
         call("new", "operator", f"Another{kind}", "--kind", kind, "--to", project / "my_robot")
     call("new", "graph", "second", "--to", project / "graphs")
