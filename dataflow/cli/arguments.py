@@ -138,8 +138,11 @@ def number(low: float, high: float, meaning: str) -> Callable[[str], float]:
     return parse
 
 
-def existing(path: Path, what: str) -> Path:
-    """`path`, or an error that names the files which could be meant. `what`: "a recording", "a graph file"."""
+def existing(path: Path, what: str, names: Iterable[str] = ()) -> Path:
+    """`path`, or an error that names the files which could be meant. `what`: "a recording", "a graph file".
+
+    `names`: words that would have done instead of a file.
+    """
     from dataflow.graph.problems import nearest
 
     if path.is_file():
@@ -152,16 +155,18 @@ def existing(path: Path, what: str) -> Path:
     if not folder.is_dir():
         raise fail(f"no file {path}: there is no folder {folder}")
     near = nearest(path.name, sorted(p.name for p in folder.iterdir() if p.is_file()))
-    raise fail(f"no file {path}" + (f"; did you mean {folder / near}?" if near else f"; expected {what}"))
+    meant = str(folder / near) if near else nearest(path.as_posix(), names)
+    raise fail(f"no file {path}; " + (f"did you mean {meant}?" if meant else f"expected {what}"))
 
 
 def graph_file(path: Path) -> Path:
     """`path` as a graph file: one that is there, or one that comes with dataflow, by its name."""
-    from dataflow.shipped import graph
+    from dataflow.shipped import graph, graphs
 
     if not path.exists() and (found := graph(path.as_posix().removeprefix("graphs/"))) is not None:
         return found.path
-    return existing(path, "a graph file (dataflow graphs lists those that come with it)")
+    what = "a graph file (dataflow graphs lists those that come with it)"
+    return existing(path, what, () if path.exists() else [shipped.name for shipped in graphs()])
 
 
 def existing_recording(path: Path) -> Path:

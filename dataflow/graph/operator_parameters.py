@@ -50,6 +50,8 @@ def _report(full: str, cls: type[Operator], fault: Any, given: Table, place: Pla
             value = at(given, path)
             message = str(fault["msg"]).removeprefix("Value error, ")
             message = message[:1].lower() + message[1:]
+            if fault["type"].endswith("_parsing") or fault["type"] == "int_from_float":
+                message = message.partition(", ")[0]  # what it got stands behind it anyway
             hint = f"{path[0]}: {fields[str(path[0])].description}" if path and str(path[0]) in fields else ""
             if fault["type"] == "string_type" and isinstance(value, Leaf) and not isinstance(value.value, str):
                 hint = f"write '{value.raw}' in quotes"

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from dataflow.cli.arguments import chosen_streams, existing, output_file, window
+from dataflow.cli.arguments import chosen_streams, existing, graph_file, output_file, window
 from dataflow.cli.output import friendly_errors, jsonable, plural, seconds, size
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report, report_json
@@ -107,6 +107,17 @@ def test_a_missing_file_is_answered_with_the_nearest(tmp_path: Path, capsys) -> 
         with pytest.raises(typer.Exit):
             existing(path, "a recording")
         assert message in capsys.readouterr().err
+
+
+def test_a_misspelt_graph_that_comes_with_it_is_answered_with_the_nearest(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    for word, message in (
+        ("sythetic_rgbd", "no file sythetic_rgbd; did you mean synthetic_rgbd?"),
+        ("xyzzy", "no file xyzzy; expected a graph file (dataflow graphs lists"),
+    ):
+        with pytest.raises(typer.Exit):
+            graph_file(Path(word))
+        assert message in " ".join(capsys.readouterr().err.split())
 
 
 def test_an_output_file_never_replaces_anything_unasked(tmp_path: Path, capsys) -> None:

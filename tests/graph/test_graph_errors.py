@@ -498,6 +498,11 @@ def test_module_that_fails_to_import_says_where(tmp_path: Path, monkeypatch: pyt
             "1:13: camera: parameter 'rate': input should be greater than 0, got -3",
             "rate: pictures a second",
         ),
+        (
+            "camera.rate=fast",
+            "1:13: camera: parameter 'rate': input should be a valid number, got fast",
+            "rate: pictures a second",
+        ),
         ("camra.rate=3", "1:1: the graph has no operator 'camra'", "did you mean 'camera'?"),
         ("rte=3", "1:1: the graph has no parameter 'rte'", "graph parameters: none"),
         (
