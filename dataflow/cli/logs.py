@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, existing
@@ -90,6 +91,8 @@ def logs(
     if not shown and not json:
         some = " that was asked for" if operators or level != "debug" else ""
         say(f"[dim]nothing was logged or printed{some}[/]")
+        if recording is not None and operators:
+            _tell_unknown(recording, operators)
 
 
 def _recorded(path: Path) -> Iterator[LogLine]:
@@ -104,6 +107,22 @@ def _recorded(path: Path) -> Iterator[LogLine]:
             found.append((event.stamp, LogLine("warning", text, "supervisor", source=event.name, stamp=event.stamp)))
     for _, line in sorted(found, key=lambda entry: entry[0]):
         yield line
+
+
+def _tell_unknown(path: Path, names: list[str]) -> None:
+    """Says which of the names are those of no operator or process of a recording, and what is near."""
+    from dataflow.graph.problems import did_you_mean
+    from dataflow.recording import Recording
+
+    with Recording(path) as opened:
+        known = {
+            *opened.firing_batches(),
+            *(name for _, line in opened.logs() for name in (line.operator, line.process)),
+        }
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, sorted(known - {""}), "there are")
+            say(f"[yellow]no operator or process {escape(repr(name))} is in the recording:[/] {escape(hint)}")
 
 
 def _running(name: str | None, wait: float, *, follow: bool) -> Iterator[LogLine]:

@@ -116,7 +116,10 @@ def test_the_command_chooses_lines_of_a_recording(recorded) -> None:
     worse = [json.loads(line) for line in call("logs", path, "--level", "error", "--json").stdout.splitlines()]
     assert {line["text"] for line in worse} == {"two\nlines"}
     assert "warning  talker  word 2" in call("logs", path, "--operator", "talker", "--last", 12).stdout
-    assert "nothing was logged" in call("logs", path, "--operator", "nobody").stderr
+    nobody = call("logs", path, "--operator", "talkr", "--operator", "talker", "--level", "fatal").stderr
+    assert "nothing was logged" in nobody
+    assert "no operator or process 'talkr' is in the recording: did you mean 'talker'?" in nobody
+    assert "'talker' is in" not in nobody
     assert "expected one of debug" in call("logs", path, "--level", "loud", code=2).stderr
     assert "about a running graph" in call("logs", path, "--follow", code=2).stderr
 
