@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, get_args
 
 import typer
 from rich.markup import escape
@@ -57,11 +57,16 @@ _MCAP = ("mcap", "foxglove", "ros2")
 
 def convert(
     recording: AnyRecording,
-    to: Annotated[Format, typer.Option("--to", metavar="FORMAT", help="The format; the examples name all of them.")],
     output: Annotated[
         Path | None, typer.Argument(metavar="OUTPUT", help="The file or folder to write; or name it with --out.")
     ] = None,
     out_option: OutInstead = None,
+    to: Annotated[
+        Format | None,
+        typer.Option(
+            "--to", metavar="FORMAT", help="The format; the examples name all of them. Not needed for NAME.rrd."
+        ),
+    ] = None,
     streams: Streams = None,
     without: Without = None,
     start: Start = None,
@@ -111,6 +116,10 @@ def convert(
         output = named_once("OUTPUT", output, out_option)
         if output is None:
             raise fail("nothing says where to write: name a file or folder behind the recording, or with --out")
+        if to is None:
+            if output.suffix != ".rrd":
+                raise fail(f"nothing says the format of {output}: give one with --to: {', '.join(get_args(Format))}")
+            to = "rrd"
         _check_output(output, to, overwrite)
         if to == "rrd":
             from dataflow.cli.drawing import draw_recording, drawn_as_json, report

@@ -29,7 +29,7 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_bag_is_drawn_as_a_recording_is(dataflow, bag: Path, tmp_path: Path) -> None:
     dataflow("view", bag, "--to", tmp_path / "a.rrd", "--without", "/truth", "--end", "1")
-    told = dataflow("convert", bag, tmp_path / "b.rrd", "--to", "rrd", "--json").stdout
+    told = dataflow("convert", bag, tmp_path / "b.rrd", "--json").stdout
 
     assert (tmp_path / "a.rrd").stat().st_size > 1000
     assert json.loads(told) == {"files": [str(tmp_path / "b.rrd")], "messages": 40, "not_drawn": 0}
@@ -45,6 +45,7 @@ def test_a_ros_1_bag_is_drawn_too(dataflow, tmp_path: Path) -> None:
 
 
 def test_a_dataset_takes_what_is_left_without_the_other_streams_of_a_kind(dataflow, bag: Path, tmp_path: Path) -> None:
+    assert "give one with --to: mcap, ros2, foxglove" in dataflow("convert", bag, tmp_path / "a", code=2).stderr
     refused = dataflow("convert", bag, tmp_path / "a", "--to", "tum", code=2).stderr
     assert "--without all but one of /estimate, /truth" in " ".join(refused.split())
 
