@@ -26,7 +26,7 @@ def open_saved(path: Path) -> None:
     from dataflow.view.process import display_problem, start
 
     if (problem := display_problem()) is not None:
-        say(f"{escape(str(path))} is not opened: {problem}; elsewhere, open it with: rerun {escape(path.name)}")
+        say(f"{escape(str(path))} is not opened: {problem}; where there is one: rerun {escape(str(path))}")
         return
     try:
         start([str(path.resolve())], [], outlive=True)

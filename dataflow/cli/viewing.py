@@ -90,8 +90,9 @@ def view(
         if recording is not None:
             if graph is not None or wait:
                 raise fail("--graph and --wait are about a running graph; leave them out to view a recording")
+            path = existing_recording(recording)
             target = _target(to, overwrite)
-            report(*draw_recording(existing_recording(recording), target, streams, without, start, end, clock, every))
+            report(*draw_recording(path, target, streams, without, start, end, clock, every))
         else:
             if start is not None or end is not None:
                 raise fail("--start and --end are about a recording; name one")

@@ -130,6 +130,10 @@ def test_a_view_that_cannot_be_is_refused(
     assert not Path("x.rrd").exists()
 
 
+def test_a_missing_recording_is_told_before_a_missing_display(dataflow, tmp_path: Path) -> None:
+    assert "no file" in dataflow("view", tmp_path / "run.mcap", code=2).stderr
+
+
 def test_a_recording_that_nothing_can_be_drawn_of_is_refused(dataflow, data_dir: Path, tmp_path: Path) -> None:
     foreign = data_dir / "bags" / "ros2_cdr_test.mcap"
 

@@ -237,7 +237,9 @@ def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(
     monkeypatch.setenv("RERUN_CLI_PATH", str(viewer))
     words = ["run", small, "--set", "count=5", "--one-process", "--view", saved, "--open"]
 
-    assert "is not opened: there is no display" in dataflow(*words).stderr
+    unopened = dataflow(*words).stderr
+    assert "is not opened: there is no display" in unopened
+    assert f"rerun {saved}" in unopened
     assert not noted.exists()
     assert "replace it with --overwrite" in dataflow(*words, code=2).stderr
     monkeypatch.setenv("DISPLAY", ":7")
