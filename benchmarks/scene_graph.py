@@ -23,6 +23,7 @@ from semantic_map import mapped, plainly_seen, scored, seen
 from sensed_worlds import Frame, World, ids_in_view, sensed
 
 from dataflow.messages import Activity, SceneGraph
+from operators.recognition import activity_score
 from operators.scene import SceneGraphBuilder
 from operators.scene.scoring import PREDICATES, RelationScore, score_nodes
 
@@ -50,14 +51,9 @@ def compare_acts(world: World, frames: list[Frame], made: list[tuple[Activity, d
 
 
 def macro_f1(counts: Counter[str]) -> float:
-    pairs = [(*key.partition("|")[::2], n) for key, n in counts.items()]
-    scores = []
-    for name in {t for t, _, _ in pairs}:
-        hit = sum(n for t, s, n in pairs if t == s == name)
-        false = sum(n for t, s, n in pairs if s == name != t)
-        miss = sum(n for t, s, n in pairs if t == name != s)
-        scores.append(2 * hit / max(2 * hit + false + miss, 1))
-    return float(np.mean(scores)) if scores else float("nan")
+    """Returns the macro-F1 of counts by `true|said`; NaN where there are none."""
+    pairs = [key.split("|") for key in counts.elements()]
+    return activity_score.macro_f1([t for t, _ in pairs], [s for _, s in pairs]) if pairs else float("nan")
 
 
 def goals(frames: list[Frame], graphs: list[SceneGraph]) -> dict[str, list[bool]]:

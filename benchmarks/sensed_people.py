@@ -12,8 +12,7 @@ import argparse
 from pathlib import Path
 
 from scene_graph import acts
-from semantic_map import mapped
-from sensed_worlds import World, ids_in_view, sensed
+from sensed_worlds import World, ids_in_view, mapped_boxes, sensed
 
 from operators.recognition.sensed_people import SensedTrack, sensed_tracks, write_tracks
 from operators.sources.simulator.classes import ACTIVITIES
@@ -21,13 +20,15 @@ from operators.sources.simulator.classes import ACTIVITIES
 
 def tracks_of(world: World) -> list[SensedTrack]:
     frames = world.frames
+    nodes, objects = mapped_boxes(world)
     return sensed_tracks(
-        mapped(world, true=False),
+        nodes,
         [frame.base for frame in frames],
         [frame.scene for frame in frames],
         [acts(frame.activities) for frame in frames],
         [ids_in_view(frame.objects, 0.3) for frame in frames],
         ACTIVITIES,
+        objects,
     )
 
 

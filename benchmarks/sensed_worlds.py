@@ -90,6 +90,13 @@ class Mapper:
         self, world: World, frame: Frame, detections: Detections2D, masks: SegmentationMap
     ) -> tuple[dict[str, Any], SceneGraph]:
         """Returns what was lifted from a frame, and the map after it."""
+        found, made = self.step(world, frame, detections, masks)
+        return found, made["nodes"]
+
+    def step(
+        self, world: World, frame: Frame, detections: Detections2D, masks: SegmentationMap
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Returns what was lifted from a frame, and all that the map gives after it."""
         found = self.lifter.process(detections, frame.cloud, world.image_info, world.extrinsics, masks, frame.camera)
         made = self.known.process(
             found["boxes"],
@@ -101,7 +108,14 @@ class Mapper:
             world.image_info,
             self.planes.process(frame.cloud, frame.camera, world.extrinsics).get("surfaces"),
         )
-        return dict(found), made["nodes"]
+        return dict(found), dict(made)
+
+
+def mapped_boxes(world: World) -> tuple[list[SceneGraph], list[Boxes3D]]:
+    """Returns the map from sensors after each frame, as nodes and as boxes with velocities."""
+    mapper = Mapper()
+    made = [mapper.step(world, f, f.detections, f.segmentation)[1] for f in world.frames]
+    return [m["nodes"] for m in made], [m["objects"] for m in made]
 
 
 def sense(kind: str, seed: int, route: Route) -> World:

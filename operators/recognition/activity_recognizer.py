@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Activity, Odometry, Pose, SceneGraph
+from dataflow.messages import Activity, Boxes3D, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
 from operators.recognition.agent_features import AGENTS, DRINKS, AgentWindow, Surroundings
@@ -40,9 +40,9 @@ class ActivityRecognizer(Operator):
     graph into two LSTM layers, whose state is kept from graph to graph for as long as the agent is in the scene; the
     network answers for a quarter of a second ago. `unknown` stands for what is too unsure, or too long out of sight.
 
-    What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat. Who has
-    reached for a drink has it in hand for a while: one who then seems to stand drinks, unless the drink is seen where
-    it lay.
+    What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat, and a robot
+    that moves does not rest. Who has reached for a drink has it in hand for a while: one who then seems to stand
+    drinks, unless the drink is seen where it lay.
 
     Persons stand, walk, sit down, sit, stand up, reach or drink; balls roll or rest; robots drive or rest. Method:
     Hochreiter and Schmidhuber, "Long short-term memory", 1997; trained on simulated people (`dataflow train activity`).
@@ -50,6 +50,10 @@ class ActivityRecognizer(Operator):
 
     nodes: In[SceneGraph] = In(doc="objects with agents among them, 2 to 10 times a second; relations are not used")
     robot: Sampled[Pose | Odometry] = Sampled(required=False, doc="the robot, in the frame of the nodes")
+    objects: Sampled[Boxes3D] = Sampled(
+        required=False,
+        doc="the nodes as boxes with velocities: how fast those are that are new; of the nodes' own stamp",
+    )
     activities: Out[Activity] = Out(doc="a row an agent: activity, probabilities, what it is done to, since when")
 
     weights: str | None = Param(None, doc="network file of `dataflow train activity`; none means the shipped one")
@@ -68,11 +72,17 @@ class ActivityRecognizer(Operator):
         self._agents: dict[int, _Agent] = {}
         self._around = Surroundings()
 
-    def process(self, nodes: SceneGraph, robot: Pose | Odometry | None = None) -> Activity:
+    def process(
+        self,
+        nodes: SceneGraph,
+        robot: Pose | Odometry | None = None,
+        objects: Boxes3D | None = None,
+    ) -> Activity:
         """Raises ValueError where the robot is in another frame than the nodes."""
         if robot is not None and robot.frame != nodes.frame:
             raise ValueError(f"the robot is in {robot.frame!r}, the nodes in {nodes.frame!r}")
-        bodies, unusable = mattering(nodes)
+        same = objects is not None and (objects.stamp, objects.frame) == (nodes.stamp, nodes.frame)
+        bodies, unusable = mattering(nodes, objects if same else None)
         seen = seen_times(nodes)
         time = nodes.stamp * 1e-9
         self._around.update(time, bodies)

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 
+from operators.scene.agents import UNKNOWN
+
 
 def macro_f1(true: Sequence[str], said: Sequence[str]) -> float:
-    """Returns the mean over the classes that are true at any time of F1; 0 where there are none.
+    """Returns the mean of F1 over all classes that are true or said at any time; 0 where there are none.
 
-    What is said and is no class, such as `unknown`, is a miss of the true class and false for none.
+    A class that is said and never true counts 0, as in scikit-learn. `unknown` is an answer and no class: a miss of the
+    true class, and false for none.
     """
     pairs = Counter(zip(true, said, strict=True))
     scores = []
-    for name in sorted(set(true)):
+    for name in sorted({*true, *said} - {UNKNOWN}):
         hit = pairs[name, name]
         false = sum(n for (t, s), n in pairs.items() if s == name != t)
         miss = sum(n for (t, s), n in pairs.items() if t == name != s)

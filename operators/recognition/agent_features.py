@@ -19,10 +19,13 @@ WINDOW = 2.5
 """Seconds of the past from which motion is taken; what was before is in the state of the network."""
 
 AGENTS = ("person", "robot", "ball")
+RIGID = ("robot", "ball")
+"""Agents whose velocity in the map is told from few views; that of a person is mostly of limbs and of what hides."""
 SEATS, TABLES, DRINKS = ("chair",), ("table",), ("mug", "bottle")
 MATTERING = frozenset((*AGENTS, *SEATS, *TABLES, *DRINKS))
 """Classes that features are made of; others change nothing."""
 _SHORT, _LONG = 0.6, 1.6
+_BEFORE = 0.5  # seconds before its first look at which an agent is put by its velocity
 FAR = 3.0  # metres at which things are as good as not there
 _REACH = 1.2  # metres up to which something is done to a thing
 
@@ -155,9 +158,12 @@ class AgentWindow:
         self._heights: tuple[float, float] | None = None
 
     def add(self, time: float, body: Body) -> None:
-        """Takes where the agent is; times rise."""
+        """Takes where the agent is; times rise. The velocity of a rigid one that is new tells where it was before."""
         if self._looks:
             self._step = time - self._looks[-1].time
+        elif body.label in RIGID and body.velocity.any():
+            gone = _BEFORE * body.velocity * (1, 1, 0)
+            self._looks.append(Look(time - _BEFORE, body.center - gone, body.size.copy()))
         self._begun = time if self._begun is None else self._begun
         self._looks.append(Look(time, body.center.copy(), body.size.copy()))
         while self._looks[0].time < time - WINDOW:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dataflow.messages import Odometry, Pose, SceneGraph
+from dataflow.messages import Boxes3D, Odometry, Pose, SceneGraph
 from operators.recognition.activity_samples import LAG, sequences
 from operators.recognition.agent_features import AGENTS
 from operators.recognition.scene_agents import scene_moments
@@ -41,13 +41,18 @@ def sensed_tracks(
     doings: Sequence[Mapping[int, str]],
     views: Sequence[set[int]],
     classes: Sequence[str],
+    objects: Sequence[Boxes3D | None] = (),
 ) -> list[SensedTrack]:
-    """Returns the agents of a map over time; `doings` and `views` tell what true agents do, and which are in view."""
+    """Returns the agents of a map over time; `doings` and `views` tell what true agents do, and which are in view.
+
+    `objects` are what the recogniser takes besides.
+    """
     of = [nearest_agents(graph, truth) for graph, truth in zip(graphs, truths, strict=True)]
     times = np.array([truth.stamp for truth in truths]) * 1e-9
-    agents = sorted({body for moment in scene_moments(graphs, robots) for body in moment.unseen})
+    moments = list(scene_moments(graphs, robots, objects))
+    agents = sorted({body for moment in moments for body in moment.unseen})
     found = []
-    for track in sequences(scene_moments(graphs, robots), agents):
+    for track in sequences(iter(moments), agents):
         count = len(track.times)
         labels, now, plain = np.full(count, -1), np.full(count, -1), np.zeros(count, bool)
         right = np.zeros((count, len(classes)), bool)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dataflow.firing.failure import OperatorFailure
-from dataflow.messages import Activity, Pose, SceneGraph
+from dataflow.messages import Activity, Boxes3D, Pose, SceneGraph
 from dataflow.messages.geometry import quaternion_from_yaw
 from dataflow.testing import play
 from operators.recognition import ActivityRecognizer
@@ -107,6 +107,26 @@ def test_balls_roll_and_rest_robots_drive_and_rest() -> None:
     assert answers(graphs, 2)[8] == "rolling"
     assert answers(graphs, 3)[8] == "driving"
     assert answers(graphs, 2)[-1] == answers(graphs, 3)[-1] == "resting"
+
+
+@pytest.mark.parametrize(("later", "expected"), [(0.0, "driving"), (0.25, "resting")])
+def test_a_robot_that_drives_into_view_drives_at_once_by_boxes_of_the_same_time(later: float, expected: str) -> None:
+    (graph,) = course(0.25, lambda _: [(3, "robot", (0.0, 4.0, 0.0), (0.4, 0.4, 0.4))])
+    boxes = Boxes3D(
+        stamp=graph.stamp + round(later * 1e9),
+        frame=graph.frame,
+        class_names=CLASSES,
+        centers=graph.positions,
+        sizes=graph.sizes,
+        orientations=graph.orientations,
+        scores=[0.9],
+        class_ids=graph.class_ids,
+        ids=graph.ids,
+        velocities=[(0.25, 0.0, 0.0)],
+    )
+    recognizer = ActivityRecognizer()
+    recognizer.setup()
+    assert said(recognizer.process(graph, objects=boxes), 3) == expected
 
 
 def test_who_is_out_of_sight_for_long_does_something_unknown() -> None:
