@@ -25,6 +25,9 @@ from operators.scene.history import Event, history
 from operators.scene.query import QueryError, as_json, ask
 from operators.scene.spark import as_spark_dsg
 
+_OLD = 1.0
+"""Seconds by which a graph may be older than what is asked for, without a word."""
+
 scene = typer.Typer(name="scene", add_completion=False)
 
 
@@ -66,6 +69,9 @@ def show(
             _told(_history(recording, stream, at, story), json=json)
             return
         graph, activities, since = _graph(recording, stream, at)
+        if at is not None and since < at - _OLD:
+            note = f"note: nothing is newer than {since:.1f} s, so this is of then, not of {at:g} s"
+            Console(stderr=True).print(note, highlight=False, soft_wrap=True)
         matches = None if query is None else ask(graph, query)
         if export is not None:
             _write(graph, export, overwrite=overwrite)

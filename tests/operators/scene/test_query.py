@@ -118,6 +118,13 @@ def test_the_command_answers_from_a_recording(recording: Path) -> None:
     assert "holding" in asked(str(recording), "--nodes")[1]
 
 
+def test_a_time_after_the_last_graph_is_said(recording: Path) -> None:
+    code, out = asked(str(recording), "--at", "99")
+    assert code == 0
+    assert "nothing is newer than 2.0 s" in out
+    assert "newer" not in asked(str(recording), "--at", "2.5")[1]
+
+
 def test_an_export_is_not_replaced_unasked(recording: Path, tmp_path: Path) -> None:
     file = tmp_path / "out" / "scene.json"
     words = (str(recording), "--export", str(file))
