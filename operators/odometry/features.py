@@ -32,15 +32,20 @@ def detect_corners(gray: Gray, count: int, taken: Pixels | None = None) -> Pixel
     return np.zeros((0, 2)) if corners is None else corners.reshape(-1, 2).astype(np.float64)
 
 
-def track_corners(gray_from: Gray, gray_to: Gray, pixels_from: Pixels, guess_to: Pixels) -> tuple[Pixels, Mask]:
-    """Follow pixels (N, 2) from one image into another, starting at a guess. Bouguet, 2000."""
+def track_corners(
+    gray_from: Gray, gray_to: Gray, pixels_from: Pixels, guess_to: Pixels, levels: int = LK_LEVELS
+) -> tuple[Pixels, Mask]:
+    """Follow pixels (N, 2) from one image into another, starting at a guess. Bouguet, 2000.
+
+    Without `levels` of smaller images they are looked for within the window around the guess alone.
+    """
     if len(pixels_from) == 0:
         return np.zeros((0, 2)), np.zeros(0, bool)
     height, width = gray_to.shape
     inside = (guess_to > -20).all(axis=1) & (guess_to[:, 0] < width + 20) & (guess_to[:, 1] < height + 20)
     start = np.where(inside[:, None], guess_to, pixels_from).astype(np.float32)
     ends, found, _ = cv2.calcOpticalFlowPyrLK(
-        gray_from, gray_to, pixels_from.astype(np.float32), start, winSize=LK_WINDOW, maxLevel=LK_LEVELS,
+        gray_from, gray_to, pixels_from.astype(np.float32), start, winSize=LK_WINDOW, maxLevel=levels,
         criteria=LK_STOP, flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=1e-4,
     )  # fmt: skip
     moved = np.asarray(ends, np.float64)

@@ -18,8 +18,8 @@ from operators.geometry.se3 import Matrix, Vector
 from operators.odometry.camera import RgbdCamera
 from operators.odometry.corners import Corners, Layer, renewed, with_new
 from operators.odometry.drift import carried
-from operators.odometry.features import track_corners, with_exposure_of
 from operators.odometry.fitting import Fit, Fitter, Sighting
+from operators.odometry.following import followed
 from operators.odometry.frame import Frame, observe
 from operators.odometry.keyframe import Keyframe, view_distance
 from operators.odometry.local_map import LocalMap
@@ -122,15 +122,7 @@ class RgbdOdometry:
             return None
         T_color_world = self.camera.T_color_depth @ invert(T_predicted)
         guess = project(transform_points(T_color_world, keyframe.points_world), self._working.K_color)
-        gray = with_exposure_of(keyframe.gray, frame.gray)
-        pixels, found = track_corners(keyframe.gray, gray, keyframe.pixels, guess)
-        return self._fitter.follow(
-            keyframe.points_world[found],
-            pixels[found],
-            keyframe.ages[found],
-            3.0 * self._noise.pixel,
-            self.config.min_inliers,
-        )
+        return followed(frame.gray, keyframe, guess, self._fitter)
 
     @property
     def _fitter(self) -> Fitter:
