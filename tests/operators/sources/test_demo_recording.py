@@ -97,10 +97,11 @@ def test_it_makes_the_same_first_second_to_the_bit_on_such_a_machine(demo: Recor
     there, here = (
         {key: recording.metadata["machine"][key] for key in ("architecture", "cpu")}
         | {name: recording.metadata["packages"][name] for name in COMPUTES}
+        | recording.metadata.get("device", {})  # OPENBLAS_CORETYPE and its like, which choose other kernels
         for recording in (demo, again)
     )
     features, ours = (set(recording.metadata["machine"]["cpu_features"].split()) for recording in (demo, again))
-    if there != here or features != ours:  # what has more instructions uses them, and rounds otherwise
+    if there != here or not features <= ours:
         pytest.skip(f"made elsewhere: with {there} {sorted(features)}, while this is {here} {sorted(ours)}")
     recorded, made = first_second(demo), first_second(again)
     for stream, messages in made.items():
