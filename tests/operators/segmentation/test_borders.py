@@ -69,7 +69,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Segment
     data, plain, out = data_of(folder / "data", 16, 4), folder / "plain.onnx", folder / "finer.onnx"
     task = SegmenterTask(data, (96, 80), width=0.25, variation=GENTLE)  # 96x72 of it are the image
     train(task, Settings(epochs=12, batch=4, learning_rate=5e-3, threads=1, evaluate_every=12), plain)
-    own = Settings(epochs=8, batch=4, learning_rate=4e-3, threads=1, evaluate_every=8)
+    own = Settings(epochs=16, batch=4, learning_rate=4e-3, threads=1, evaluate_every=16)
     outcome = add_second(BorderTask(data, plain, variation=GENTLE), plain, out, own, resume=False, quiet=True)
     assert outcome.best["miou"] > outcome.best["miou_before"]
     return plain, out, data
@@ -201,7 +201,7 @@ def test_it_finds_borders_better_than_the_first_look(files: tuple[Path, Path, Se
             found = segmenter.process(Image(stamp=seed, frame="camera", data=pixels))
             missed += float((found.classes != mask).mean())
         wrong.append(missed / 8)
-    assert wrong[1] < 0.85 * wrong[0]  # 0.77 where training rounds otherwise than on most machines
+    assert wrong[1] < 0.75 * wrong[0]
 
 
 def test_it_repeats_itself_and_confidence_stays(files: tuple[Path, Path, SegmentationData]) -> None:
