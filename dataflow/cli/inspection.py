@@ -117,15 +117,15 @@ def operators(
 
     with friendly_errors():
         find_modules_in(path)
-        found = catalogue.discover()
         if name is None:
+            found = catalogue.discover()
             if json:
                 print_json(found.to_json())
             else:
                 _print_operators(found)
             return
         try:
-            described = catalogue.find(found, name)
+            described = catalogue.look_up(name)
         except LookupError as error:
             raise fail(str(error.args[0])) from None
         if json:

@@ -17,7 +17,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from dataflow.graph.lookup import NotFound, find_operator, is_concrete, offered
+from dataflow.graph.lookup import NotFound, find_operator, is_concrete, lost_exports, offered
 from dataflow.graph.problems import did_you_mean
 from dataflow.operator import InputPort, Operator, OutputPort, is_live, is_source
 from dataflow.sync.stamps import format_duration, parse_duration
@@ -55,9 +55,11 @@ class Catalogue:
         }
 
 
-def discover(packages: Iterable[str] | None = None) -> Catalogue:
+def discover(packages: Iterable[str] | None = None, named: str | None = None) -> Catalogue:
     """Imports the packages (built in and advertised, unless given) with all their modules and lists their operators.
 
+    Of the built-in packages, only what they export is imported: they export all their operators, and their other
+    modules (networks in training, say) take seconds. `named`: the class name of the only operators to list.
     A module that fails is reported in `failures` and the rest still listed. An operator has the path of the module
     that defines it, or of a package above that module which exports it, whichever is shorter.
     """
@@ -66,7 +68,9 @@ def discover(packages: Iterable[str] | None = None) -> Catalogue:
     found: dict[type[Operator], str] = {}
     for root in roots:
         for module in _modules(root, failures):
-            for name, value in offered(module):
+            if root in BUILT_IN and named is None:
+                failures += (Failure(*told) for told in lost_exports(module))
+            for name, value in offered(module, named):
                 if not _is_own(value, root):
                     continue
                 path = f"{module.__name__}:{name}"
@@ -94,8 +98,9 @@ def _modules(root: str, failures: list[Failure]) -> Iterator[Any]:
     if package is None:
         return
     yield package
+    built_in = root.partition(".")[0] in BUILT_IN
     for info in pkgutil.iter_modules(getattr(package, "__path__", [])):
-        if info.name != "__main__":
+        if info.ispkg or not (built_in or info.name == "__main__"):
             yield from _modules(f"{root}.{info.name}", failures)
 
 
@@ -130,6 +135,14 @@ class Described:
             "outputs": [_output(port) for port in spec.outputs.values()],
             "params": [dict(row) for row in parameters(cls)],
         }
+
+
+def look_up(name: str) -> Described:
+    """The operator of an import path or of a class name, as `find`; as few modules are imported as will do."""
+    if ":" in name:
+        return find(Catalogue({}), name)
+    found = discover(named=name)
+    return find(found if found.operators else discover(), name)
 
 
 def find(catalogue: Catalogue, name: str) -> Described:

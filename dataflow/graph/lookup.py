@@ -85,13 +85,27 @@ def operator_names(module: ModuleType) -> list[str]:
     return [name for name, value in offered(module) if is_concrete(value)]
 
 
-def offered(module: ModuleType) -> Iterator[tuple[str, type[Operator]]]:
-    """Yields the operators that a module offers by name, also what it imports only when it is asked."""
+def offered(module: ModuleType, named: str | None = None) -> Iterator[tuple[str, type[Operator]]]:
+    """Yields the operators that a module offers by name, also what it imports only when it is asked.
+
+    `named`: the only name of interest; nothing is imported for another.
+    """
     for name in dir(module):
+        if named not in (None, name):
+            continue
         with contextlib.suppress(Exception, SystemExit):  # one that fails to import is named when its module is
             value = getattr(module, name)
             if isinstance(value, type) and issubclass(value, Operator) and not name.startswith("_"):
                 yield name, value
+
+
+def lost_exports(module: ModuleType) -> Iterator[tuple[str, str]]:
+    """Yields what a module exports (`module:name`) and fails to import, and why."""
+    for name in getattr(module, "__all__", ()):
+        try:
+            getattr(module, name)
+        except (Exception, SystemExit) as error:
+            yield f"{module.__name__}:{name}", f"{type(error).__name__}: {error}"
 
 
 def is_concrete(cls: type[Operator]) -> bool:

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.messages.geometry import quaternion_to_matrix
+from operators.chi_square import quantile
 from operators.fusion.error_state import log_rotation
 
 Array = NDArray[np.float64]
@@ -49,7 +49,7 @@ def normalised(error: Array, covariance: Array, axes: Sequence[int]) -> tuple[fl
 
 def band(freedom: int) -> tuple[float, float]:
     """Returns the limits between which the mean of an honest normalised error lies with 95 %, over its freedom."""
-    low, high = chi2.ppf([0.025, 0.975], freedom) / freedom
+    low, high = quantile([0.025, 0.975], freedom) / freedom
     return float(low), float(high)
 
 

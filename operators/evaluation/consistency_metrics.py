@@ -6,11 +6,11 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from dataflow.messages import Diagnostics, Odometry, Pose
 from dataflow.operator import Batch, Duration, In, Operator, Param, Sampled
 from operators.association import mutually_nearest
+from operators.chi_square import quantile
 from operators.evaluation.consistency import (
     Innovations,
     band,
@@ -129,7 +129,7 @@ class ConsistencyMetrics(Operator):
         ratio = found / freedom
         self._figures[f"{name}_nees_mean"] = float(ratio.mean())
         self._figures[f"{name}_nees_median"] = float(np.median(ratio))
-        self._figures[f"{name}_above_95_percent"] = float((found > chi2.ppf(0.95, freedom)).mean() * 100)
+        self._figures[f"{name}_above_95_percent"] = float((found > quantile(0.95, freedom)).mean() * 100)
         chosen: list[int] = []
         for k, stamp in enumerate(times):
             if not chosen or stamp - times[chosen[-1]] >= self.apart:

@@ -9,11 +9,11 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from dataflow.messages import Diagnostics, Image, Number, Odometry, Pose
 from dataflow.messages.geometry import invert, matrix_to_quaternion
 from dataflow.operator import Batch, Duration, In, Operator, Out, Param, Sampled
+from operators.chi_square import quantile
 from operators.evaluation.charts import Curve, chart, plan, tiled
 from operators.evaluation.consistency import Innovations, covariance_of, innovations, normalised, pose_error
 
@@ -160,7 +160,7 @@ class TrajectoryPlots(Operator):
             errors.append(Curve("3 sigma", seconds, spread, limit=True))
         nees = [_curve(part, rows, begin) for part, rows in self._nees.items() if rows]
         nis = [_curve(sensor, rows, begin) for sensor, rows in sorted(self._nis.items())]
-        bound = float(chi2.ppf(0.95, 3)) / 3
+        bound = float(quantile(0.95, 3)) / 3
         size, ends = self.size, np.array([0.0, float(seconds[-1])])
         charts = [
             plan("from above, m", tracks, size),

@@ -15,8 +15,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
+from operators.chi_square import quantile
 from operators.fusion.error_state import GYRO_BIAS, POSITION, ROTATION, VELOCITY, State
 
 Array = NDArray[np.float64]
@@ -81,8 +81,8 @@ class Health:
 
 @lru_cache(maxsize=64)
 def threshold(share: float, freedom: int) -> float:
-    """Returns the quantile of chi-square, as `scipy.stats.chi2.ppf`, which takes a second to import."""
-    return float(2 * gammaincinv(freedom / 2, share))
+    """Returns the quantile of chi-square, remembered: the same few are asked for at each measurement."""
+    return float(quantile(share, freedom))
 
 
 def judge(

@@ -1,5 +1,12 @@
 """Localisation in a known map."""
 
-from operators.localization.localizer import ParticleFilterLocalizer
+from typing import TYPE_CHECKING
+
+from dataflow.lazy import lazily
+
+if TYPE_CHECKING:
+    from operators.localization.localizer import ParticleFilterLocalizer
+else:
+    __getattr__, __dir__ = lazily(__name__, {"localizer": ("ParticleFilterLocalizer",)})
 
 __all__ = ["ParticleFilterLocalizer"]

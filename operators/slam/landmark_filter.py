@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
+
+from operators.chi_square import quantile
 
 Array = NDArray[np.float64]
 _FIRST = 3
@@ -43,11 +44,11 @@ class Association:
 
     @property
     def gate_distance(self) -> float:
-        return float(chi2.ppf(self.gate, 2))
+        return float(quantile(self.gate, 2))
 
     @property
     def new_distance(self) -> float:
-        return float(chi2.ppf(self.new, 2))
+        return float(quantile(self.new, 2))
 
 
 @dataclass

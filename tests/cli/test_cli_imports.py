@@ -128,3 +128,32 @@ def test_looking_at_a_recording_imports_none_of_its_modules(made: tuple[Path, Pa
         assert told.returncode == 0, told.stderr
         assert "imported" not in told.stderr
     assert saved.is_file()
+
+
+LOADED = """\
+import contextlib, sys
+from dataflow.cli.app import call
+with contextlib.suppress(SystemExit):
+    call()
+print(*sys.modules, file=sys.stderr)
+"""
+
+
+@pytest.mark.parametrize("name", ["CloudBuilder", "EkfFusion", "operators.evaluation:ConsistencyMetrics", ""])
+def test_describing_operators_loads_no_large_library(tmp_path: Path, name: str) -> None:
+    package = Path(__file__).resolve().parents[2]
+    told = subprocess.run(
+        [sys.executable, "-P", "-c", LOADED, "operators", *name.split()],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(package)},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    loaded = set(told.stderr.split())
+
+    assert name.rpartition(":")[2] in told.stdout
+    assert loaded & {"torch", "torchvision", "onnxruntime", "scipy.stats", "pandas", "open3d"} == set()
+    if name == "CloudBuilder":
+        assert "operators.cloud.cloud_builder" in loaded
+        assert loaded & {"operators.cloud.clusterer", "operators.slam.lidar_slam", "scipy.spatial"} == set()

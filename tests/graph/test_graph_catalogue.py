@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import io
 import json
+import pkgutil
+import sys
 from pathlib import Path
 
 import graph_operators
 import pytest
 from rich.console import Console, RenderableType
 
-from dataflow.graph.catalogue import Described, discover, find, page, parameters, table
+from dataflow.graph.catalogue import BUILT_IN, Described, discover, find, look_up, page, parameters, table
+from dataflow.graph.lookup import is_concrete
+from dataflow.operator import Operator
 
 
 def shown(renderable: RenderableType) -> str:
@@ -103,6 +109,41 @@ def test_details_show_everything_declared() -> None:
     text = shown(page(Described("graph_operators:Detector", graph_operators.Detector)))
     assert "must be given" in text
     assert "list[str]" in text
+
+
+def test_one_operator_is_looked_up_by_name_or_path_with_the_errors_of_the_whole_catalogue() -> None:
+    assert look_up("CloudBuilder").use == "operators.cloud:CloudBuilder"
+    assert look_up("graph_operators:CloudBuilder").operator is graph_operators.CloudBuilder
+    with pytest.raises(LookupError, match="no operator 'CloudBilder': did you mean 'CloudBuilder'"):
+        look_up("CloudBilder")
+    assert list(discover(["graph_operators"], "Fuse").operators) == ["graph_operators:Fuse"]
+
+
+def test_the_built_in_packages_export_all_their_operators() -> None:
+    """Only what they export is listed, so that their other modules need not be imported."""
+    for module in pkgutil.walk_packages(importlib.import_module("operators").__path__, "operators."):
+        with contextlib.suppress(ImportError):  # an optional package is missing
+            importlib.import_module(module.name)
+    made = [Operator]
+    for cls in made:
+        made += cls.__subclasses__()
+    own = {cls for cls in made if is_concrete(cls) and cls.__module__.startswith("operators.")}
+
+    catalogue = discover(BUILT_IN)
+
+    assert {cls for cls in own if not cls.__name__.startswith("_")} == set(catalogue.operators.values())
+    assert len(own) > 80
+
+
+def test_an_export_that_fails_to_import_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "operators.cloud.cloud_filter", None)
+    monkeypatch.delattr("operators.cloud.CloudFilter", raising=False)
+
+    (failure,) = discover(BUILT_IN).failures
+
+    assert str(failure).startswith("operators.cloud:CloudFilter: ModuleNotFoundError")
+    with pytest.raises(LookupError, match=r"no operator 'CloudFilter'.*failed to import operators.cloud:CloudFilter"):
+        look_up("CloudFilter")
 
 
 def test_the_installed_catalogue_is_json() -> None:
