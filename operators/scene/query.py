@@ -14,6 +14,29 @@ from operators.scene.map_surface import SURFACES
 from operators.scene.relations import FLOOR, INVERSES, PREDICATES, ROBOT, ROOM
 
 _ANY = ("anything", "something", "thing", "*")
+_PHRASES = {p.replace("_", " "): p for p in (*PREDICATES, *INVERSES)}
+_MEANT = {
+    "inside": "in",
+    "within": "in",
+    "on top of": "on",
+    "upon": "on",
+    "over": "above",
+    "below": "under",
+    "beneath": "under",
+    "underneath": "under",
+    "beside": "near",
+    "next to": "near",
+    "close to": "near",
+    "by": "near",
+    "before": "in front of",
+    "in back of": "behind",
+    "after": "behind",
+    "carrying": "holding",
+    "seated on": "sitting on",
+    "looking at": "facing",
+    "going to": "heads for",
+}
+"""Relations as people call them, with the one that is nearest in meaning: what an error proposes."""
 _LAYERS = {ROOM: "room", FLOOR: "surface", ROBOT: "robot"}
 
 
@@ -44,14 +67,11 @@ def parse(text: str, classes: Sequence[str]) -> tuple[str, list[Clause]]:
     on a table and near a person.
 
     A class may be `anything`, or name a node with its number, as `table 3`; `not on table` asks for none. Relations are
-    written with blanks or `_`. Raises QueryError.
+    written with blanks or `_`. Raises QueryError, which proposes the relation nearest in meaning or spelling.
     """
     words = re.findall(r"[\w*-]+", text.lower().replace("_", " "))
     if not words:
         raise QueryError("the question is empty; ask for something like: mug on table near person")
-    phrases = sorted(
-        ((tuple(p.replace("_", " ").split()), p) for p in (*PREDICATES, *INVERSES)), key=lambda row: -len(row[0])
-    )
     subject, k = _noun(words, 0, classes)
     clauses = []
     while k < len(words):
@@ -60,20 +80,28 @@ def parse(text: str, classes: Sequence[str]) -> tuple[str, list[Clause]]:
             continue
         wanted = words[k] != "not"
         k += not wanted
-        found = next(((len(p), name) for p, name in phrases if tuple(words[k : k + len(p)]) == p), None)
-        if found is None:
-            heard = words[k] if k < len(words) else "nothing"
-            near = difflib.get_close_matches(heard, [" ".join(p) for p, _ in phrases], 1)
-            hint = (
-                f"; did you mean {near[0]!r}?" if near else f"; there are {', '.join(' '.join(p) for p, _ in phrases)}"
-            )
-            raise QueryError(f"{heard!r} is no relation{hint}")
-        k += found[0]
+        phrase = _relation(words[k:])
+        k += len(phrase.split())
         while k < len(words) and words[k] in ("a", "an", "the", "of"):
             k += 1
         object, k = _noun(words, k, classes)
-        clauses.append(Clause(found[1], object, wanted))
+        clauses.append(Clause(_PHRASES[phrase], object, wanted))
     return subject, clauses
+
+
+def _relation(words: Sequence[str]) -> str:
+    """Returns the relation that the words begin with, the longest that does. Raises QueryError."""
+    begun = [p for p in (*_PHRASES, *_MEANT) if list(words[: len(p.split())]) == p.split()]
+    longest = max(begun, key=len, default="")
+    if longest in _PHRASES:
+        return longest
+    known = f"there are {', '.join(sorted(_PHRASES))}"
+    if not words:
+        raise QueryError(f"the question ends where a relation should be named; {known}")
+    heard = longest or words[0]
+    near = difflib.get_close_matches(heard, (*_PHRASES, *_MEANT), 1)
+    hint = f"did you mean {_MEANT.get(near[0], near[0])!r}? " if near else ""
+    raise QueryError(f"{heard!r} is no relation; {hint}{known}")
 
 
 def _noun(words: Sequence[str], k: int, classes: Sequence[str]) -> tuple[str, int]:

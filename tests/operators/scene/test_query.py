@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from dataflow.messages import SceneGraph
 from dataflow.recording import RecordingWriter
 from operators.scene.commands import scene
-from operators.scene.query import Clause, QueryError, as_json, ask, parse
+from operators.scene.query import _MEANT, _PHRASES, Clause, QueryError, as_json, ask, parse
 from operators.scene.spark import as_spark_dsg
 
 NAMES = ("mug", "table", "person", "floor", "room")
@@ -74,7 +74,18 @@ def test_relations_of_several_words_are_understood() -> None:
     ("question", "words"),
     [
         ("mugg on table", "did you mean 'mug'"),
-        ("mug nearr table", "did you mean 'near'"),
+        ("mug nearr table", "'nearr' is no relation; did you mean 'near'"),
+        ("mug insde table", "'insde' is no relation; did you mean 'in'"),
+        ("mug inside table", "did you mean 'in'"),
+        ("mug on top of table", "'on top of' is no relation; did you mean 'on'"),
+        ("mug ontop of table", "did you mean 'on'"),
+        ("mug besides table", "did you mean 'near'"),
+        ("mug below table", "did you mean 'under'"),
+        ("mug undr table", "did you mean 'under'"),
+        ("mug left table", "did you mean 'left of'"),
+        ("mug nearr table", "there are above, approaching, behind, facing, heads for"),
+        ("mug xyzzy table", "'xyzzy' is no relation; there are above"),
+        ("mug not", "ends where a relation should be named; there are above"),
         ("mug on", "ends where a thing should be named"),
         ("", "the question is empty"),
     ],
@@ -82,6 +93,11 @@ def test_relations_of_several_words_are_understood() -> None:
 def test_what_is_not_understood_is_named(question: str, words: str) -> None:
     with pytest.raises(QueryError, match=words):
         ask(graph(), question)
+
+
+def test_what_is_proposed_is_a_relation_and_no_relation_is_called_something_else() -> None:
+    assert set(_MEANT.values()) <= set(_PHRASES)
+    assert not set(_MEANT) & set(_PHRASES)
 
 
 def test_the_graph_as_json_names_layers_and_scores() -> None:
