@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from dataflow.cli import completion
 from dataflow.cli.arguments import FLAG
-from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, wants_traceback
+from dataflow.cli.output import COULD_NOT_RUN, TRACEBACK, err, fail, interrupted_by_user, wants_traceback
 from dataflow.cli.plugins import CommandGroup, renamed
 from dataflow.cli.standard_output import OutputFailed
 
@@ -82,6 +82,8 @@ def call() -> None:
     except OutputFailed:
         raise
     except Exception as error:  # a fault of ours, or of a plug-in
+        if interrupted_by_user(error):
+            raise KeyboardInterrupt from None
         if wants_traceback():
             err.print(escape(traceback.format_exc().rstrip()), soft_wrap=True)
             fail(f"internal error: {type(error).__name__}: {error}")

@@ -108,8 +108,8 @@ def execute(
     try:
         with attached_viewer(outputs.live_view), shown(err, display, quiet=quiet) as watch:
             report = start(watch)
-    except RunFailed:
-        _say_what_is_left(before)
+    except RunFailed as failure:
+        _say_what_is_left(before, "end" if failure.interrupted else "failure")
         raise
     if json:
         print_json({**report_json(report), "total_s": time.monotonic() - began})
@@ -127,8 +127,8 @@ def _written(file: Path) -> tuple[int, int] | None:
     return (found.st_ino, found.st_mtime_ns) if file.exists() and (found := file.stat()) else None
 
 
-def _say_what_is_left(before: dict[Path, tuple[int, int] | None]) -> None:
-    """After a failure: which files hold what came before it, other than those that were there already."""
+def _say_what_is_left(before: dict[Path, tuple[int, int] | None], end: str) -> None:
+    """After an `end` out of turn: which files hold what came before it, other than those that were there already."""
     for file, earlier in before.items():
         if file.exists() and _written(file) != earlier:
-            say(f"[dim]{escape(str(file))} ({size(file.stat().st_size)}) holds what came before the failure[/]")
+            say(f"[dim]{escape(str(file))} ({size(file.stat().st_size)}) holds what came before the {end}[/]")

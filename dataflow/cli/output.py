@@ -99,7 +99,7 @@ def say(text: str) -> None:
 
 def fail(message: str, *, details: str = "", code: int = COULD_NOT_RUN) -> typer.Exit:
     """Prints an error; the caller raises what it returns."""
-    say(f"[bold red]error:[/] {escape(message)}")
+    say(escape(message) if code == INTERRUPTED else f"[bold red]error:[/] {escape(message)}")
     if details.strip():
         err.print(f"[dim]{escape(details.rstrip())}[/]", soft_wrap=True)
     return typer.Exit(code)
@@ -121,6 +121,8 @@ def friendly_errors() -> Iterator[None]:
     try:
         yield
     except Exception as error:
+        if interrupted_by_user(error):
+            raise KeyboardInterrupt from None
         explained = _explained(error)
         if explained is None:
             raise
@@ -131,6 +133,13 @@ def friendly_errors() -> Iterator[None]:
             err.print(escape(message[1:]), soft_wrap=True)
             raise typer.Exit(code) from None
         raise fail(message, details=details, code=code) from None
+
+
+def interrupted_by_user(error: BaseException | None) -> bool:
+    """Tells whether an error is what Python or a library has made of Ctrl-C."""
+    return error is not None and (
+        isinstance(error, KeyboardInterrupt) or interrupted_by_user(error.__cause__ or error.__context__)
+    )
 
 
 def _explained(error: Exception) -> tuple[str, str, int] | None:

@@ -28,12 +28,13 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
     """
     title = Text.assemble(
         (report.graph, "bold"),
-        ("  interrupted", "yellow") if report.interrupted else ("  complete", "green"),
+        _outcome(report),
         f"  {timing(report)}",
         "" if total is None else f"; {seconds(total)} with start and end",
     )
     console.print(title)
-    console.print(_operators(report))
+    if report.wall:
+        console.print(_operators(report))
     blocks = [
         Group(Text(operator, style="bold"), Padding(_figures(summary), (0, 0, 1, 2), expand=False))
         for operator, summary in report.summaries.items()
@@ -53,6 +54,13 @@ def print_report(console: Console, report: RunReport, *, total: float | None = N
             console.print(Text(line), soft_wrap=True)
             if facts.get("failed"):
                 console.print(Text(f"  {plural(facts['failed'], 'message')} could not be drawn", style="yellow"))
+
+
+def _outcome(report: RunReport) -> tuple[str, str]:
+    """The outcome in words, and the style of them."""
+    if not report.interrupted:
+        return "  complete", "green"
+    return "  interrupted" if report.wall else "  interrupted while starting", "yellow"
 
 
 def _operators(report: RunReport) -> Table:

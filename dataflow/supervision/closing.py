@@ -1,7 +1,8 @@
 """The end of a run: first the processes with operators leave, then the recorder and the like, then nobody is left.
 
-The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run ended only when
-nothing can go wrong with the others any more. Every step is bounded; who is late is killed.
+A run that is stopped while it starts has nothing to drain: whoever is still busy with starting is killed soon, which is
+no failure. The sinks leave last: processes hand over firing records when they leave, and a sink is told how the run
+ended only when nothing can go wrong with the others any more. Every step is bounded; who is late is killed.
 """
 
 from __future__ import annotations
@@ -76,7 +77,7 @@ class Closing:
         leaving = self._leaving(sinks=self._stage.sinks)
         late = self.run.steady > self._stage.deadline
         ahead = notice(self._time_for(sinks=self._stage.sinks))
-        if self.failure is None and self.run.steady > self._stage.deadline - ahead:
+        if self._has_run and self.failure is None and self.run.steady > self._stage.deadline - ahead:
             self._asking.ask(leaving, self._stage.deadline)
         if leaving and late:
             self._give_up_on(leaving)
@@ -86,13 +87,18 @@ class Closing:
                 self._hand_over()
             self._stage = self._begin(sinks=True)
 
+    @property
+    def _has_run(self) -> bool:
+        """Tells whether sources were released, so that there may be something to drain and to write."""
+        return self.run.release is not None
+
     def _leaving(self, *, sinks: bool) -> list[Supervised]:
         return [p for p in self.run.processes.values() if p.is_sink == sinks and p.reachable]
 
     def _time_for(self, *, sinks: bool) -> float:
         if self._at_once:
             return LEAVE_AT_ONCE if sinks else LEAVE_AT_ONCE / 2
-        if self.failure is not None:
+        if self.failure is not None or not self._has_run:
             return LEAVE_TIMEOUT if sinks else LEAVE_TIMEOUT / 2
         return bounded(self.run.plan.stall_timeout)
 
@@ -110,8 +116,10 @@ class Closing:
         return _Stage(sinks, run.steady + self._time_for(sinks=sinks))
 
     def _give_up_on(self, late: list[Supervised]) -> None:
-        if self.failure is None:
-            names = "; ".join(p.describe() for p in late)
+        names = "; ".join(p.describe() for p in late)
+        if self.failure is None and not self._has_run and not self._stage.sinks:
+            self.run.note(f"still starting, and killed: {names}")
+        elif self.failure is None:
             timeout = self._time_for(sinks=self._stage.sinks)
             self.failure = RunFailed(f"did not close within {timeout:g} s: {names}", self.run.last_words(late))
         for process in late:

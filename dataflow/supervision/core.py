@@ -161,7 +161,8 @@ class Core:
             if self._stops > 1:
                 self._closing.hurry()
         elif self.run.phase is Phase.STARTING:
-            raise RunFailed("interrupted while starting", interrupted=True)
+            self._interrupted = True
+            self._close(None)
         elif self._stops > 1:
             raise RunFailed("stopped before everything was drained", interrupted=True)
         else:

@@ -11,8 +11,10 @@ from dataflow.sync import FOREVER, NEVER
 
 
 def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport:
-    """Returns the report of a run that was released; `ended_at` is when everything was drained (steady s)."""
-    assert run.release is not None
+    """Returns the report of a run; `ended_at` is when everything was drained (steady s).
+
+    One that was interrupted while starting has done nothing, for 0 s.
+    """
     status = run.status
     reports = {p.label: p.report or {} for p in run.processes.values()}
     streams = {s: (n, d) for r in reports.values() for s, (n, d) in r.get("streams", {}).items()}
@@ -31,7 +33,7 @@ def report_of(run: RunState, ended_at: float, *, interrupted: bool) -> RunReport
         files={p.label: p.facts for p in run.processes.values() if p.is_sink},
         first=status.first,
         last=max(reached, default=None),
-        wall=ended_at - run.release.at.steady,
+        wall=0.0 if run.release is None else ended_at - run.release.at.steady,
         interrupted=interrupted,
         notes=tuple(status.notes),
         restarts=dict(status.restarts),

@@ -270,6 +270,14 @@ def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkey
         assert ("Traceback" in capsys.readouterr().err) == (asked == "1")
 
 
+def test_an_interruption_is_no_error(capsys) -> None:
+    with pytest.raises(typer.Exit) as ended, friendly_errors():
+        raise RunFailed("stopped before everything was drained", interrupted=True)
+
+    assert ended.value.exit_code == 130
+    assert capsys.readouterr().err == "stopped before everything was drained\n"
+
+
 def test_a_start_says_which_processes_it_waits_for() -> None:
     status = Status(waiting=("camera", "cloud", "detector", "odometry", "@recorder"))
     console = Console(file=io.StringIO(), width=100)

@@ -8,12 +8,16 @@ import signal
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
 
 from dataflow.cli.main import app
+from dataflow.recording import Recording
+
+PACKAGE = Path(__file__).resolve().parents[2]
 
 ZSTD = b"\x28\xb5\x2f\xfd"
 """What a compressed chunk begins with."""
@@ -225,6 +229,60 @@ def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -
     assert running.returncode == 130
     assert "small  interrupted" in stdout
     assert f"wrote {path}" in stdout
+
+
+SLOW = """\
+import time
+from pathlib import Path
+
+from dataflow.messages import FeatureVector
+from dataflow.operator import In, Operator
+
+
+class Slow(Operator):
+    x: In[FeatureVector]
+
+    def setup(self):
+        Path("begun").touch()
+        time.sleep(100)
+
+    def process(self, x):
+        pass
+"""
+
+
+def test_ctrl_c_while_the_graph_starts_is_a_stop_and_no_failure(tmp_path: Path) -> None:
+    (tmp_path / "slow_setup.py").write_text(SLOW)
+    (tmp_path / "slow.yaml").write_text(
+        "graph: slow\noperators:\n  left: {use: 'runtime_operators:Counter'}\n"
+        "  last: {use: 'slow_setup:Slow', inputs: {x: left/fast}}\n"
+    )
+    running = subprocess.Popen(
+        [sys.executable, "-m", "dataflow.cli.main", "run", "slow.yaml", "--record", "run.mcap"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(PACKAGE), str(PACKAGE / "tests" / "runtime")])},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        deadline = time.monotonic() + 60
+        while not (tmp_path / "begun").exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        running.send_signal(signal.SIGINT)
+        stdout, stderr = running.communicate(timeout=60)
+    finally:
+        running.kill()
+
+    assert running.returncode == 130
+    assert "slow  interrupted while starting" in stdout
+    assert "still starting, and killed: process 'last'" in stdout
+    assert "wrote run.mcap (0 messages" in stdout
+    assert "error" not in stderr
+    assert "fail" not in stdout + stderr
+    with Recording(tmp_path / "run.mcap") as recording:
+        assert not recording.torn
+        assert recording.metadata["dataflow:outcome"]["outcome"] == "interrupted"
 
 
 def test_the_saved_view_is_opened_where_there_is_a_display_and_else_said_so(

@@ -13,6 +13,7 @@ import pytest
 from rich.text import Text
 
 from dataflow.cli import output
+from dataflow.cli.app import call
 from dataflow.cli.output import print_json
 
 PACKAGE = Path(__file__).resolve().parents[2]
@@ -55,6 +56,21 @@ def test_ctrl_c_while_something_is_imported_is_no_error(small: Path, module: str
     assert told.returncode == 130
     assert "Traceback" not in told.stderr
     assert told.stdout == ""
+
+
+def test_ctrl_c_that_a_library_has_wrapped_into_an_error_is_none(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    def interrupted() -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as pressed:
+            raise RuntimeError("Error calling __set_name__") from pressed  # as Python 3.11 does
+
+    monkeypatch.setattr("dataflow.cli.app.app", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        call()
+    with pytest.raises(KeyboardInterrupt), output.friendly_errors():
+        interrupted()
+    assert capsys.readouterr().err == ""
 
 
 def test_a_closed_output_is_refused(small: Path, tmp_path: Path) -> None:

@@ -216,6 +216,61 @@ def test_ctrl_c_drains_and_a_second_one_does_not_wait() -> None:
     assert play.over.failure.interrupted
 
 
+def test_ctrl_c_while_starting_is_an_orderly_end_of_a_run_that_did_nothing() -> None:
+    play = Play(record="run.mcap")
+    play.deaf.add("sum")  # it is being set up
+    play.tell(Begin(), Said("sum", "joined", {}))
+    play.stops()
+    play.deaf.discard("sum")
+    play.tell(Said("sum", "closed", {"facts": {}}))
+    play.dies("sum", 0)
+    over = play.wait(1.0) and play.over
+
+    assert over is not None
+    assert over.report is not None
+    assert (over.report.interrupted, over.report.wall, over.report.streams) == (True, 0.0, {})
+    assert [fields["outcome"] for _, fields in sent(play.commands, "leave")] == ["interrupted"] * 3
+    assert sent(play.commands, "go") == []
+    assert killed(play.commands) == []
+
+
+def test_a_process_that_is_still_starting_at_ctrl_c_is_killed_soon_and_that_is_no_failure() -> None:
+    play = Play(record="run.mcap")
+    play.deaf.add("sum")
+    play.tell(Begin(), Said("sum", "joined", {}))
+    play.stops()
+    play.wait(7.0)
+
+    assert killed(play.commands) == ["sum"]
+    assert asked_where(play.commands) == []
+    assert play.over is not None
+    assert play.over.report is not None
+    assert play.over.report.interrupted
+    assert play.over.report.notes == ("still starting, and killed: process 'sum'",)
+    assert sent(play.commands, "leave")[-1][1]["outcome"] == "interrupted"
+
+
+def test_a_recorder_that_does_not_close_after_ctrl_c_while_starting_is_a_failure() -> None:
+    play = Play(record="run.mcap")
+    play.deaf.add("@recorder")
+    play.begins()
+    play.stops()
+    play.wait(20.0)
+
+    assert "did not close within 10 s: process '@recorder'" in play.failure()
+
+
+def test_a_second_ctrl_c_while_starting_does_not_wait() -> None:
+    play = Play()
+    play.deaf.add("sum")
+    play.begins()
+    play.stops()
+    play.stops()
+    play.wait(2.0)
+
+    assert play.failure() == "stopped before everything was closed"
+
+
 def test_a_run_that_always_finds_more_to_do_ends_in_time_and_says_what_it_owed() -> None:
     play = Play(stall_timeout=30.0).starts()
     play.tell(play.progress("left", {"left": 1_800_000_000}))
