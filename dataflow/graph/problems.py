@@ -20,18 +20,24 @@ MAX_CHOICES = 2_000
 """Words that a wrong one is compared with."""
 MAX_WORD = 200
 """Characters of a word that is compared."""
+SETTINGS = "--set"
+"""The file that the `--set` words of the command line are the lines of."""
 LISTED = 50
 """Words that are listed where none is near."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Place:
-    """A span of one source line: 1-based line and column, width in characters."""
+    """A span of one source line: 1-based line and column, width in characters.
+
+    `given`: where a value was given that stands here because of a `${}`.
+    """
 
     file: str
     line: int
     column: int
     width: int = 1
+    given: Place | None = field(default=None, compare=False, repr=False)
 
     def __str__(self) -> str:
         return f"{self.file}:{self.line}:{self.column}"
@@ -100,6 +106,11 @@ class Problems:
     found: list[Problem] = field(default_factory=list)
 
     def add(self, place: Place, message: str, hint: str = "", related: Iterable[tuple[Place, str]] = ()) -> None:
+        """Adds a fault at a place; that of a value which `--set` has given is there, whatever stands for it."""
+        if place.given is not None and place.given.file == SETTINGS:
+            place, related = place.given, [(place, "stands for it here"), *related]
+        elif place.given is not None:
+            related = [(place.given, "given here"), *related]
         lines = self.texts.get(place.file, ())
         source = lines[place.line - 1] if 0 < place.line <= len(lines) else ""
         where = (place.file, place.line, place.column)

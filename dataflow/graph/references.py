@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from dataflow.graph.limits import MAX_NESTING, NESTED_TOO_DEEP, Budget
 from dataflow.graph.problems import Place, Problems
@@ -54,13 +54,16 @@ def substitute(tree: Tree, lookup: Lookup, problems: Problems, budget: Budget, d
     whole = REFERENCE.fullmatch(tree.value)
     if whole is None:
         return _interpolated(tree, tree.value, lookup, problems, budget)
-    value = lookup(_reference(whole[0], tree.place, problems))
+    reference = _reference(whole[0], tree.place, problems)
+    value = lookup(reference)
     if value is None:
         return Leaf(UNKNOWN, tree.place, tree.raw)
     values, levels = measured(value)
     budget.charge(tree.place, values)
     if depth + levels - 1 > MAX_NESTING:
         problems.stop(tree.place, NESTED_TOO_DEEP)
+    if isinstance(value, Leaf) and value.place == reference.place:  # a default or a variable: it was given here
+        return replace(value, place=tree.place)
     return moved(value, tree.place)
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from dataflow.graph import document
-from dataflow.graph.problems import Place, Problems
+from dataflow.graph.problems import SETTINGS, Place, Problems
 from dataflow.graph.tree import UNKNOWN, Entry, Leaf, Table, Tree
 
 
@@ -23,23 +23,22 @@ class Setting:
 
 def read_settings(words: Sequence[str], problems: Problems) -> list[Setting]:
     """`operator.param=value` and `param=value` words; values are YAML. Faults stand in the file `--set`."""
-    file = "--set"
     lines = list(words)
     if lines:
-        problems.texts[file] = lines
+        problems.texts[SETTINGS] = lines
     settings = []
     for index, word in enumerate(words):
         name, equals, text = word.partition("=")
-        place = Place(file, index + 1, 1, max(1, len(name)))
+        place = Place(SETTINGS, index + 1, 1, max(1, len(name)))
         *owner, last = name.strip().split(".") if "." in name else ("", name.strip())
         if not equals or not last:
             hint = "write operator.param=value, or param=value for the graph's own"
             problems.add(place, f"{word!r} sets nothing", hint)
             continue
         padded = "\n" * index + " " * (len(name) + 1) + text
-        value = document.parse(padded, file, problems, lines)
+        value = document.parse(padded, SETTINGS, problems, lines)
         if value is None:
-            value = Leaf(None, place) if not any(p.file == file for p in problems.found) else Leaf(UNKNOWN, place)
+            value = Leaf(None, place) if not any(p.file == SETTINGS for p in problems.found) else Leaf(UNKNOWN, place)
         head, *inner = owner
         settings.append(Setting(head, (*inner, last), value, place))
     return settings

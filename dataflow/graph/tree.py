@@ -72,15 +72,16 @@ def at(tree: Tree, path: tuple[str | int, ...]) -> Tree:
 
 
 def moved(tree: Tree, place: Place) -> Tree:
-    """The tree as if all of it stood at `place`."""
+    """The tree as if all of it stood at `place`, which then tells where each value was given."""
+    here = replace(place, given=tree.place.given or tree.place)
     match tree:
         case Leaf():
-            return replace(tree, place=place)
+            return replace(tree, place=here)
         case Items():
-            return Items(tuple(moved(item, place) for item in tree.items), place)
+            return Items(tuple(moved(item, place) for item in tree.items), here)
         case Table():
             return Table(
-                {k: Entry(replace(e.key, place=place), moved(e.value, place)) for k, e in tree.entries.items()}, place
+                {k: Entry(replace(e.key, place=here), moved(e.value, place)) for k, e in tree.entries.items()}, here
             )
 
 

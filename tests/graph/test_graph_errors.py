@@ -519,6 +519,55 @@ def test_fault_of_a_setting_is_shown_in_its_own_words(setting: str, said: str, h
     assert problem.source == setting
 
 
+GIVEN = """\
+graph: g
+params: {rate: 30, limit: 2, both: "${rate}"}
+threads: ${limit}
+operators:
+  camera: {use: "graph_operators:Camera", params: {rate: "${both}"}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("setting", "message", "column", "used"),
+    [
+        ("rate=-3", "camera: parameter 'rate': input should be greater than 0, got -3", 6, "graph.yaml:5:58"),
+        ("both=fast", "camera: parameter 'rate': input should be a valid number, got fast", 6, "graph.yaml:5:58"),
+        ("limit=none", "threads must be a whole number from 1 to 256, not the text 'none'", 7, "graph.yaml:3:10"),
+    ],
+)
+def test_fault_of_a_value_that_a_setting_gives_the_graph_is_shown_where_it_was_given(
+    setting: str, message: str, column: int, used: str
+) -> None:
+    (problem,) = problems(GIVEN, settings=[setting])
+
+    assert (problem.file, problem.line, problem.column, problem.message) == ("--set", 1, column, message)
+    assert problem.source == setting
+    assert [(str(place), word) for place, word in problem.related] == [(used, "stands for it here")]
+
+
+def test_fault_of_a_text_with_a_setting_in_it_stays_where_the_text_is() -> None:
+    text = 'graph: g\nparams: {part: a}\noperators:\n  camera: {use: "${part}_operators:Camra"}\n'
+    (problem,) = problems(text, settings=["part=graph"])
+
+    assert str(problem).startswith("graph.yaml:4:17: module 'graph_operators' has no operator 'Camra'")
+
+
+def test_fault_of_a_graph_parameter_tells_where_its_value_is_given() -> None:
+    text = GIVEN.replace("rate: 30", "rate: -3")
+    (problem,) = problems(text)
+
+    assert (problem.line, problem.column) == (5, 58)
+    assert [(str(place), word) for place, word in problem.related] == [("graph.yaml:2:16", "given here")]
+
+
+def test_a_default_in_a_reference_is_given_where_it_stands() -> None:
+    (problem,) = problems(operator('c: {use: "graph_operators:Camera", params: {rate: "${env:NO_SUCH_RATE:--3}"}}'))
+
+    assert problem.line == 4
+    assert problem.related == ()
+
+
 def test_alias_bomb_is_refused_quickly() -> None:
     text = "graph: g\nparams:\n  a0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
     for i in range(1, 9):
