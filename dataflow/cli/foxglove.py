@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.arguments import Clock, End, Start, Streams, chosen_streams, existing_recording, number, span, window
-from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.live import GraphName, Wait, running_graph, say_followed
 from dataflow.cli.output import err, fail, friendly_errors, out, plural, say
 
 if TYPE_CHECKING:
@@ -149,7 +148,7 @@ def _follow(host: str, port: int, words: list[str] | None, name: str | None, wai
             )
         )
         _say_where(server)
-        say(f"following {escape(running.name)} (process {found.pid})")
+        say_followed(found)
         if bar is not None:
             say("a replay: the playback bar of Foxglove pauses it and changes its speed")
             stack.enter_context(_told(server, bar))

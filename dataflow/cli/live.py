@@ -74,12 +74,24 @@ def running_graph(name: str | None, wait: float) -> RunningGraph:
     return find_running(name, wait=wait)
 
 
+def followed_graph(name: str | None, wait: float) -> RunningGraph:
+    """The running graph of that name, or the only one, which it names. Raises `NotRunning`."""
+    found = running_graph(name, wait)
+    say_followed(found)
+    return found
+
+
+def say_followed(found: RunningGraph) -> None:
+    """Says which running graph a command follows."""
+    say(f"following {escape(found.name)} (process {found.pid})")
+
+
 @contextmanager
 def tapped(streams: list[str] | None, name: str | None, wait: float) -> Iterator[tuple[RunningGraph, TapClient]]:
     """The running graph, and a lossy copy of those of its streams that were asked for."""
     from dataflow.client.attach import graph_of, tap
 
-    found = running_graph(name, wait)
+    found = followed_graph(name, wait)
     graph = graph_of(found)
     chosen = chosen_streams(streams, graph.streams, graph.namespace)
     with tap(found, [f"/{stream}" for stream in chosen] if streams else ["**"]) as client:

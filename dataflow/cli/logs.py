@@ -13,7 +13,7 @@ from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, existing
 from dataflow.cli.completion import running_operators
-from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.live import GraphName, Wait, followed_graph, running_graph
 from dataflow.cli.output import INTERRUPTED, fail, friendly_errors, out, print_json_line, say
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ def _running(name: str | None, wait: float, *, follow: bool) -> Iterator[LogLine
     from dataflow.recording import LogLine
     from dataflow.transport.log_file import LogFollower
 
-    found = running_graph(name, wait)
+    found = followed_graph(name, wait) if follow else running_graph(name, wait)
     follower = LogFollower(found.pid)
     try:
         while True:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG, Json, Overwrite, chosen_streams, output_file
-from dataflow.cli.live import GraphName, Streams, Wait, running_graph
+from dataflow.cli.live import GraphName, Streams, Wait, running_graph, say_followed
 from dataflow.cli.material import Compression
 from dataflow.cli.output import count, err, fail, friendly_errors, out, plural, print_json, say, size, table
 from dataflow.cli.quantities import parsed_duration, parsed_size
@@ -77,6 +77,8 @@ def record(
             raise fail(f"--seconds {duration:g}: expected seconds, more than 0")
         output_file(output, ".mcap", overwrite=overwrite or every is not None or most is not None, option="--out")
         found = running_graph(graph, wait)
+        if not quiet:
+            say_followed(found)
         running = graph_of(found)
         chosen = chosen_streams(streams, running.streams, running.namespace)
         about = {"mode": "recorded from outside", "started": str(time.time_ns())}

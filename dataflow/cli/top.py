@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from dataflow.cli.arguments import FLAG
-from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.live import GraphName, Wait, followed_graph
 from dataflow.cli.output import INTERRUPTED, err, fail, friendly_errors, out, print_json
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ def top(
     if not 0.05 <= every < 1e6:
         raise fail(f"--every {every:g}: expected seconds, 0.05 or more")
     with friendly_errors():
-        found = running_graph(graph, wait)
+        found = followed_graph(graph, wait)
         with processes_of(found) as processes:
             processes.connected(len(found.endpoints), CONNECT_WITHIN)
             try:

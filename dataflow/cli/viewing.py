@@ -25,7 +25,7 @@ from dataflow.cli.arguments import (
     output_file,
 )
 from dataflow.cli.drawing import Announcer, draw_recording, open_sink, report, showing, until_interrupted
-from dataflow.cli.live import GraphName, Wait, running_graph
+from dataflow.cli.live import GraphName, Wait, running_graph, say_followed
 from dataflow.cli.output import fail, friendly_errors, say
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _view_running(
     others = [name for name, stream in running.streams.items() if set(stream.types) & set(PLACE_FRAMES)]
     others = [name for name in others if name not in chosen]
     with tap(found, [f"/{name}" for name in (*chosen, *others)] if streams else ["**"]) as client:
-        say(f"following {escape(running.name)} (process {found.pid})")
+        say_followed(found)
         _draw_running(target, client, found, running, chosen, others, every, logs=not streams, until_end=until_end)
 
 

@@ -70,6 +70,17 @@ def test_echo_prints_arrays_as_numbers_where_it_prints_json(dataflow) -> None:
     assert all(isinstance(value, (int, float)) for row in line["vectors"] for value in row)
 
 
+@pytest.mark.usefixtures("running")
+@pytest.mark.parametrize(
+    "words", [["echo", "-n", "1"], ["hz", "--seconds", "0.2"], ["top", "--once"], ["record", "--seconds", "0.2", "-o"]]
+)
+def test_commands_say_which_graph_they_follow(dataflow, tmp_path: Path, words: list[str]) -> None:
+    told = dataflow(*words, *([tmp_path / "attached.mcap"] if words[0] == "record" else []))
+
+    assert f"following small (process {os.getpid()})" in told.stderr
+    assert "following" not in told.stdout
+
+
 def test_the_graph_that_is_meant_may_stand_in_the_environment(dataflow, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATAFLOW_GRAPH", "kitchen")
     assert "no graph 'kitchen' runs here" in dataflow("echo", code=2).stderr
