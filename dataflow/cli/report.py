@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from dataflow.cli.output import count, plural, seconds, size, table
-from dataflow.records.figures import figure
+from dataflow.records.figures import figures
 from dataflow.supervision.report import RunReport
 from dataflow.sync import TICK
 
@@ -105,9 +105,8 @@ def _figures(summary: Mapping[str, Any]) -> Table:
     grid = Table.grid(padding=(0, 2))
     grid.add_column(no_wrap=True)
     grid.add_column(overflow="fold", max_width=_VALUE_WIDTH)
-    for name, value in summary.items():
-        label, text, unit = figure(name, value)
-        grid.add_row(Text(label, style="dim"), Text(f"{text} {unit}".rstrip()))
+    for label, text in figures(summary).items():
+        grid.add_row(Text(label, style="dim"), Text(text))
     return grid
 
 

@@ -30,6 +30,19 @@ def figure(name: str, value: Any) -> tuple[str, str, str]:
     return name.replace("_", " "), text, _UNITS.get(unit, "")
 
 
+def figures(summary: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the values of a summary by their names, both for people, in its order.
+
+    Figures whose names differ in their unit alone, such as a translation and a rotation, have one line:
+    {"rpe_1s_rmse_m": 0.0213, "rpe_1s_rmse_deg": 0.5} → {"rpe 1s rmse": "0.0213 m, 0.5 °"}.
+    """
+    found: dict[str, list[str]] = {}
+    for name, value in summary.items():
+        label, text, unit = figure(name, value)
+        found.setdefault(label, []).append(f"{text} {unit}".rstrip())
+    return {label: ", ".join(values) for label, values in found.items()}
+
+
 def recorded_summaries(recording: Recording, operators: Iterable[str]) -> dict[str, Mapping[str, Any]]:
     """Returns what each of some operators summed up when it last ended; nothing for those that did not get so far."""
     found: dict[str, Mapping[str, Any]] = {}

@@ -8,7 +8,7 @@ from typing import Any
 import rerun as rr
 
 from dataflow.graph.model import Graph
-from dataflow.records.figures import figure
+from dataflow.records.figures import figures
 
 SCORES = "/viewer/scores"
 """Entity of the scores."""
@@ -28,8 +28,6 @@ def document(summaries: Summaries) -> rr.TextDocument:
     parts = []
     for operator, found in summaries.items():
         rows = [f"| **{operator.replace('_', ' ')}** | of the whole run |", "|---|---|"]
-        for name, value in found.items():
-            label, text, unit = figure(name, value)
-            rows.append(f"| {label} | {' '.join((text, unit)).rstrip()} |".replace("\n", " "))
+        rows += (f"| {label} | {text} |".replace("\n", " ") for label, text in figures(found).items())
         parts.append("\n".join(rows))
     return rr.TextDocument("\n\n".join(parts), media_type=rr.MediaType.MARKDOWN)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from dataflow.recording import Recording, RecordingWriter
-from dataflow.records.figures import figure, recorded_summaries
+from dataflow.records.figures import figure, figures, recorded_summaries
 from dataflow.records.firing import FiringRecord, encode_batch
 
 
@@ -14,6 +14,18 @@ def test_figures_carry_the_unit_of_their_name() -> None:
     assert figure("rpe_1s_rmse_deg", 0.5) == ("rpe 1s rmse", "0.5", "°")
     assert figure("unmatched_poses", 12345) == ("unmatched poses", "12,345", "")
     assert figure("alignment_m", "se3") == ("alignment m", "se3", "")
+
+
+def test_figures_of_one_name_in_several_units_have_one_line() -> None:
+    score = {"matched": 90, "rpe_1s_rmse_m": 0.0213, "rpe_1s_rmse_deg": 0.5, "rpe_1m_rmse_m": 0.02, "alignment": "se3"}
+
+    assert figures(score) == {
+        "matched": "90",
+        "rpe 1s rmse": "0.0213 m, 0.5 °",
+        "rpe 1m rmse": "0.02 m",
+        "alignment": "se3",
+    }
+    assert list(figures(score)) == ["matched", "rpe 1s rmse", "rpe 1m rmse", "alignment"]
 
 
 def test_a_recording_tells_what_operators_summed_up_when_they_last_ended(tmp_path: Path) -> None:
