@@ -42,6 +42,7 @@ from dataflow.ports import (
     Param,
     ParameterError,
     Sampled,
+    SourceError,
     is_live,
 )
 
@@ -63,6 +64,7 @@ __all__ = [
     "ParameterError",
     "Sampled",
     "Source",
+    "SourceError",
     "is_live",
     "is_source",
     "outputs_of",

@@ -30,6 +30,13 @@ class ParameterError(ValueError):
     """A parameter value that is refused: names the operator, the parameter, the value and what would be right."""
 
 
+class SourceError(ValueError):
+    """A file, folder or device that a source is to read, and cannot: names it, what is wrong and what would be right.
+
+    A command that it ends says this alone, without a traceback.
+    """
+
+
 class OutputError(ValueError):
     """`process()` returned something that its ports cannot emit: names the operator and the port."""
 

@@ -12,11 +12,11 @@ import typer
 from rich.markup import escape
 
 from dataflow.cli.arguments import output_file
-from dataflow.cli.output import INTERRUPTED, err, fail, out, print_json, say, size
+from dataflow.cli.output import INTERRUPTED, about_a_file, err, fail, out, print_json, say, size
 
 if TYPE_CHECKING:
     from dataflow.graph import Graph
-    from dataflow.supervision.report import RunReport, Watch
+    from dataflow.supervision.report import RunFailed, RunReport, Watch
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +110,8 @@ def execute(
             report = start(watch)
     except RunFailed as failure:
         _say_what_is_left(before, "end" if failure.interrupted else "failure")
+        if about_a_file(failure.details) and (parameter := _named_by(failure, graph)) is not None:
+            failure.add_note(f"name another with --set {parameter}=...")
         raise
     if json:
         print_json({**report_json(report), "total_s": time.monotonic() - began})
@@ -120,6 +122,14 @@ def execute(
     if report.interrupted:
         raise typer.Exit(INTERRUPTED)
     return report
+
+
+def _named_by(failure: RunFailed, graph: Graph) -> str | None:
+    """The parameter, such as `camera.path`, whose value stands in a failure; the one with the longest value."""
+    node = graph.nodes.get(failure.operator or "")
+    texts = {name: value for name, value in (node.params if node else {}).items() if isinstance(value, str) and value}
+    named = [name for name, value in texts.items() if str(Path(value)) in str(failure)]
+    return f"{failure.operator}.{max(named, key=lambda name: len(texts[name]))}" if named else None
 
 
 def _written(file: Path) -> tuple[int, int] | None:

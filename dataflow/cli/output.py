@@ -172,9 +172,10 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
             return f"\n{error}", "", COULD_NOT_RUN
         case RunFailed():
             details = own_traceback(error.details) if error.internal else error.details
-            if _about_a_file(error.details) and not wants_traceback():
+            if about_a_file(error.details) and not wants_traceback():
                 details = ""  # the message names the file; where in the operator it was opened does not help
-            return str(error), details, INTERRUPTED if error.interrupted else DIFFERENT
+            message = "\n".join((str(error), *getattr(error, "__notes__", ())))
+            return message, details, INTERRUPTED if error.interrupted else DIFFERENT
         case BrokenPipeError():
             return None
         case OSError() if error.strerror and error.filename:
@@ -184,13 +185,14 @@ def _explained(error: Exception) -> tuple[str, str, int] | None:
     return None
 
 
-_FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", "PermissionError", "DatasetError")
+_FILE_ERRORS = ("FileNotFoundError", "NotADirectoryError", "IsADirectoryError", "PermissionError", "SourceError")
 
 
-def _about_a_file(details: str) -> bool:
-    """Tells whether a traceback ends with a file that is missing or cannot be read."""
-    last = details.rstrip().rpartition("\n")[2].partition(":")[0]
-    return details.startswith("Traceback") and last.rpartition(".")[2] in _FILE_ERRORS
+def about_a_file(details: str) -> bool:
+    """Tells whether a traceback ends with a file that is missing or cannot be read; its text may have several lines."""
+    lines = details.rpartition('\n  File "')[2].splitlines()
+    raised = next((line for line in lines[1:] if not line.startswith(" ")), "")
+    return details.startswith("Traceback") and raised.partition(":")[0].rpartition(".")[2] in _FILE_ERRORS
 
 
 def table(*columns: str, right: tuple[str, ...] = (), title: str | None = None) -> Table:

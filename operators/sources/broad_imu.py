@@ -13,15 +13,11 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Imu, MagneticField, Message, Pose
 from dataflow.messages.geometry import normalize
-from dataflow.operator import Out, Param, Source
+from dataflow.operator import Out, Param, Source, SourceError
 from operators.sources.pacing import frame_stamp
 
 Array = NDArray[np.float64]
 _SETS = {"imu_gyr": 3, "imu_acc": 3, "imu_mag": 3, "opt_quat": 4, "opt_pos": 3}
-
-
-class BroadError(ValueError):
-    """A BROAD trial that cannot be read: names the file, the data set, and what it should hold."""
 
 
 @dataclass(frozen=True)
@@ -62,13 +58,13 @@ class BroadImu(Source):
     world_frame: str = Param("world", min_length=1, doc="frame of the ground truth: east, north, up")
 
     def setup(self) -> None:
-        """Raises BroadError, FileNotFoundError."""
+        """Raises SourceError, FileNotFoundError."""
         file = self.use_file(Path(self.path).expanduser())
         self._trial = read_trial(file)
         count = len(self._trial.gyroscope)
         self._samples = range(count)[self.start : self.stop]
         if not self._samples:
-            raise BroadError(f"{file} has {count} samples: start={self.start}, stop={self.stop} leaves none")
+            raise SourceError(f"{file} has {count} samples: start={self.start}, stop={self.stop} leaves none")
 
     def length(self) -> int:
         return len(self._samples)
@@ -105,25 +101,25 @@ class BroadImu(Source):
 
 
 def read_trial(file: Path) -> BroadTrial:
-    """Reads a whole file. Raises BroadError."""
+    """Reads a whole file. Raises SourceError."""
     try:
         with h5py.File(file) as content:
             rate = content.attrs.get("sampling_rate")
             found = {name: _data_set(file, content, name) for name in (*_SETS, "movement")}
     except OSError as error:
-        raise BroadError(f"{file} is no HDF5 file: {error}") from None
+        raise SourceError(f"{file} is no HDF5 file: {error}") from None
     if rate is None or not np.isscalar(rate) or not 0 < float(rate) < np.inf:  # type: ignore[arg-type]
-        raise BroadError(f"{file}: the attribute sampling_rate must be a number above 0, got {rate!r}")
+        raise SourceError(f"{file}: the attribute sampling_rate must be a number above 0, got {rate!r}")
     count = len(found["imu_gyr"])
     for name, columns in _SETS.items():
         if found[name].shape != (count, columns):
-            raise BroadError(f"{file}: {name} must have the shape {(count, columns)}, got {found[name].shape}")
+            raise SourceError(f"{file}: {name} must have the shape {(count, columns)}, got {found[name].shape}")
     if found["movement"].shape != (count,):
-        raise BroadError(f"{file}: movement must have the shape {(count,)}, got {found['movement'].shape}")
+        raise SourceError(f"{file}: movement must have the shape {(count,)}, got {found['movement'].shape}")
     for name in ("imu_gyr", "imu_acc"):
         wrong = np.flatnonzero(~np.isfinite(found[name]).all(axis=1))
         if wrong.size:
-            raise BroadError(f"{file}: {name} is not finite at sample {wrong[0]}")
+            raise SourceError(f"{file}: {name} is not finite at sample {wrong[0]}")
     return BroadTrial(
         rate=float(rate),  # type: ignore[arg-type]
         gyroscope=found["imu_gyr"].astype(np.float64),
@@ -137,5 +133,5 @@ def read_trial(file: Path) -> BroadTrial:
 
 def _data_set(file: Path, content: h5py.File, name: str) -> NDArray[np.generic]:
     if not isinstance(content.get(name), h5py.Dataset):
-        raise BroadError(f"{file} has no data set {name!r}; it has {', '.join(content) or 'none'}")
+        raise SourceError(f"{file} has no data set {name!r}; it has {', '.join(content) or 'none'}")
     return np.asarray(content[name])

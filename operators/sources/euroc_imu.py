@@ -14,13 +14,9 @@ from ruamel.yaml.error import YAMLError
 
 from dataflow.messages import Imu, Message, Pose
 from dataflow.messages.geometry import normalize
-from dataflow.operator import Out, Param, Source
+from dataflow.operator import Out, Param, Source, SourceError
 
 Array = NDArray[np.float64]
-
-
-class EurocError(ValueError):
-    """A EuRoC folder that cannot be read: names the file, the line, and what it should hold."""
 
 
 @dataclass(frozen=True)
@@ -56,10 +52,10 @@ class EurocImu(Source):
     world_frame: str = Param("world", min_length=1, doc="frame of the ground truth, z up")
 
     def setup(self) -> None:
-        """Raises EurocError."""
+        """Raises SourceError."""
         folder = Path(self.path).expanduser()
         if not folder.is_dir():
-            raise EurocError(f"no folder {folder}")
+            raise SourceError(f"no folder {folder}")
         self._imu = read_imu(self.use_file(folder / "imu.csv"))
         truth, sensor = folder / "groundtruth.txt", folder / "imu_sensor.yaml"
         self._truth = read_truth(self.use_file(truth)) if truth.is_file() else Samples([], np.zeros((0, 7)))
@@ -97,33 +93,33 @@ class EurocImu(Source):
 
 
 def read_imu(file: Path) -> Samples:
-    """Reads `imu.csv`: gyroscope and accelerometer (N, 6). Raises EurocError, OSError."""
+    """Reads `imu.csv`: gyroscope and accelerometer (N, 6). Raises SourceError, OSError."""
     return _rows(file, ",", 6, Decimal(1), "a stamp in ns and 6 numbers: gyroscope in rad/s, accelerometer in m/s²")
 
 
 def read_truth(file: Path) -> Samples:
-    """Reads `groundtruth.txt`: position and quaternion (x, y, z, w) (N, 7). Raises EurocError, OSError."""
+    """Reads `groundtruth.txt`: position and quaternion (x, y, z, w) (N, 7). Raises SourceError, OSError."""
     wanted = "seconds and 7 numbers: x y z qx qy qz qw"
     truth = _rows(file, None, 7, Decimal(10) ** 9, wanted)
     wrong = np.flatnonzero(~(np.abs(np.linalg.norm(truth.values[:, 3:], axis=1) - 1) < 1e-2))
     if wrong.size:
-        raise EurocError(f"{file}, pose {wrong[0] + 1}: {truth.values[wrong[0], 3:].tolist()} is no unit quaternion")
+        raise SourceError(f"{file}, pose {wrong[0] + 1}: {truth.values[wrong[0], 3:].tolist()} is no unit quaternion")
     return truth
 
 
 def read_noise(file: Path) -> InertialNoise:
-    """Reads the densities of `imu_sensor.yaml`. Raises EurocError, OSError."""
+    """Reads the densities of `imu_sensor.yaml`. Raises SourceError, OSError."""
     text = file.read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("%YAML")]  # OpenCV's own header is no YAML
     try:
         content = YAML(typ="safe").load("\n".join(lines))
     except YAMLError as error:
-        raise EurocError(f"{file}: no YAML: {error}") from None
+        raise SourceError(f"{file}: no YAML: {error}") from None
     found = []
     for key in ("gyroscope_noise_density", "accelerometer_noise_density", "rate_hz"):
         value = content.get(key) if isinstance(content, dict) else None
         if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < float("inf"):
-            raise EurocError(f"{file}: {key} must be a number above 0, got {value!r}")
+            raise SourceError(f"{file}: {key} must be a number above 0, got {value!r}")
         found.append(float(value))
     return InertialNoise(*found)
 
@@ -145,9 +141,9 @@ def _rows(file: Path, separator: str | None, columns: int, scale: Decimal, wante
                 raise ValueError(f"stamp {stamp} after {stamps[-1]}")
         except (ValueError, InvalidOperation, OverflowError) as error:
             reason = "the stamp is no number" if isinstance(error, InvalidOperation) else error
-            raise EurocError(f"{file}, line {number}: {reason}; expected {wanted}, stamps increasing") from None
+            raise SourceError(f"{file}, line {number}: {reason}; expected {wanted}, stamps increasing") from None
         stamps.append(stamp)
         values.append(row)
     if not stamps:
-        raise EurocError(f"{file} holds no line of {wanted}")
+        raise SourceError(f"{file} holds no line of {wanted}")
     return Samples(stamps, np.array(values))

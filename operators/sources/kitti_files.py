@@ -8,30 +8,28 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dataflow.operator import SourceError
+
 _CALIBRATIONS = (("calib.txt",), ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt"))
 
 
-class KittiError(ValueError):
-    """A KITTI folder that cannot be read: names the file and what it should hold."""
-
-
 def files_in(folder: Path, places: tuple[str, ...], suffix: str) -> list[Path]:
-    """The files in the first of some places that holds any. Raises KittiError where none does."""
+    """The files in the first of some places that holds any. Raises SourceError where none does."""
     for place in places:
         found = sorted((folder / place).glob(f"*{suffix}"))
         if found:
             return found
-    raise KittiError(f"no {suffix} files in {' or '.join(str(folder / place) for place in places)}")
+    raise SourceError(f"no {suffix} files in {' or '.join(str(folder / place) for place in places)}")
 
 
 def calibration_files(folder: Path) -> tuple[Path, ...]:
-    """The calibration files of a drive, there or in the folder above. Raises KittiError."""
+    """The calibration files of a drive, there or in the folder above. Raises SourceError."""
     for home in (folder, folder.parent):
         for names in _CALIBRATIONS:
             if all((home / name).is_file() for name in names):
                 return tuple(home / name for name in names)
     wanted = " or ".join(" with ".join(names) for names in _CALIBRATIONS)
-    raise KittiError(f"no calibration in {folder} or the folder above: {wanted}")
+    raise SourceError(f"no calibration in {folder} or the folder above: {wanted}")
 
 
 def read_stamps(file: Path, names: list[str], what: str) -> dict[str, int]:
@@ -40,7 +38,7 @@ def read_stamps(file: Path, names: list[str], what: str) -> dict[str, int]:
         return {}
     lines = [line.strip() for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
     if len(lines) != len(names):
-        raise KittiError(f"{file} has {len(lines)} lines for {len(names)} {what}")
+        raise SourceError(f"{file} has {len(lines)} lines for {len(names)} {what}")
     stamps = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -48,9 +46,9 @@ def read_stamps(file: Path, names: list[str], what: str) -> dict[str, int]:
             moment = datetime.strptime(whole, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
             stamps.append(int(moment.timestamp()) * 10**9 + int((part or "0").ljust(9, "0")[:9]))
         except ValueError:
-            raise KittiError(f"{file}, line {number}: {line!r} is no date and time") from None
+            raise SourceError(f"{file}, line {number}: {line!r} is no date and time") from None
         if len(stamps) > 1 and stamps[-1] <= stamps[-2]:
-            raise KittiError(f"{file}, line {number}: the time is not later than that of the line before")
+            raise SourceError(f"{file}, line {number}: the time is not later than that of the line before")
     return dict(zip(names, stamps, strict=True))
 
 
@@ -71,11 +69,11 @@ class Numbers:
                     continue  # dates and names
 
     def of(self, count: int, *keys: str) -> NDArray[np.float64]:
-        """The numbers (count,) of the first key that is there. Raises KittiError."""
+        """The numbers (count,) of the first key that is there. Raises SourceError."""
         for key in keys:
             if key in self._values:
                 found = np.array(self._values[key])
                 if len(found) != count or not np.isfinite(found).all():
-                    raise KittiError(f"{self._named}: {key} must have {count} finite numbers, has {len(found)}")
+                    raise SourceError(f"{self._named}: {key} must have {count} finite numbers, has {len(found)}")
                 return found
-        raise KittiError(f"{self._named}: no {' or '.join(keys)}")
+        raise SourceError(f"{self._named}: no {' or '.join(keys)}")

@@ -10,16 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, Image, Message, Pose
-from dataflow.operator import Out, Param, Source
+from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
 from operators.sources.pacing import frame_stamp
 
 Array = NDArray[np.float64]
 FOLDERS = (("image_l", "image_r"), ("image_0", "image_1"), ("image_2", "image_3"))
-
-
-class KittiError(ValueError):
-    """A KITTI folder that cannot be read: names the file, what is wrong with it, and what it should hold."""
 
 
 class KittiOdometry(Source):
@@ -47,25 +43,25 @@ class KittiOdometry(Source):
     right_frame: str = Param("stereo_right_optical", min_length=1, doc="optical frame of the right camera")
 
     def setup(self) -> None:
-        """Raises KittiError."""
+        """Raises SourceError."""
         folder = Path(self.path).expanduser()
         pair = next((p for p in FOLDERS if (folder / p[0]).is_dir() and (folder / p[1]).is_dir()), None)
         if pair is None:
-            raise KittiError(f"{folder} holds no pair of folders: {', '.join('/'.join(p) for p in FOLDERS)}")
+            raise SourceError(f"{folder} holds no pair of folders: {', '.join('/'.join(p) for p in FOLDERS)}")
         lefts = sorted((folder / pair[0]).glob("*.png"))[self.start : self.stop]
         if not lefts:
-            raise KittiError(f"{folder / pair[0]} holds no image *.png from {self.start} to {self.stop}")
+            raise SourceError(f"{folder / pair[0]} holds no image *.png from {self.start} to {self.stop}")
         self._pairs = [(left, folder / pair[1] / left.name) for left in lefts]
         for _, right in self._pairs:
             if not right.is_file():
-                raise KittiError(f"no file {right}, which the left image of that name needs")
+                raise SourceError(f"no file {right}, which the left image of that name needs")
         cameras = (2, 3) if pair[0] == "image_2" else (0, 1)
         self._P = read_projections(self.use_file(folder / "calib.txt"), cameras)
         truth = folder / "poses.txt"
         poses = read_poses(self.use_file(truth)) if truth.is_file() else []
         self._poses = poses[self.start : self.stop]
         if poses and len(self._poses) < len(self._pairs):
-            raise KittiError(f"{truth} has {len(poses)} poses, and there are more images")
+            raise SourceError(f"{truth} has {len(poses)} poses, and there are more images")
         self._size = self._read(self._pairs[0][0]).shape[1::-1]
 
     def static_outputs(self) -> Mapping[str, Message]:
@@ -84,7 +80,7 @@ class KittiOdometry(Source):
         }
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
-        """Raises KittiError that names an image that cannot be read or has another size."""
+        """Raises SourceError that names an image that cannot be read or has another size."""
         for i, (left, right) in enumerate(self._pairs):
             stamp = frame_stamp(self.start + i, self.rate, self.first_stamp)
             messages: dict[str, Message] = {
@@ -103,10 +99,10 @@ class KittiOdometry(Source):
     def _read(self, file: Path) -> NDArray[np.uint8]:
         pixels = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB if self.color else cv2.IMREAD_GRAYSCALE)
         if pixels is None:
-            raise KittiError(f"cannot decode {file}")
+            raise SourceError(f"cannot decode {file}")
         size = getattr(self, "_size", None)
         if size is not None and pixels.shape[1::-1] != size:
-            raise KittiError(
+            raise SourceError(
                 f"{file} has {pixels.shape[1]}x{pixels.shape[0]} pixels, the first image {size[0]}x{size[1]}"
             )
         return np.asarray(pixels, np.uint8)
@@ -115,7 +111,7 @@ class KittiOdometry(Source):
 def read_projections(file: Path, cameras: tuple[int, int]) -> tuple[Array, Array]:
     """Returns the projections (3, 4) of two cameras, named `P0:` and so on, or where none is named, the first lines."""
     if not file.is_file():
-        raise KittiError(f"no file {file}")
+        raise SourceError(f"no file {file}")
     lines = [line.split() for line in file.read_text().splitlines() if line.strip()]
     named = {words[0].rstrip(":"): words[1:] for words in lines if words[0].startswith("P")}
     found = []
@@ -124,7 +120,7 @@ def read_projections(file: Path, cameras: tuple[int, int]) -> tuple[Array, Array
         found.append(_numbers(file, words, f"projection P{camera}"))
     left, right = found
     if left[0, 0] <= 0 or right[0, 3] - left[0, 3] >= 0:
-        raise KittiError(f"{file}: P{cameras[1]}[0, 3] must be below P{cameras[0]}[0, 3]: -fx times the baseline")
+        raise SourceError(f"{file}: P{cameras[1]}[0, 3] must be below P{cameras[0]}[0, 3]: -fx times the baseline")
     return left, right
 
 
@@ -144,5 +140,5 @@ def _numbers(file: Path, words: list[str], what: str) -> Array:
     except ValueError:
         values = np.zeros(0)
     if values.size != 12 or not np.isfinite(values).all():
-        raise KittiError(f"{file}: {what} must be 12 numbers, row by row, got {' '.join(words)[:80]!r}")
+        raise SourceError(f"{file}: {what} must be 12 numbers, row by row, got {' '.join(words)[:80]!r}")
     return values.reshape(3, 4)

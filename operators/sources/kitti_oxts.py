@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from dataflow.messages import Imu, Message, NavSatFix, Odometry
 from dataflow.messages.geometry import matrix_to_quaternion
+from dataflow.operator import SourceError
 from operators.geometry.geodesy import east_north_up
-from operators.sources.kitti_files import KittiError
 
 Array = NDArray[np.float64]
 
@@ -80,13 +80,13 @@ class Packet(NamedTuple):
 
 
 def read_packet(file: Path) -> Packet:
-    """Reads one packet. Raises KittiError that names the number that is wrong; accuracies may be nan, not known."""
+    """Reads one packet. Raises SourceError that names the number that is wrong; accuracies may be nan, not known."""
     try:
         words = file.read_text(encoding="utf-8").split()
     except (OSError, UnicodeDecodeError) as error:
-        raise KittiError(f"{file}: {error}") from None
+        raise SourceError(f"{file}: {error}") from None
     if len(words) != len(Packet._fields):
-        raise KittiError(
+        raise SourceError(
             f"{file} has {len(words)} numbers; {len(Packet._fields)} expected: {', '.join(Packet._fields)}"
         )
     values = []
@@ -94,13 +94,13 @@ def read_packet(file: Path) -> Packet:
         try:
             value = float(word)
         except ValueError:
-            raise KittiError(f"{file}: {name} is {word!r}, no number") from None
+            raise SourceError(f"{file}: {name} is {word!r}, no number") from None
         if not math.isfinite(value) and not name.endswith("accuracy"):
-            raise KittiError(f"{file}: {name} is {word}; expected a finite number")
+            raise SourceError(f"{file}: {name} is {word}; expected a finite number")
         values.append(value)
     packet = Packet(*values)
     if abs(packet.lat) > 90 or abs(packet.lon) > 180:
-        raise KittiError(f"{file}: {packet.lat}, {packet.lon} is no latitude and longitude in degrees")
+        raise SourceError(f"{file}: {packet.lat}, {packet.lon} is no latitude and longitude in degrees")
     return packet
 
 

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, Image, Imu, Message, NavSatFix, Odometry, PointCloud, Transforms
 from dataflow.messages.geometry import invert
-from dataflow.operator import Out, Param, Source
+from dataflow.operator import Out, Param, Source, SourceError
 from operators.geometry.se3 import orthonormalised
-from operators.sources.kitti_files import KittiError, Numbers, calibration_files, files_in, read_stamps
+from operators.sources.kitti_files import Numbers, calibration_files, files_in, read_stamps
 from operators.sources.kitti_oxts import messages_of, read_packet
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class KittiRaw(Source):
     odometry_frame: str = Param("odom", min_length=1, doc="frame of the odometry")
 
     def setup(self) -> None:
-        """Raises KittiError for a folder or calibration that cannot be used."""
+        """Raises SourceError for a folder or calibration that cannot be used."""
         folder = Path(self.path).expanduser()
         images = {file.stem: file for file in files_in(folder, _IMAGES, ".png")}
         scans = {file.stem: file for file in files_in(folder, _SCANS, ".bin")}
@@ -79,7 +79,7 @@ class KittiRaw(Source):
         stamps = read_stamps(folder / "velodyne_points" / "timestamps.txt", sorted(scans), "scans")
         chosen = list(enumerate(both))[self.start : self.stop : self.stride]
         if not chosen:
-            raise KittiError(
+            raise SourceError(
                 f"{folder} has {len(both)} frames with image and scan: start={self.start}, stop={self.stop}, "
                 f"stride={self.stride} leaves none"
             )
@@ -131,7 +131,7 @@ class KittiRaw(Source):
         return made
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
-        """Raises KittiError that names a file that cannot be read."""
+        """Raises SourceError that names a file that cannot be read."""
         for stamp in sorted(self._frames.keys() | self._packets.keys()):
             messages: dict[str, Message] = {}
             if stamp in self._frames:
@@ -146,7 +146,7 @@ class KittiRaw(Source):
     def _frame(self, stamp: int, image_file: Path, scan_file: Path) -> Mapping[str, Message]:
         image, scan = _read_image(image_file), read_scan(scan_file)
         if image.shape[:2] != self._size:
-            raise KittiError(f"{image_file} has another size than the first image: {image.shape[:2]}, {self._size}")
+            raise SourceError(f"{image_file} has another size than the first image: {image.shape[:2]}, {self._size}")
         return {
             "points": PointCloud(
                 stamp=stamp,
@@ -162,18 +162,18 @@ class KittiRaw(Source):
 
 
 def read_scan(file: Path) -> NDArray[np.float32]:
-    """Reads x, y, z, reflectance (N, 4) of a Velodyne file. Raises KittiError."""
+    """Reads x, y, z, reflectance (N, 4) of a Velodyne file. Raises SourceError."""
     try:
         content = file.read_bytes()
     except OSError as error:
-        raise KittiError(f"{file}: {error}") from None
+        raise SourceError(f"{file}: {error}") from None
     if len(content) % 16:
-        raise KittiError(f"{file} has {len(content)} bytes; 16 a point expected (x, y, z, reflectance as float32)")
+        raise SourceError(f"{file} has {len(content)} bytes; 16 a point expected (x, y, z, reflectance as float32)")
     return np.frombuffer(content, "<f4").reshape(-1, 4).astype(np.float32)
 
 
 def read_mounting(file: Path) -> Array:
-    """Reads `calib_imu_to_velo.txt`: T_velodyne_imu (4, 4). Raises KittiError."""
+    """Reads `calib_imu_to_velo.txt`: T_velodyne_imu (4, 4). Raises SourceError."""
     numbers, T = Numbers(file), np.eye(4)
     T[:3, :3] = numbers.of(9, "R").reshape(3, 3)
     T[:3, 3] = numbers.of(3, "T")
@@ -181,11 +181,11 @@ def read_mounting(file: Path) -> Array:
 
 
 def read_calibration(*files: Path) -> Calibration:
-    """Reads KITTI calibration files, taken together: lines of a key, a colon and numbers. Raises KittiError."""
+    """Reads KITTI calibration files, taken together: lines of a key, a colon and numbers. Raises SourceError."""
     numbers, named = Numbers(*files), ", ".join(file.name for file in files)
     P = numbers.of(12, "P_rect_02").reshape(3, 4)
     if P[0, 0] <= 0 or P[1, 1] <= 0:
-        raise KittiError(f"{named}: P_rect_02 has focal lengths {P[0, 0]} and {P[1, 1]}")
+        raise SourceError(f"{named}: P_rect_02 has focal lengths {P[0, 0]} and {P[1, 1]}")
     T = np.eye(4)
     T[:3, :3] = numbers.of(9, "R_velo_to_cam", "R").reshape(3, 3)
     T[:3, 3] = numbers.of(3, "T_velo_to_cam", "T")
@@ -199,5 +199,5 @@ def read_calibration(*files: Path) -> Calibration:
 def _read_image(file: Path) -> NDArray[np.uint8]:
     pixels = cv2.imread(str(file), cv2.IMREAD_COLOR_RGB)
     if pixels is None:
-        raise KittiError(f"cannot decode {file} as a colour image")
+        raise SourceError(f"cannot decode {file} as a colour image")
     return np.asarray(pixels, np.uint8)

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Transforms
 from dataflow.messages.geometry import normalize
-from dataflow.operator import Out, Param, Source
+from dataflow.operator import Out, Param, Source, SourceError
 from operators.sources.rgbd_layouts import (
     Dataset,
-    DatasetError,
     Frame,
     Intrinsics,
     detect_layout,
@@ -76,21 +75,21 @@ class RgbdFolder(Source):
     depth_frame: str = Param("camera_depth_optical", min_length=1, doc="optical frame of the depth camera")
 
     def setup(self) -> None:
-        """Raises DatasetError for a folder, list, calibration or parameter that cannot be used."""
+        """Raises SourceError for a folder, list, calibration or parameter that cannot be used."""
         if self.image_frame == self.depth_frame:
-            raise DatasetError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
+            raise SourceError(f"image_frame and depth_frame must differ, both are {self.image_frame!r}")
         folder = Path(self.path).expanduser()
         self._dataset = self._list(folder)
         self._frames = self._dataset.frames[self.start : self.stop : self.stride]
         if not self._frames:
-            raise DatasetError(
+            raise SourceError(
                 f"{folder} has {len(self._dataset.frames)} frames: start={self.start}, stop={self.stop}, "
                 f"stride={self.stride} leaves none"
             )
         for frame in self._frames:
             for file in (frame.image, frame.depth):
                 if not file.is_file():
-                    raise DatasetError(f"frame {frame.name}: no file {file}")
+                    raise SourceError(f"frame {frame.name}: no file {file}")
         if (folder / "camera-intrinsics.txt").is_file():
             self.use_file(folder / "camera-intrinsics.txt")
         self._image_size = _size(read_color(self._frames[0]))
@@ -116,7 +115,7 @@ class RgbdFolder(Source):
         }
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
-        """Raises DatasetError that names the frame and file where one cannot be read."""
+        """Raises SourceError that names the frame and file where one cannot be read."""
         for frame in self._frames:
             color, raw = read_color(frame), read_depth(frame)
             self._check_size(frame, frame.image, _size(color), self._image_size)
@@ -144,27 +143,27 @@ class RgbdFolder(Source):
 
     def _check_size(self, frame: Frame, file: Path, found: Size, expected: Size) -> None:
         if found != expected:
-            raise DatasetError(
+            raise SourceError(
                 f"frame {frame.name}: {file} has {found[0]}x{found[1]} pixels, "
                 f"but the first frame {expected[0]}x{expected[1]}"
             )
 
 
 def read_color(frame: Frame) -> NDArray[np.uint8]:
-    """(H, W, 3) RGB. Raises DatasetError."""
+    """(H, W, 3) RGB. Raises SourceError."""
     pixels = cv2.imread(str(frame.image), cv2.IMREAD_COLOR_RGB)
     if pixels is None:
-        raise DatasetError(f"frame {frame.name}: {_why(frame.image)} as a colour image")
+        raise SourceError(f"frame {frame.name}: {_why(frame.image)} as a colour image")
     return np.asarray(pixels, np.uint8)
 
 
 def read_depth(frame: Frame) -> NDArray[np.uint16]:
-    """(H, W) in the dataset's own units. Raises DatasetError."""
+    """(H, W) in the dataset's own units. Raises SourceError."""
     pixels = cv2.imread(str(frame.depth), cv2.IMREAD_UNCHANGED)
     if pixels is None:
-        raise DatasetError(f"frame {frame.name}: {_why(frame.depth)} as a depth image")
+        raise SourceError(f"frame {frame.name}: {_why(frame.depth)} as a depth image")
     if pixels.dtype != np.uint16 or pixels.ndim != 2:
-        raise DatasetError(
+        raise SourceError(
             f"frame {frame.name}: {frame.depth} must have one 16-bit channel, has {pixels.dtype} {pixels.shape}"
         )
     return np.asarray(pixels, np.uint16)
@@ -181,10 +180,10 @@ def depth_in_metres(
 
 
 def _transform(name: str, numbers: Sequence[float]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Returns translation (3,) and unit quaternion (4,). Raises DatasetError."""
+    """Returns translation (3,) and unit quaternion (4,). Raises SourceError."""
     translation, rotation = np.array(numbers[:3], np.float64), np.array(numbers[3:], np.float64)
     if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
-        raise DatasetError(f"{name}: its last four numbers must be a unit quaternion, got {tuple(numbers[3:])}")
+        raise SourceError(f"{name}: its last four numbers must be a unit quaternion, got {tuple(numbers[3:])}")
     return translation, normalize(rotation)
 
 

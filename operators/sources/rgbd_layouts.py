@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import transform_matrix
+from dataflow.operator import SourceError
 from operators.association import mutually_nearest
 from operators.sources.pacing import frame_stamp
 
@@ -21,10 +22,6 @@ LayoutName = Literal["7scenes", "tum"]
 
 _TUM_GAP = 20_000_000  # ns: images farther apart than this are no pair, as in the dataset's own associate.py
 _FRAME = re.compile(r"frame-(\d+)\.(?:color\.(?:jpg|png)|depth\.png|pose\.txt)")
-
-
-class DatasetError(ValueError):
-    """A dataset that cannot be read: names the file, the frame, what is wrong and what would be right."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,14 +45,14 @@ class Frame:
     pose: Path | Matrix | None
 
     def T_world_camera(self) -> Matrix | None:
-        """The true pose, its rotation made orthonormal, or None. Raises DatasetError for a matrix that is no pose."""
+        """The true pose, its rotation made orthonormal, or None. Raises SourceError for a matrix that is no pose."""
         if self.pose is None or isinstance(self.pose, np.ndarray):
             return self.pose
         T = read_matrix(self.pose, (4, 4))
         if not np.isfinite(T).all():  # 7-Scenes marks a pose it does not know so
             return None
         if np.abs(T[3] - [0, 0, 0, 1]).max() > 1e-6 or np.abs(T[:3, :3] @ T[:3, :3].T - np.eye(3)).max() > 0.05:
-            raise DatasetError(f"{self.pose}: frame {self.name}: not a rigid motion:\n{T}")
+            raise SourceError(f"{self.pose}: frame {self.name}: not a rigid motion:\n{T}")
         T[:3, :3] = nearest_rotation(T[:3, :3])
         return T
 
@@ -72,14 +69,14 @@ class Dataset:
 
 
 def detect_layout(folder: Path) -> LayoutName:
-    """Raises DatasetError where the folder is neither."""
+    """Raises SourceError where the folder is neither."""
     if not folder.is_dir():
-        raise DatasetError(f"no folder {str(folder)!r} (looked for {folder.absolute()})")
+        raise SourceError(f"no folder {str(folder)!r} (looked for {folder.absolute()})")
     if (folder / "rgb.txt").is_file():
         return "tum"
     if any(_FRAME.fullmatch(entry.name) for entry in folder.iterdir()):
         return "7scenes"
-    raise DatasetError(
+    raise SourceError(
         f"{folder} holds neither the 7-Scenes layout (frame-000000.color.jpg, ...) nor TUM RGB-D (rgb.txt, depth.txt)"
     )
 
@@ -98,15 +95,15 @@ def list_7scenes(folder: Path, rate: float, first_stamp: int) -> Dataset:
             numbers[int(match[1])] = match[1]
             present.add(entry.name)
     if not numbers:
-        raise DatasetError(f"{folder} has no frame-NNNNNN.color.jpg, as the 7-Scenes layout has")
+        raise SourceError(f"{folder} has no frame-NNNNNN.color.jpg, as the 7-Scenes layout has")
     frames = []
     for number in sorted(numbers):
         stem = f"frame-{numbers[number]}"
         image = next((f"{stem}.color.{s}" for s in ("jpg", "png") if f"{stem}.color.{s}" in present), None)
         if image is None:
-            raise DatasetError(f"frame {numbers[number]} has no colour image: no {folder / stem}.color.jpg (or .png)")
+            raise SourceError(f"frame {numbers[number]} has no colour image: no {folder / stem}.color.jpg (or .png)")
         if f"{stem}.depth.png" not in present:
-            raise DatasetError(f"frame {numbers[number]} has no depth image: no {folder / stem}.depth.png")
+            raise SourceError(f"frame {numbers[number]} has no depth image: no {folder / stem}.depth.png")
         pose = folder / f"{stem}.pose.txt" if f"{stem}.pose.txt" in present else None
         stamp = frame_stamp(number, rate, first_stamp)
         frames.append(Frame(numbers[number], stamp, folder / image, folder / f"{stem}.depth.png", pose))
@@ -127,9 +124,9 @@ def list_tum(folder: Path) -> Dataset:
         poses = dict(mutually_nearest(stamps, [stamp for stamp, _ in truth], _TUM_GAP))
         pairs = mutually_nearest(stamps, [stamp for stamp, _ in depths], _TUM_GAP)
     except ValueError as error:
-        raise DatasetError(f"{folder}: {error}") from None
+        raise SourceError(f"{folder}: {error}") from None
     if not pairs:
-        raise DatasetError(f"{folder}: no image of rgb.txt is within 20 ms of one of depth.txt")
+        raise SourceError(f"{folder}: no image of rgb.txt is within 20 ms of one of depth.txt")
     frames = []
     for i, j in pairs:
         stamp, (image,) = images[i]
@@ -147,13 +144,13 @@ def nearest_rotation(M: Matrix) -> Matrix:
 
 
 def read_matrix(file: Path, shape: tuple[int, int]) -> Matrix:
-    """A text file of numbers as a matrix. Raises DatasetError."""
+    """A text file of numbers as a matrix. Raises SourceError."""
     try:
         values = np.array(file.read_text().split(), np.float64)
     except (OSError, ValueError) as error:
-        raise DatasetError(f"{file}: {error}") from None
+        raise SourceError(f"{file}: {error}") from None
     if values.size != shape[0] * shape[1]:
-        raise DatasetError(f"{file}: expected {shape[0]}x{shape[1]} numbers, found {values.size}")
+        raise SourceError(f"{file}: expected {shape[0]}x{shape[1]} numbers, found {values.size}")
     return values.reshape(shape)
 
 
@@ -163,14 +160,14 @@ def _intrinsics_file(folder: Path) -> Intrinsics | None:
         return None
     K = read_matrix(file, (3, 3))
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
-        raise DatasetError(f"{file}: not an intrinsic matrix with positive focal lengths:\n{K}")
+        raise SourceError(f"{file}: not an intrinsic matrix with positive focal lengths:\n{K}")
     return Intrinsics(float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2]))
 
 
 def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
     """The lines `seconds value...` of a TUM list file, stamps exact in nanoseconds."""
     if not file.is_file():
-        raise DatasetError(f"the TUM RGB-D layout needs {file.name} (looked for {file.absolute()})")
+        raise SourceError(f"the TUM RGB-D layout needs {file.name} (looked for {file.absolute()})")
     rows = []
     for number, line in enumerate(file.read_text().splitlines(), 1):
         words = line.split()
@@ -179,9 +176,9 @@ def _tum_list(file: Path, values: int) -> list[tuple[int, list[str]]]:
         try:
             stamp = int(Fraction(words[0]) * 10**9)
         except (ValueError, ZeroDivisionError):
-            raise DatasetError(f"{file}:{number}: {words[0]!r} is no time in seconds") from None
+            raise SourceError(f"{file}:{number}: {words[0]!r} is no time in seconds") from None
         if len(words) != values + 1:
-            raise DatasetError(f"{file}:{number}: expected a time and {values} values, found {line!r}")
+            raise SourceError(f"{file}:{number}: expected a time and {values} values, found {line!r}")
         rows.append((stamp, words[1:]))
     return rows
 
@@ -190,8 +187,8 @@ def _tum_pose(folder: Path, stamp: int, words: Sequence[str]) -> Matrix:
     try:
         x, y, z, qx, qy, qz, qw = map(float, words)
     except ValueError as error:
-        raise DatasetError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: {error}") from None
+        raise SourceError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: {error}") from None
     norm = float(np.linalg.norm([qx, qy, qz, qw]))
     if not abs(norm - 1) < 0.01:
-        raise DatasetError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: quaternion of length {norm:.3g}, not 1")
+        raise SourceError(f"{folder / 'groundtruth.txt'}: pose at {stamp} ns: quaternion of length {norm:.3g}, not 1")
     return transform_matrix([x, y, z], [qx, qy, qz, qw])

@@ -12,14 +12,10 @@ from numpy.typing import NDArray
 
 from dataflow.messages import LandmarkSightings, Message, Odometry
 from dataflow.messages.geometry import quaternion_from_yaw
-from dataflow.operator import Out, Param, Source
+from dataflow.operator import Out, Param, Source, SourceError
 
 Array = NDArray[np.float64]
 _PLANAR = [0, 1, 5]
-
-
-class LandmarkFileError(ValueError):
-    """A landmark file that cannot be read: names the file, the line, and what it should hold."""
 
 
 @dataclass
@@ -55,7 +51,7 @@ class VictoriaPark(Source):
     odometry_frame: str = Param("odom", min_length=1, doc="frame of the dead reckoning")
 
     def setup(self) -> None:
-        """Raises LandmarkFileError."""
+        """Raises SourceError."""
         file = Path(self.path).expanduser()
         self.use_file(file)
         self._steps = read_steps(file)
@@ -96,7 +92,7 @@ class VictoriaPark(Source):
 
 
 def read_steps(file: Path) -> list[Step]:
-    """Reads all poses of a file, in their order. Raises LandmarkFileError, OSError."""
+    """Reads all poses of a file, in their order. Raises SourceError, OSError."""
     following: dict[int, int] = {}
     steps: dict[int, Step] = {}
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines(), start=1):
@@ -119,13 +115,13 @@ def read_steps(file: Path) -> list[Step]:
             else:
                 raise ValueError(f"{kind} with {len(values)} numbers")
         except (ValueError, IndexError) as error:
-            raise LandmarkFileError(
+            raise SourceError(
                 f"{file}, line {number}: {error}; expected `ODOMETRY i j dx dy dturn` and 6 numbers of covariance, or "
                 "`LANDMARK i k x y` and 3"
             ) from None
     beginnings = sorted(set(following) - set(following.values()))
     if len(beginnings) != 1:
-        raise LandmarkFileError(f"{file}: its poses are not one chain; it begins at {beginnings or 'no pose'}")
+        raise SourceError(f"{file}: its poses are not one chain; it begins at {beginnings or 'no pose'}")
     ordered, pose = [steps[beginnings[0]]], beginnings[0]
     while pose in following:
         pose = following[pose]

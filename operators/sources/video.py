@@ -15,16 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import CameraInfo, Image, Message
-from dataflow.operator import Duration, Out, Param, Source
+from dataflow.operator import Duration, Out, Param, Source, SourceError
 from operators.sources.pacing import frame_stamp
 
 Pixels = NDArray[np.uint8]
 SILENT = 3
 """Reads in a row that give nothing, after which a camera counts as unplugged."""
-
-
-class VideoError(OSError):
-    """A video that cannot be read: names it, what is wrong, and what would be right."""
 
 
 class _Video(Source):
@@ -78,14 +74,14 @@ class VideoFile(_Video):
     stop: int | None = Param(None, ge=1, doc="frame to stop before; none reads to the end")
 
     def setup(self) -> None:
-        """Raises VideoError, FileNotFoundError."""
+        """Raises SourceError, FileNotFoundError."""
         path = self.use_file(Path(self.input).expanduser())
         self._video = cv2.VideoCapture(str(path))
         if not self._video.isOpened():
-            raise VideoError(f"{path} is no video that OpenCV {cv2.__version__} can decode")
+            raise SourceError(f"{path} is no video that OpenCV {cv2.__version__} can decode")
         read, first = self._video.read()
         if not read:
-            raise VideoError(f"{path} holds no frame that can be decoded")
+            raise SourceError(f"{path} holds no frame that can be decoded")
         self._size = (first.shape[1], first.shape[0])
         self._rate = self.rate or self._video.get(cv2.CAP_PROP_FPS) or 25.0
         self._video.set(cv2.CAP_PROP_POS_FRAMES, 0)
@@ -130,14 +126,14 @@ class Webcam(_Video):
     retry: Duration = Param("1s", ge=10_000_000, doc="pause between two looks for a camera that is gone")
 
     def setup(self) -> None:
-        """Raises VideoError where there is no camera, or it gives no image."""
+        """Raises SourceError where there is no camera, or it gives no image."""
         self._stopped = threading.Event()
         self._camera = self._open()
         if self._camera is None:
-            raise VideoError(f"camera {self.input!r} does not open; {_cameras()}")
+            raise SourceError(f"camera {self.input!r} does not open; {_cameras()}")
         bgr = self._read()
         if bgr is None:
-            raise VideoError(f"camera {self.input!r} gives no image: another program may be using it")
+            raise SourceError(f"camera {self.input!r} gives no image: another program may be using it")
         self._size = (bgr.shape[1], bgr.shape[0])
 
     def stream(self) -> Iterator[Mapping[str, Message]]:
@@ -188,7 +184,7 @@ class Webcam(_Video):
         return None
 
     def _look_for_it(self) -> None:
-        """Waits until the camera is back, or the run ends. Raises VideoError for images of another size."""
+        """Waits until the camera is back, or the run ends. Raises SourceError for images of another size."""
         if self._stopped.is_set():
             return
         self.log.warning("camera %s gives no image any more: looking for it every %g s", self.input, self.retry * 1e-9)
@@ -202,7 +198,7 @@ class Webcam(_Video):
                 self._camera = None
                 continue
             if (bgr.shape[1], bgr.shape[0]) != self._size:
-                raise VideoError(
+                raise SourceError(
                     f"camera {self.input!r} came back with {bgr.shape[1]}x{bgr.shape[0]} pixels instead of "
                     f"{self._size[0]}x{self._size[1]}"
                 )

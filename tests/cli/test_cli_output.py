@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from dataflow.cli.arguments import chosen_streams, existing, graph_file, output_file, window
-from dataflow.cli.output import friendly_errors, jsonable, plural, seconds, size
+from dataflow.cli.output import about_a_file, friendly_errors, jsonable, plural, seconds, size
 from dataflow.cli.progress import RunDisplay, shown
 from dataflow.cli.report import print_report, report_json
 from dataflow.supervision.report import OperatorCounts, RunFailed, RunReport, Status
@@ -268,6 +268,22 @@ def test_a_missing_file_of_an_operator_is_one_message_without_a_traceback(monkey
         with pytest.raises(typer.Exit), friendly_errors():
             raise failure
         assert ("Traceback" in capsys.readouterr().err) == (asked == "1")
+
+
+@pytest.mark.parametrize(
+    ("last", "file"),
+    [
+        ("dataflow.ports.SourceError: pose.txt: not a rigid motion:\n[[1 0]\n [0 1]]", True),  # text of several lines
+        ("PermissionError: [Errno 13] Permission denied: 'a.png'", True),
+        ("ValueError: SourceError: no", False),
+        ("KeyError: 'a'", False),
+    ],
+)
+def test_an_error_about_a_file_is_told_by_its_class(last: str, file: bool) -> None:
+    trace = f'Traceback (most recent call last):\n  File "x.py", line 1, in setup\n    read()\n    ^^^^^^\n{last}\n'
+
+    assert about_a_file(trace) is file
+    assert not about_a_file(last)
 
 
 def test_an_interruption_is_no_error(capsys) -> None:

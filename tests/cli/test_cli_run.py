@@ -231,6 +231,38 @@ def test_ctrl_c_ends_a_run_in_order_with_code_130(small: Path, tmp_path: Path) -
     assert f"wrote {path}" in stdout
 
 
+ABSENT = """\
+from dataflow.messages import FeatureVector
+from dataflow.operator import Out, Param, Source, SourceError
+
+
+class Reader(Source):
+    made: Out[FeatureVector]
+    path: str = Param(doc="folder")
+    layout: str = Param("any", doc="how files lie in any folder")
+
+    def setup(self):
+        raise SourceError(f"no any.png in {self.path}/images, as any such folder has")
+
+    def stream(self):
+        yield from ()
+"""
+
+
+def test_data_that_is_not_there_is_one_line_and_the_parameter_that_names_other_data(dataflow, tmp_path: Path) -> None:
+    (tmp_path / "absent_reader.py").write_text(ABSENT)
+    (tmp_path / "absent.yaml").write_text(
+        f"graph: absent\noperators:\n  camera: {{use: 'absent_reader:Reader', params: {{path: {tmp_path}/nowhere}}}}\n"
+    )
+    told = dataflow("run", tmp_path / "absent.yaml", "--path", tmp_path, "-q", code=1).stderr
+
+    assert told.splitlines() == [
+        "error: operator 'camera' failed in setup(): SourceError: no any.png in "
+        f"{tmp_path}/nowhere/images, as any such folder has",
+        "name another with --set camera.path=...",
+    ]
+
+
 SLOW = """\
 import time
 from pathlib import Path

@@ -8,9 +8,10 @@ import h5py
 import numpy as np
 import pytest
 
+from dataflow.operator import SourceError
 from dataflow.testing import play
 from operators.sources import BroadImu
-from operators.sources.broad_imu import BroadError, read_trial
+from operators.sources.broad_imu import read_trial
 
 
 def trial(file: Path, **changes: object) -> Path:
@@ -54,20 +55,20 @@ def test_everything_known_is_given_if_asked(tmp_path: Path) -> None:
     ],
 )
 def test_a_wrong_broad_file_is_named(tmp_path: Path, changes: dict[str, object], words: str) -> None:
-    with pytest.raises(BroadError, match=words):
+    with pytest.raises(SourceError, match=words):
         read_trial(trial(tmp_path / "a.hdf5", **changes))
 
 
 def test_what_is_no_broad_file_is_named(tmp_path: Path) -> None:
     text = tmp_path / "a.hdf5"
     text.write_text("words")
-    with pytest.raises(BroadError, match="no HDF5 file"):
+    with pytest.raises(SourceError, match="no HDF5 file"):
         read_trial(text)
     with h5py.File(text, "w") as made:
         made["imu_gyr"] = np.zeros((1, 3))
-    with pytest.raises(BroadError, match="no data set 'imu_acc'"):
+    with pytest.raises(SourceError, match="no data set 'imu_acc'"):
         read_trial(text)
-    with pytest.raises(BroadError, match="start=9, stop=None leaves none"):
+    with pytest.raises(SourceError, match="start=9, stop=None leaves none"):
         BroadImu(path=str(trial(tmp_path / "b.hdf5")), start=9).setup()
 
 
@@ -78,7 +79,7 @@ def test_a_wrong_sampling_rate_is_named(tmp_path: Path, rate: float | None) -> N
         del content.attrs["sampling_rate"]
         if rate is not None:
             content.attrs["sampling_rate"] = rate
-    with pytest.raises(BroadError, match="sampling_rate must be a number above 0"):
+    with pytest.raises(SourceError, match="sampling_rate must be a number above 0"):
         read_trial(file)
 
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from dataflow.messages import Message
+from dataflow.operator import SourceError
 from dataflow.testing import play
 from operators.sources import EurocImu
-from operators.sources.euroc_imu import EurocError
 
 IMU = "#stamp,gyro,accel\n100,0.1,0.2,0.3,1,2,3\n5000100,0.4,0.5,0.6,4,5,6\n"
 TRUTH = "# t p q\n0.0000001 1 2 3 0 0 0 1\n0.00250 1 2 4 0 0 1 0\n"
@@ -61,12 +61,12 @@ def test_a_euroc_folder_without_truth_or_densities_gives_the_samples_alone(folde
 )
 def test_a_wrong_euroc_file_is_named(folder: Path, name: str, text: str, words: str) -> None:
     (folder / name).write_text(text)
-    with pytest.raises(EurocError, match=words):
+    with pytest.raises(SourceError, match=words):
         EurocImu(path=str(folder)).setup()
 
 
 def test_a_missing_euroc_folder_and_file_are_named(folder: Path) -> None:
-    with pytest.raises(EurocError, match="no folder"):
+    with pytest.raises(SourceError, match="no folder"):
         EurocImu(path=str(folder / "other")).setup()
     (folder / "imu.csv").unlink()
     with pytest.raises(FileNotFoundError, match=r"imu\.csv"):

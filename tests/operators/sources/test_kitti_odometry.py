@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from dataflow.messages import CameraInfo, Image
+from dataflow.operator import SourceError
 from dataflow.testing import play
 from operators.sources import KittiOdometry
-from operators.sources.kitti_odometry import KittiError, read_poses, read_projections
+from operators.sources.kitti_odometry import read_poses, read_projections
 
 K = np.array([[300.0, 0, 24], [0, 300, 16], [0, 0, 1]])
 BASELINE = 0.5
@@ -129,24 +130,24 @@ def test_a_folder_that_is_broken_is_named(tmp_path: Path, file: str, text: str |
         (folder / file).unlink()
     else:
         (folder / file).write_text(text)
-    with pytest.raises((KittiError, FileNotFoundError), match=words):
+    with pytest.raises((SourceError, FileNotFoundError), match=words):
         KittiOdometry(path=str(folder)).setup()
 
 
 def test_an_image_that_cannot_be_used_is_named(tmp_path: Path) -> None:
     folder = written(tmp_path)
     (folder / "image_1" / "000001.png").write_bytes(b"no image")
-    with pytest.raises(KittiError, match=r"cannot decode .*image_1.000001\.png"):
+    with pytest.raises(SourceError, match=r"cannot decode .*image_1.000001\.png"):
         read(folder)
     cv2.imwrite(str(folder / "image_1" / "000001.png"), np.zeros((8, 8), np.uint8))
-    with pytest.raises(KittiError, match="has 8x8 pixels, the first image 48x32"):
+    with pytest.raises(SourceError, match="has 8x8 pixels, the first image 48x32"):
         read(folder)
 
 
 def test_a_folder_without_images_and_a_span_without_any_are_named(tmp_path: Path) -> None:
-    with pytest.raises(KittiError, match="holds no pair of folders: image_l/image_r"):
+    with pytest.raises(SourceError, match="holds no pair of folders: image_l/image_r"):
         KittiOdometry(path=str(tmp_path)).setup()
-    with pytest.raises(KittiError, match=r"holds no image \*\.png from 3 to None"):
+    with pytest.raises(SourceError, match=r"holds no image \*\.png from 3 to None"):
         KittiOdometry(path=str(written(tmp_path)), start=3).setup()
 
 

@@ -16,11 +16,11 @@ from dataflow.interop.export.material import Material
 from dataflow.interop.export.report import Exported
 from dataflow.messages import Imu, Message, NavSatFix, Odometry, PointCloud, Transforms
 from dataflow.messages.geometry import quaternion_to_matrix
+from dataflow.operator import SourceError
 from dataflow.recording import RecordingWriter
 from dataflow.testing import Played, play
 from operators.sources import KittiRaw
 from operators.sources.kitti_oxts import Packet, messages_of, read_packet
-from operators.sources.kitti_raw import KittiError
 
 LEVEL = Packet(
     lat=49.0, lon=8.4, alt=116.0, roll=0.0, pitch=0.0, yaw=0.0,
@@ -143,14 +143,14 @@ def test_the_place_of_the_unit_is_known_where_its_file_is(tmp_path: Path) -> Non
 def test_a_packet_that_cannot_be_read_names_its_file_and_number(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "0000000000.txt"
     file.write_text(text)
-    with pytest.raises(KittiError, match=message) as caught:
+    with pytest.raises(SourceError, match=message) as caught:
         read_packet(file)
     assert str(file) in str(caught.value)
 
 
 def test_fewer_times_than_packets_are_refused(tmp_path: Path) -> None:
     folder = drive(tmp_path, [LEVEL] * 3, times=["2011-09-26 13:02:25.0"])
-    with pytest.raises(KittiError, match="has 1 lines for 3 packets"):
+    with pytest.raises(SourceError, match="has 1 lines for 3 packets"):
         KittiRaw(path=str(folder)).setup()
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from dataflow.messages import CameraInfo, Image, PointCloud, Transforms
+from dataflow.operator import SourceError
 from dataflow.testing import play
 from operators.sources import KittiRaw
-from operators.sources.kitti_raw import KittiError
 
 R_VELO = "0 -1 0 0 0 -1 1 0 0"
 IMAGE = np.full((4, 6, 3), (10, 20, 200), np.uint8)  # RGB
@@ -86,7 +86,7 @@ def test_the_extrinsics_take_the_lidar_to_the_colour_camera_beside_the_reference
 def test_a_folder_that_cannot_be_used_is_refused_by_name(tmp_path: Path, break_it: Any, message: str) -> None:
     folder = simple(tmp_path)
     break_it(folder)
-    with pytest.raises(KittiError, match=message):
+    with pytest.raises(SourceError, match=message):
         KittiRaw(path=str(folder)).setup()
 
 
@@ -95,7 +95,7 @@ def test_a_scan_that_was_cut_off_is_named(tmp_path: Path) -> None:
     (folder / "velodyne" / "0000000001.bin").write_bytes(b"x" * 17)
     source = KittiRaw(path=str(folder))
     source.setup()
-    with pytest.raises(KittiError, match=r"0000000001\.bin has 17 bytes; 16 a point expected"):
+    with pytest.raises(SourceError, match=r"0000000001\.bin has 17 bytes; 16 a point expected"):
         list(source.stream())
 
 

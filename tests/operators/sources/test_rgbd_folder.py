@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from dataflow.messages import CameraInfo, DepthImage, Image, Message, Pose, Transforms
-from dataflow.operator import ParameterError
+from dataflow.operator import ParameterError, SourceError
 from operators.sources import RgbdFolder
-from operators.sources.rgbd_layouts import DatasetError, nearest_rotation
+from operators.sources.rgbd_layouts import nearest_rotation
 
 COLOR = np.zeros((6, 8, 3), np.uint8)
 COLOR[..., 0], COLOR[..., 2] = 200, 10  # RGB: reddish
@@ -169,27 +169,27 @@ def test_equal_folders_give_equal_digests(tmp_path: Path) -> None:
 )
 def test_a_spoiled_file_is_named_with_its_frame(tmp_path: Path, spoil, message: str) -> None:  # type: ignore[no-untyped-def]
     spoil(write_7scenes(tmp_path))
-    with pytest.raises(DatasetError, match=message):
+    with pytest.raises(SourceError, match=message):
         read(tmp_path)
 
 
 def test_spoiled_tum_lists_are_named_with_their_line(tmp_path: Path) -> None:
     write_tum(tmp_path)
     (tmp_path / "depth.txt").write_text("10.0 depth/0.png\nsoon depth/1.png\n")
-    with pytest.raises(DatasetError, match=r"depth\.txt:2: 'soon' is no time in seconds"):
+    with pytest.raises(SourceError, match=r"depth\.txt:2: 'soon' is no time in seconds"):
         read(tmp_path)
     (tmp_path / "depth.txt").write_text("10.0 depth/9.png\n")
-    with pytest.raises(DatasetError, match=r"no file .*depth/9\.png"):
+    with pytest.raises(SourceError, match=r"no file .*depth/9\.png"):
         read(tmp_path)
 
 
 def test_folders_and_slices_without_frames_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DatasetError, match="holds neither the 7-Scenes layout"):
+    with pytest.raises(SourceError, match="holds neither the 7-Scenes layout"):
         read(tmp_path)
-    with pytest.raises(DatasetError, match=r"no folder .*nowhere"):
+    with pytest.raises(SourceError, match=r"no folder .*nowhere"):
         read(tmp_path / "nowhere")
     write_7scenes(tmp_path)
-    with pytest.raises(DatasetError, match="has 3 frames: start=5"):
+    with pytest.raises(SourceError, match="has 3 frames: start=5"):
         read(tmp_path, start=5)
     with pytest.raises(ParameterError, match=r"RgbdFolder\.rate"):
         RgbdFolder(path=str(tmp_path), rate=0)

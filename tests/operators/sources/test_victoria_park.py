@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from dataflow.messages.geometry import yaw_of
+from dataflow.operator import SourceError
 from operators.sources import VictoriaPark
-from operators.sources.victoria_park import LandmarkFileError, read_steps
+from operators.sources.victoria_park import read_steps
 
 TEXT = """ODOMETRY 0 1 1.0 0.0 1.5707963267948966 0.01 0 0 0.02 0 0.03
 LANDMARK 1 7 2.0 -1.0 0.4 0.1 0.5
@@ -73,7 +74,7 @@ def test_reading_twice_gives_equal_bits(file: Path) -> None:
 def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, text: str, words: str) -> None:
     made = tmp_path / "bad.txt"
     made.write_text(text)
-    with pytest.raises(LandmarkFileError, match=words):
+    with pytest.raises(SourceError, match=words):
         read_steps(made)
 
 

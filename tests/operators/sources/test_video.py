@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from dataflow.messages import CameraInfo, Image
+from dataflow.operator import SourceError
 from dataflow.testing import play
 from operators.sources import VideoFile, Webcam
-from operators.sources.video import SILENT, VideoError
+from operators.sources.video import SILENT
 
 SIZE = (48, 32)
 
@@ -140,7 +141,7 @@ def test_a_camera_that_is_not_there_at_the_start_is_an_error(
 ) -> None:
     source = webcam(monkeypatch, camera)
 
-    with pytest.raises((VideoError, Exception), match=wrong):
+    with pytest.raises((SourceError, Exception), match=wrong):
         play(source)
 
 

@@ -107,6 +107,17 @@ def test_a_graph_that_comes_with_dataflow_is_called_by_its_name(monkeypatch: pyt
     assert called[0][4].endswith("graphs/synthetic_rgbd.yaml")
 
 
+@pytest.mark.parametrize(("graph", "parameter"), [("perception_kitti", "car"), ("slam_folder", "camera")])
+def test_data_that_is_not_there_is_one_line(graph: str, parameter: str, capfd: pytest.CaptureFixture[str]) -> None:
+    ran = CliRunner().invoke(evaluate, ["graph", graph, "--set", "data=/nowhere"])
+    told = capfd.readouterr().err
+
+    assert ran.exit_code == 1
+    assert told.startswith(f"error: operator '{parameter}' failed in setup(): SourceError: no ")
+    assert told.endswith(f"name another with --set {parameter}.path=...\n")
+    assert "Traceback" not in told
+
+
 def test_a_graph_without_data_is_named() -> None:
     with pytest.raises(ValueError, match=r"none of data, path.*its parameters: seed"):
         data_settings({"seed": 1}, ["here"])
