@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
 
-def quantile(share: ArrayLike, freedom: ArrayLike) -> np.float64:
-    """Returns the value that `share` of a chi-square distribution of `freedom` degrees lie below; arrays give arrays.
+def quantile(share: ArrayLike, freedom: ArrayLike) -> NDArray[np.float64]:
+    """Returns the values that the `share` of a chi-square distribution of `freedom` degrees lies below, elementwise.
 
     It equals `scipy.stats.chi2.ppf` bit by bit, and does not load `scipy.stats`, which takes a second.
     """
-    return 2 * gammaincinv(np.asarray(freedom) / 2, share)
+    return np.asarray(2 * gammaincinv(np.asarray(freedom) / 2, share))
