@@ -13,6 +13,12 @@ from operators.odometry.surface import Surface
 RECENT = 5  # newest keyframes, never forgotten
 EARLIER = 6  # keyframes back, at most, to one that tells what has moved since
 REACH = 0.7  # radians of view change beyond which two views share too little to be compared
+DRIFTED = 0.06  # metres: of keyframes that the odometry may have drifted farther from, a view is not laid on the surfaces
+
+
+def drift(a: Keyframe, b: Keyframe) -> float:
+    """Returns the standard deviation, metres, by which the place of one keyframe is less sure than another's."""
+    return float(np.sqrt(abs(np.trace(a.covariance[:3, :3]) - np.trace(b.covariance[:3, :3]))))
 
 
 class LocalMap:
@@ -65,8 +71,13 @@ class LocalMap:
         ]
 
     def nearby(self, T_world_camera: Matrix, count: int, segment: int, reach: float = REACH) -> list[Keyframe]:
-        """Returns a segment's newest keyframe, then those whose views are nearest to a pose's."""
+        """Returns a segment's newest keyframe, then those whose views are nearest to a pose's, and their places sure.
+
+        A camera that comes round again sees old keyframes at a place that is as far off as it has drifted: laid on
+        them, a pose would be torn from one place to the other, and what stands still would seem to move.
+        """
         *older, newest = (k for k in self.keyframes if k.segment == segment)
+        older = [k for k in older if drift(k, newest) < DRIFTED]
         depth = newest.surface.typical_depth
         distances = [view_distance(k.T_world_camera, T_world_camera, depth) for k in older]
         ranked = sorted(range(len(older)), key=distances.__getitem__)

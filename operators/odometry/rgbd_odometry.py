@@ -220,7 +220,7 @@ class RgbdOdometry:
         starved = fit.inliers < max(0.4 * len(newest.points), 3 * self.config.min_inliers) or fit.recognised
         better = frame.depth_flaw is None and newest.surface.coverage < 0.5 * surface.coverage
         worse = frame.depth_flaw is None and surface.coverage < 0.5 * newest.surface.coverage
-        if not (moved or starved or better) or worse:
+        if not (moved or starved or better) or (worse and not starved):
             return False
         candidate = self._keyframe(frame, fit)
         richer = len(candidate.points) > 1.5 * fit.inliers + self.config.min_inliers

@@ -1,11 +1,13 @@
-"""The keyframes that an odometry remembers: how much memory they take."""
+"""The keyframes that an odometry remembers: how much memory they take, and which a view is laid on."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from operators.odometry.keyframe import Keyframe
-from operators.odometry.local_map import RECENT, LocalMap
+from operators.odometry.local_map import DRIFTED, RECENT, LocalMap
 from operators.odometry.surface import Surface
 
 K = np.array([[140.0, 0.0, 79.5], [0.0, 140.0, 59.5], [0.0, 0.0, 1.0]])
@@ -58,3 +60,23 @@ def test_planes_that_are_made_anew_are_the_same() -> None:
     assert surface.bordered_planes is not planes
     assert surface.bordered_planes.tobytes() == planes.tobytes()
     assert surface.bordered.tobytes() == bordered.tobytes()
+
+
+def test_a_view_is_not_laid_on_keyframes_from_which_the_odometry_may_have_drifted_far() -> None:
+    """It comes round to the first of them, whose place by the newest is as unsure as the way between them was long."""
+    known = LocalMap(20)
+    for number in range(4):
+        drifted = number * 0.4 * DRIFTED  # a standard deviation
+        known.add(replace(keyframe(number), covariance=np.diag([drifted**2, 0, 0, 0, 0, 0])))
+
+    sure = [k.stamp for k in known.nearby(keyframe(0).T_world_camera, 4, 0, reach=3.0)]
+
+    assert sure == [3, 2]
+
+
+def test_a_camera_that_is_placed_again_is_not_laid_on_what_it_drifted_past_meanwhile() -> None:
+    known = LocalMap(20)
+    known.add(replace(keyframe(1), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
+    known.add(keyframe(0))
+
+    assert [k.stamp for k in known.nearby(keyframe(0).T_world_camera, 4, 0)] == [0]

@@ -333,6 +333,15 @@ def test_sparse_depth_is_depth(share: float) -> None:
     assert errors(results, poses)[0] < 0.03
 
 
+def test_keyframes_are_renewed_where_depth_reaches_less_far() -> None:
+    """Most of what comes into view is beyond the reach of the depth camera: poorer keyframes are all that there is."""
+    frames, poses = sequence(60, 1.5)
+    far = [(g, np.where(np.arange(SIZE[0]) > 0.4 * SIZE[0], np.float32(0), d)) for g, d in frames]
+    results = follow([*frames[:3], *far[3:]])
+    assert {r.status for r in results} == {Status.TRACKING}
+    assert errors(results, poses)[0] < 0.01
+
+
 def test_old_map_is_found_again_after_a_gap() -> None:
     frames, poses = sequence(60, 1.5)
     blind = [black(without_depth(frames[0]))] * 30
