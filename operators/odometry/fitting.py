@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.geometry.perspective import agreed_pose
 from operators.geometry.pinhole import Pixels, Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.alignment import Freedom, PixelTerm, PlaneTerm, PriorTerm, align
@@ -33,6 +33,7 @@ SYSTEMATIC = 0.43
 JITTER = 0.38  # working pixels; variances grow with the fourth power of what tracks miss by beyond it
 CONTESTED = 120.0  # of the product of both shares, and of the square of the gate
 
+ITERATIONS = 300  # of RANSAC, at most
 RIVAL = 0.33  # of the tracks that agree: as many that agree on another motion contest it
 
 STAGES = ((4, 0.15, 2), (2, 0.06, 2))  # stride over patches, gate in metres, iterations
@@ -125,7 +126,7 @@ class Fitter:
     def solve(
         self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
     ) -> Sighting | None:
-        """RANSAC PnP; OpenCV seeds it alike at every call."""
+        """Returns the pose that most points agree with, and those that do, if enough do: see `agreed_pose`."""
         return self._consensus(points_world, pixels, ages, threshold, fewest)[0]
 
     def _consensus(
@@ -136,15 +137,10 @@ class Fitter:
         if len(points_world) < fewest:
             return None, none
         threshold = max(threshold, 1.0)
-        ok, rotation, translation, inliers = cv2.solvePnPRansac(
-            points_world, pixels, self.camera.K_color, None, iterationsCount=300,
-            reprojectionError=threshold, confidence=0.999, flags=cv2.SOLVEPNP_AP3P,
-        )  # fmt: skip
-        if not ok or inliers is None:
+        found = agreed_pose(points_world, pixels, self.camera.K_color, threshold, ITERATIONS)
+        if found is None:
             return None, none
-        T_color_world = np.eye(4)
-        T_color_world[:3, :3] = cv2.Rodrigues(rotation)[0]
-        T_color_world[:3, 3] = translation.ravel()
+        T_color_world = found[0]
         error = project(transform_points(T_color_world, points_world), self.camera.K_color) - pixels
         chosen = np.einsum("ij,ij->i", error, error) < threshold**2
         if np.count_nonzero(chosen) < fewest:

@@ -13,7 +13,7 @@ from operators.odometry.surface import Surface
 RECENT = 5  # newest keyframes, never forgotten
 EARLIER = 6  # keyframes back, at most, to one that tells what has moved since
 REACH = 0.7  # radians of view change beyond which two views share too little to be compared
-DRIFTED = 0.06  # metres: of keyframes that the odometry may have drifted farther from, a view is not laid on the surfaces
+DRIFTED = 0.06  # metres: no view is laid on the surfaces of keyframes that the odometry may have drifted farther from
 
 
 def drift(a: Keyframe, b: Keyframe) -> float:

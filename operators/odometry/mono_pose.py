@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from dataflow.messages.geometry import invert, transform_points
+from operators.geometry.perspective import agreed_pose
 from operators.geometry.pinhole import Pixels, Points, project
 from operators.geometry.se3 import Matrix
 from operators.odometry.alignment import PixelTerm, PriorTerm, align
 from operators.odometry.features import Mask
+
+ITERATIONS = 200  # of RANSAC, at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,18 +29,14 @@ class PosedView:
 
 def solved(points: Points, pixels: Pixels, K: Matrix, error: float, fewest: int) -> tuple[Matrix, Mask] | None:
     """Returns T_world_camera by RANSAC, and which points (N, 3) agree within an error in pixels; None if too few do."""
-    if len(points) < max(fewest, 5):
+    if len(points) < fewest:
         return None
-    ok, rotation, translation, inliers = cv2.solvePnPRansac(
-        points, pixels, K, None, iterationsCount=200, reprojectionError=error, confidence=0.999, flags=cv2.SOLVEPNP_AP3P
-    )
-    if not ok or inliers is None or len(inliers) < fewest:
+    found = agreed_pose(points, pixels, K, error, ITERATIONS)
+    if found is None or len(found[1]) < fewest:
         return None
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], translation.ravel()
     agree = np.zeros(len(points), np.bool_)
-    agree[inliers.ravel()] = True
-    return invert(T), agree
+    agree[found[1]] = True
+    return invert(found[0]), agree
 
 
 def refined(points: Points, pixels: Pixels, T: Matrix, K: Matrix, sigma: float, gate: float) -> PosedView:
