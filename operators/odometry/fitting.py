@@ -136,24 +136,30 @@ class Fitter:
         none = np.zeros(len(points_world), np.bool_)
         if len(points_world) < fewest:
             return None, none
-        threshold = max(threshold, 1.0)
-        found = agreed_pose(points_world, pixels, self.camera.K_color, threshold, ITERATIONS)
+        found = agreed_pose(points_world, pixels, self.camera.K_color, max(threshold, 1.0), ITERATIONS)
         if found is None:
             return None, none
-        T_color_world = found[0]
-        error = project(transform_points(T_color_world, points_world), self.camera.K_color) - pixels
-        chosen = np.einsum("ij,ij->i", error, error) < threshold**2
+        T_world_camera = invert(found[0]) @ self.camera.T_color_depth
+        chosen = self._agree(T_world_camera, points_world, pixels, threshold)
         if np.count_nonzero(chosen) < fewest:
             return None, none
-        T_world_camera = invert(T_color_world) @ self.camera.T_color_depth
         return Sighting(T_world_camera, points_world[chosen], pixels[chosen], ages[chosen], len(points_world)), chosen
+
+    def _agree(
+        self, T_world_camera: Matrix, points_world: Points, pixels: Pixels, threshold: float
+    ) -> NDArray[np.bool_]:
+        """Returns which points (N, 3) a pose sees where they were found."""
+        T_color_world = self.camera.T_color_depth @ invert(T_world_camera)
+        error = project(transform_points(T_color_world, points_world), self.camera.K_color) - pixels
+        return np.asarray(np.einsum("ij,ij->i", error, error) < max(threshold, 1.0) ** 2, np.bool_)
 
     def follow(
         self, points_world: Points, pixels: Pixels, ages: NDArray[np.int64], threshold: float, fewest: int
     ) -> Sighting | None:
         """As `solve`, for tracks: where those that disagree agree on a second motion, the larger surface stands still.
 
-        What moves stands before the world: it may fill most of the image, and yet is smaller than what it hides.
+        What moves stands before the world: it may fill most of the image, and yet is smaller than what it hides. Some
+        corners agree with both motions, far ones above all, and count for both.
         """
         first, agree = self._consensus(points_world, pixels, ages, threshold, fewest)
         if first is None:
@@ -162,8 +168,12 @@ class Fitter:
         second = self.solve(points_world[~agree], pixels[~agree], ages[~agree], threshold, rivals)
         if second is None:
             return first
-        still, moving = sorted((first, second), key=_area, reverse=True)
-        return replace(still, tracked=len(points_world), contrary=moving.points_camera)
+        also = self._agree(second.T_world_camera, points_world, pixels, threshold)
+        rival = Sighting(second.T_world_camera, points_world[also], pixels[also], ages[also], len(points_world))
+        if _area(first) >= _area(rival):
+            return replace(first, contrary=second.points_camera)
+        alone = agree & ~also
+        return replace(rival, contrary=replace(first, points_world=points_world[alone]).points_camera)
 
     def refine(
         self,
