@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dataflow.messages import Activity, Boxes3D, Odometry, Pose, SceneGraph
 from dataflow.operator import In, Operator, Out, Param, Sampled
 from operators.recognition.activity_model import ActivityModel
+from operators.recognition.activity_samples import STEP
 from operators.recognition.agent_features import AGENTS, DRINKS, AgentWindow, Surroundings
 from operators.recognition.in_hand import Hand, drinking
 from operators.recognition.possible import possible
@@ -24,10 +25,14 @@ from operators.weights import shipped
 
 @dataclass
 class _Agent:
-    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), its hand."""
+    """State of one agent: its recent past, the network's state (2, L, W), what it does, since when (ns), its hand.
+
+    `stepped` is the time (ns) of the graph whose step is the last in the state, None where there is none.
+    """
 
     window: AgentWindow
     state: NDArray[np.float32]
+    stepped: int | None
     activity: str
     since: int
     hand: Hand
@@ -37,8 +42,9 @@ class ActivityRecognizer(Operator):
     """Says what each person, robot and ball of a scene does, by a recurrent network over motion and surroundings.
 
     A vector of an agent's motion in the last 2.5 s, its extent and the seats, tables and drinks around it goes at each
-    graph into two LSTM layers, whose state is kept from graph to graph for as long as the agent is in the scene; the
-    network answers for a quarter of a second ago. `unknown` stands for what is too unsure, or too long out of sight.
+    graph into two LSTM layers. Their state is kept for as long as the agent is in the scene, and goes on by steps of
+    0.15 s at least, however often graphs come; the network answers for a quarter of a second ago. `unknown` stands for
+    what is too unsure, or too long out of sight.
 
     What motion and surroundings exclude is not said: nobody sits down or stands up away from every seat, and a robot
     that moves does not rest. Who has reached for a drink has it in hand for a while: one who then seems to stand
@@ -104,18 +110,20 @@ class ActivityRecognizer(Operator):
 
     def snapshot(self) -> Mapping[str, Any]:
         agents = [
-            [i, a.window.snapshot(), a.state, a.activity, a.since, a.hand.snapshot()] for i, a in self._agents.items()
+            [i, a.window.snapshot(), a.state, a.stepped, a.activity, a.since, a.hand.snapshot()]
+            for i, a in self._agents.items()
         ]
         return {"agents": agents, "around": self._around.snapshot(), "counts": dict(self._counts)}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         self._begin()
         self._around.restore(state["around"])
-        for id, window, network, activity, since, hand in state["agents"]:
+        for id, window, network, stepped, activity, since, hand in state["agents"]:
             kept, held = AgentWindow(), Hand()
             kept.restore(window)
             held.restore(hand)
-            self._agents[int(id)] = _Agent(kept, np.array(network, np.float32), str(activity), int(since), held)
+            last = None if stepped is None else int(stepped)
+            self._agents[int(id)] = _Agent(kept, np.array(network, np.float32), last, str(activity), int(since), held)
         self._counts = Counter({key: int(n) for key, n in state["counts"].items()})
 
     def summary(self) -> Mapping[str, float | int]:
@@ -123,7 +131,7 @@ class ActivityRecognizer(Operator):
         return dict(self._counts)
 
     def _fresh(self, stamp: int) -> _Agent:
-        return _Agent(AgentWindow(), self._model.fresh(), "", stamp, Hand())
+        return _Agent(AgentWindow(), self._model.fresh(), None, "", stamp, Hand())
 
     def _answer(
         self,
@@ -144,7 +152,8 @@ class ActivityRecognizer(Operator):
         chosen = []
         for k, body in enumerate(agents):
             agent = self._agents[body.id]
-            agent.state = states[k]
+            if agent.stepped is None or stamp - agent.stepped >= STEP * 1e9:
+                agent.state, agent.stepped = states[k], stamp
             fresh = stamp - seen[body.id] <= self.memory * 1e9
             if self._holds(stamp, body, self._likeliest(probabilities[k], fresh), drinks):
                 probabilities[k, :-1] = drinking(probabilities[k, :-1], self._classes[:-1])

@@ -15,6 +15,9 @@ from operators.recognition.tracked_people import Moment, tracked_moments, true_m
 LAG = 0.25
 """Seconds by which what is said trails what is done: what comes right after tells a beginning from a passing look."""
 
+STEP = 0.15
+"""Seconds that a step of the network takes at least, however often agents are seen."""
+
 
 @dataclass(frozen=True, eq=False)
 class Track:

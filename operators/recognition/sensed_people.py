@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dataflow.messages import Boxes3D, Odometry, Pose, SceneGraph
-from operators.recognition.activity_samples import LAG, sequences
+from operators.recognition.activity_samples import LAG, STEP, sequences
 from operators.recognition.agent_features import AGENTS
 from operators.recognition.scene_agents import scene_moments
 from operators.scene.scoring import boxes_of
@@ -45,7 +45,8 @@ def sensed_tracks(
 ) -> list[SensedTrack]:
     """Returns the agents of a map over time; `doings` and `views` tell what true agents do, and which are in view.
 
-    `objects` are what the recogniser takes besides.
+    `objects` are what the recogniser takes besides. Of graphs that come more often than the network takes steps, every
+    second, third ... moment is a track of its own.
     """
     of = [nearest_agents(graph, truth) for graph, truth in zip(graphs, truths, strict=True)]
     times = np.array([truth.stamp for truth in truths]) * 1e-9
@@ -66,7 +67,9 @@ def sensed_tracks(
             for near in np.flatnonzero(np.abs(times - times[row]) <= _HALF + 1e-9).tolist():
                 if agent in doings[near]:
                     right[k, classes.index(doings[near][agent])] = True
-        found.append(SensedTrack(track.features, labels, now, right, plain))
+        apart = max(1, int(np.ceil(STEP / np.median(np.diff(track.times)) - 1e-6)))
+        parts = [slice(begin, None, apart) for begin in range(apart)]
+        found += [SensedTrack(track.features[p], labels[p], now[p], right[p], plain[p]) for p in parts]
     return [track for track in found if (track.labels >= 0).any()]
 
 

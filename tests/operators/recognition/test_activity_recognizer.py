@@ -137,6 +137,22 @@ def test_who_is_out_of_sight_for_long_does_something_unknown() -> None:
     assert found[-1] == "unknown"
 
 
+def test_graphs_that_come_more_often_take_no_more_steps_of_the_network() -> None:
+    recognizer = ActivityRecognizer()
+    recognizer.setup()
+
+    def state() -> bytes:
+        ((_, _, network, *_),) = recognizer.snapshot()["agents"]
+        return np.asarray(network).tobytes()
+
+    states = []
+    for k in range(9):
+        recognizer.process(nodes(k / 10, [person(0.06 * k, 0.0)]))
+        states.append(state())
+    assert states[1::2] == states[0:-1:2]
+    assert len(set(states)) == 5
+
+
 def test_the_state_goes_on_after_a_snapshot_as_if_nothing_had_been() -> None:
     graphs = course(6, lambda t: [person(0.6 * t, 0.0), (4, "mug", (1.0, 0.5, 0.8), (0.1, 0.1, 0.1))])
     whole, first, second = ActivityRecognizer(), ActivityRecognizer(), ActivityRecognizer()

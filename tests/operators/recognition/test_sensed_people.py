@@ -9,16 +9,16 @@ import pytest
 
 from dataflow.messages import Pose, SceneGraph
 from operators.recognition.agent_features import COUNT
-from operators.recognition.sensed_people import nearest_agents, read_tracks, sensed_tracks, write_tracks
+from operators.recognition.sensed_people import SensedTrack, nearest_agents, read_tracks, sensed_tracks, write_tracks
 
 CLASSES = ("walking", "standing")
 
 
-def graph(k: int, people: dict[int, float], chair: bool = False) -> SceneGraph:
-    """A graph a quarter of a second after the last: people by id and where along x they are."""
+def graph(k: int, people: dict[int, float], chair: bool = False, *, rate: int = 4) -> SceneGraph:
+    """The `k`-th of graphs that come so often a second: people by id and where along x they are."""
     ids = [*people, *([99] if chair else [])]
     return SceneGraph(
-        stamp=k * 250_000_000,
+        stamp=k * 1_000_000_000 // rate,
         frame="map",
         class_names=("person", "chair"),
         ids=ids,
@@ -34,10 +34,10 @@ def robot(k: int) -> Pose:
     return Pose(stamp=k, frame="map", position=(0, 0, 0), orientation=(0, 0, 0, 1))
 
 
-def made() -> list[np.ndarray]:
+def made(rate: int = 4) -> list[SensedTrack]:
     count = 12
-    graphs = [graph(k, {7: 0.1 * k, 8: 30.0}, chair=True) for k in range(count)]
-    truths = [graph(k, {1: 0.1 * k + 0.2}) for k in range(count)]
+    graphs = [graph(k, {7: 0.1 * k, 8: 30.0}, chair=True, rate=rate) for k in range(count)]
+    truths = [graph(k, {1: 0.1 * k + 0.2}, rate=rate) for k in range(count)]
     doings = [{1: "walking" if k < 6 else "standing"} for k in range(count)]
     views = [{1} if k != 3 else set() for k in range(count)]
     return sensed_tracks(graphs, [robot(k) for k in range(count)], truths, doings, views, CLASSES)
@@ -51,6 +51,12 @@ def test_a_node_has_what_its_agent_did_a_quarter_of_a_second_before() -> None:
     assert track.plain.tolist() == [k != 3 for k in range(12)]
     assert track.right[4].tolist() == [True, True]  # two graphs before it changes
     assert track.right[2].tolist() == [True, False]
+
+
+def test_more_frequent_graphs_give_a_track_for_each_of_the_steps_in_turn() -> None:
+    first, second = made(rate=10)
+    both = np.stack([first.now, second.now], axis=1).ravel()
+    assert both.tolist() == [0] * 6 + [1] * 6
 
 
 def test_the_nearest_of_a_class_are_one() -> None:
