@@ -32,17 +32,16 @@ def carried(
 ) -> dict[int, int]:
     """Returns the object's id of each observation that is of none where it lay, but of one in somebody's hand.
 
-    `joined` holds the object's ids of the other observations, `views` how often a thing must have been seen. Notes with
-    the things whether they are held now.
+    `joined` holds the object's ids of the other observations, `views` in how many views a thing must
+    have been seen. Notes with the things whether they are held now.
     """
     free = [k for k, each in enumerate(seen) if k not in joined and each.class_id in kinds.portable]
     hands = [objects[i] for k, i in joined.items() if seen[k].class_id in kinds.carriers]
     if not free or not (hands or any(o.held for o in objects.values())):
         return {}
     there = set(joined.values())
-    things = [
-        o for i, o in sorted(objects.items()) if i not in there and o.class_id in kinds.portable and o.views >= views
-    ]
+    rest = [o for i, o in sorted(objects.items()) if i not in there]
+    things = [o for o in rest if o.class_id in kinds.portable and o.sightings >= views]
     shown = view.may_show(np.array([o.center for o in things]).reshape(-1, 3), np.zeros(len(things)))
     usable = [o.id for o, plain in zip(things, shown.tolist(), strict=True) if plain]
     found: dict[int, int] = {}

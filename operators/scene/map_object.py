@@ -18,6 +18,9 @@ from operators.scene.cuboid import ImageView, fit_cuboid
 Array = NDArray[np.float64]
 
 MOST_EVIDENCE = 6.0
+WHOLE = 100_000_000
+"""Nanoseconds since the last view of a thing, from which a view counts in full: sooner ones tell the same again."""
+
 _BRINK = 0.012  # metres that masks and clouds lose of each side of an object
 _KEPT = 16  # views of an object
 _FAR, _ENOUGH = 1.6, 5  # times as far as the third nearest of so many views, and one tells nothing more
@@ -28,7 +31,7 @@ _APART = 0.02  # angle, rad, and a third of the change of the distance, from whi
 _AGAIN = 0.25  # share of the views that are new, from which the box is fitted again
 _SETTLED = 9  # views after which the way in which it stands is settled
 _POINTS = 45  # points of an object that a fit uses
-_PLAIN = ("id", "evidence", "born", "seen", "views", "yaw", "most", "form")
+_PLAIN = ("id", "evidence", "born", "seen", "views", "told", "yaw", "most", "form")
 _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 
 
@@ -36,11 +39,11 @@ _ARRAYS = ("votes", "color", "center", "size", "velocity", "view")
 class MapObject:
     """One object of the map, in an upright box. Times in nanoseconds.
 
-    `votes` (C,) sums scores by class, `view` (2,) the horizontal directions of the views; `most` is the largest number
-    of voxels that it had; `images` are the views that its box is fitted to, `form` which of the ways in which its class
-    stands, -1 while that is open, `fresh` how many of them are new since the last fit; `held` whether it
-    was last seen in a hand. `beside` counts by id in how many views
-    another one was seen too, in a place of its own in the image.
+    `told` sums for its views the time since the one before, `WHOLE` at most. `votes` (C,) sums scores by class,
+    `view` (2,) the horizontal directions of the views; `most` is the largest number of voxels that it had; `images` are
+    the views that its box is fitted to, `form` which of the ways in which its class stands, -1 while that is open,
+    `fresh` how many of them are new since the last fit; `held` whether it was last seen in a hand. `beside` counts by
+    id in how many views another one was seen too, in a place of its own in the image.
     """
 
     id: int
@@ -50,6 +53,7 @@ class MapObject:
     born: int
     seen: int
     views: int = 1
+    told: int = WHOLE
     color: Array = field(default_factory=lambda: np.full(3, np.nan))
     center: Array = field(default_factory=lambda: np.zeros(3))
     size: Array = field(default_factory=lambda: np.zeros(3))
@@ -80,6 +84,11 @@ class MapObject:
     def label(self) -> float:
         """Mean over its views of what labels of its class count, others counting as 0."""
         return float(self.votes[self.class_id]) / self.views
+
+    @property
+    def sightings(self) -> int:
+        """Number of its views, to the nearest, those soon after another counting less: alike at any rate of images."""
+        return round(self.told / WHOLE)
 
     @property
     def longest(self) -> float:
@@ -180,7 +189,8 @@ class MapObject:
         cells = Cells(side)
         cells.restore(state["cells"])
         fields: dict[str, Any] = {name: np.array(state[name], np.float64) for name in _ARRAYS}
-        made = cls(cells=cells, **{name: state[name] for name in _PLAIN}, **fields)
+        plain = {"told": state["views"] * WHOLE, **state}  # earlier versions counted views alone
+        made = cls(cells=cells, **{name: plain[name] for name in _PLAIN}, **fields)
         made.beside = Counter({int(other): int(count) for other, count in state.get("beside", ())})
         made.held = bool(state.get("held", False))
         for P, box, edges, eye in zip(*state["images"], strict=True) if len(state["images"]) else ():

@@ -73,6 +73,7 @@ def merge(a: MapObject, b: MapObject, kinds: Kinds) -> MapObject:
         best.vote(class_id, count)
     best.evidence = min(max(best.evidence, other.evidence), MOST_EVIDENCE)
     best.seen, best.views = max(best.seen, other.seen), best.views + other.views
+    best.told += other.told
     best.view = best.view + other.view
     best.beside += other.beside
     best.born, best.id = min((a.born, a.id), (b.born, b.id))
@@ -91,7 +92,7 @@ def smaller_in_place(object: MapObject, known: Iterable[MapObject], kinds: Kinds
         for o in known
         if o.class_id != object.class_id
         and o.evidence >= s.confirm
-        and o.views >= s.views
+        and o.sightings >= s.views
         and o.cells.apart(object.cells) <= s.voxel
         and not (kinds.is_mover(o) or kinds.is_large(o))
     ]

@@ -15,7 +15,7 @@ from operators.scene.cells import Cells
 from operators.scene.class_sizes import Usual
 from operators.scene.heading import RoomHeading
 from operators.scene.kinds import Kinds
-from operators.scene.map_object import MOST_EVIDENCE, MapObject
+from operators.scene.map_object import MOST_EVIDENCE, WHOLE, MapObject
 from operators.scene.matching import (
     MapSettings,
     Observation,
@@ -114,7 +114,7 @@ class ObjectMap:
     def confirmed(self) -> list[MapObject]:
         """Returns the objects that are surely there, by rising id."""
         s = self._settings
-        sure = [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.views >= s.views]
+        sure = [o for _, o in sorted(self.objects.items()) if o.evidence >= s.confirm and o.sightings >= s.views]
         called = (o for o in sure if o.label >= s.label or not self._kinds.may_leave(o))
         return [o for o in called if self._kinds.may_be_so_large(o)]
 
@@ -176,7 +176,10 @@ class ObjectMap:
         before, since = object.center.copy(), max((stamp - object.seen) * 1e-9, 1e-3)
         voted = object.class_id
         object.vote(each.class_id, self._kinds.vote(each.class_id, each.score))
-        object.evidence = min(max(object.evidence, 0.0) + _log_odds(each.score, self._settings.gain), MOST_EVIDENCE)
+        told = min(stamp - object.seen, WHOLE)
+        object.told += told
+        gain = told / WHOLE * _log_odds(each.score, self._settings.gain)
+        object.evidence = min(max(object.evidence, 0.0) + gain, MOST_EVIDENCE)
         object.seen = stamp
         if each.color is not None:
             known = np.isfinite(object.color).all()
@@ -278,7 +281,7 @@ class ObjectMap:
         for i, object in list(self.objects.items()):
             if object.evidence < 0:
                 del self.objects[i]
-                if object.views >= s.views:
+                if object.sightings >= s.views:
                     self.gone[i] = (stamp, object)
         there: dict[int, list[MapObject]] = {}  # by class
         for o in self.confirmed() if self.gone else ():

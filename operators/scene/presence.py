@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from operators.scene.cells import Cells
 from operators.scene.kinds import Kinds
-from operators.scene.map_object import MOST_EVIDENCE, MapObject
+from operators.scene.map_object import MOST_EVIDENCE, WHOLE, MapObject
 from operators.scene.matching import MapSettings
 from operators.scene.range_view import GROWTH, RangeView, Sight
 
@@ -42,7 +42,8 @@ def look_at(
 ) -> None:
     """Takes what a view says of an object's place, and what of it (`own`) the view shows, if any.
 
-    `left` says that a finer look found its place empty.
+    `seconds` are those since the view before: soon after it a view tells less. `left` says that a finer look found its
+    place empty.
     """
     mover = kinds.is_mover(object)
     if not len(object.cells):
@@ -61,13 +62,14 @@ def look_at(
         object.evidence -= seconds * MOST_EVIDENCE / s.mover_memory
     if sight is None:
         return
+    share = min(seconds * 1e9 / WHOLE, 1.0)
     if left or _is_empty(sight):
-        object.evidence -= s.vacated * (3 if mover else 1)
+        object.evidence -= share * s.vacated * (3 if mover else 1)
     elif np.count_nonzero(sight.looked) >= _least(sight):
         distance = float(np.linalg.norm(object.center - eye))
         plain = np.count_nonzero(sight.confirmed) >= _EMPTY * len(sight.looked)
         if plain and object.longest >= s.miss_angle * distance:
-            object.evidence -= s.missed
+            object.evidence -= share * s.missed
 
 
 def _is_empty(sight: Sight) -> bool:

@@ -221,6 +221,51 @@ def test_a_snapshot_from_before_that_was_counted_is_taken_up() -> None:
     assert list(again.objects) == list(known.objects)
 
 
+@pytest.mark.parametrize("rate", [10, 20, 50])
+def test_what_is_seen_for_a_while_tells_the_same_at_any_rate_of_images(rate: int) -> None:
+    known = ObjectMap(3, [], MapSettings())
+    T, nothing = looking(0.0), RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
+    for k in range(rate * 2 // 5 + 1):
+        known.update(SECOND + k * SECOND // rate, [replace(observation(THING, BOX, T), score=0.6)], nothing)
+    object = only(known)
+    assert object.sightings == 5
+    assert object.evidence == pytest.approx(5 * np.log(0.6 / 0.4))
+
+
+@pytest.mark.parametrize(("seconds", "given"), [(0.1, 0), (0.3, 1)])
+def test_what_images_in_a_flash_show_is_not_yet_there(seconds: float, given: int) -> None:
+    known = ObjectMap(3, [], MapSettings())
+    nothing = RangeView(np.zeros((0, 3)), looking(0.0), 0.012)
+    for k in range(4):
+        stamp = SECOND + round(k * seconds / 3 * SECOND)
+        known.update(stamp, [observation(THING, BOX, looking(0.0))], nothing)
+    assert len(known.confirmed()) == given
+
+
+@pytest.mark.parametrize("rate", [10, 50])
+def test_an_empty_place_is_given_up_as_soon_at_any_rate_of_images(rate: int) -> None:
+    known = after([[(THING, BOX)]] * 8)
+    T = looking(0.0)
+    wall = np.stack(np.meshgrid([4.0], np.linspace(-2, 2, 120), np.linspace(-1, 1.4, 90)), axis=-1).reshape(-1, 3)
+    empty = RangeView((wall - T[:3, 3]) @ T[:3, :3], T, 0.012)
+    only(known).cells.hits[:] = 1000  # so that its voxels are not what goes first
+    for k in range(1, 3 * rate + 1):
+        known.update(2 * SECOND + k * SECOND // rate, [], empty)
+        if not known.objects:
+            break
+    assert k / rate == pytest.approx(0.7, abs=0.1)
+
+
+def test_a_snapshot_from_before_times_of_views_were_summed_is_taken_up() -> None:
+    known = after([[(THING, BOX)]] * 5)
+    earlier = known.snapshot()
+    for entry in earlier["objects"]:
+        del entry["told"]
+    again = ObjectMap(3, [BALL], MapSettings(), BALL_SIZE)
+    again.restore(earlier)
+    assert [o.sightings for o in again.objects.values()] == [5]
+
+
 @pytest.mark.parametrize(("length", "given"), [(0.14, 1), (0.8, 0)])
 def test_a_thing_larger_than_any_of_its_class_is_not_given(length: float, given: int) -> None:
     size = {BOX: (Usual((0.12, 0.12, 0.12), (0.2, 0.2, 0.2)),)}
