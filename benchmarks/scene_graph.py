@@ -71,7 +71,9 @@ def goals(frames: list[Frame], graphs: list[SceneGraph]) -> dict[str, list[bool]
                 continue
             if not early or not aim.isdigit():
                 continue
-            graph, old = graphs[early[-1]], graphs[max(early[-1] - 4, 0)]
+            now = frames[early[-1]].cloud.stamp
+            before_that = [j for j in early if now - frames[j].cloud.stamp >= 1_000_000_000]
+            graph, old = graphs[early[-1]], graphs[before_that[-1] if before_that else 0]
             ids, names = graph.ids.tolist(), [graph.class_names[c] for c in graph.class_ids.tolist()]
             candidates = [i for i, n in enumerate(names) if n in ("chair", "table", "mug", "bottle", "door", "shelf")]
             if agent not in ids or int(aim) not in ids:
