@@ -40,6 +40,11 @@ class Keyframe:
         return invert(self.T_world_camera)
 
     @cached_property
+    def place_variance(self) -> float:
+        """Square metres by which its place is unsure, all directions together."""
+        return float(np.trace(self.covariance[:3, :3]))
+
+    @cached_property
     def description(self) -> Description:
         """Its descriptors, made when a lost camera first asks for them."""
         return describe(self.gray)

@@ -16,9 +16,9 @@ REACH = 0.7  # radians of view change beyond which two views share too little to
 DRIFTED = 0.06  # metres: no view is laid on the surfaces of keyframes that the odometry may have drifted farther from
 
 
-def drift(a: Keyframe, b: Keyframe) -> float:
-    """Returns the standard deviation, metres, by which the place of one keyframe is less sure than another's."""
-    return float(np.sqrt(abs(np.trace(a.covariance[:3, :3]) - np.trace(b.covariance[:3, :3]))))
+def drifted(a: Keyframe, b: Keyframe) -> bool:
+    """Tells whether the odometry may have drifted far from one keyframe to the other: see DRIFTED."""
+    return abs(a.place_variance - b.place_variance) >= DRIFTED**2
 
 
 class LocalMap:
@@ -77,7 +77,7 @@ class LocalMap:
         them, a pose would be torn from one place to the other, and what stands still would seem to move.
         """
         *older, newest = (k for k in self.keyframes if k.segment == segment)
-        older = [k for k in older if drift(k, newest) < DRIFTED]
+        older = [k for k in older if not drifted(k, newest)]
         depth = newest.surface.typical_depth
         distances = [view_distance(k.T_world_camera, T_world_camera, depth) for k in older]
         ranked = sorted(range(len(older)), key=distances.__getitem__)
@@ -89,9 +89,9 @@ class LocalMap:
 
     def earlier(self, T_world_camera: Matrix, segment: int) -> list[Keyframe]:
         """Returns the keyframe of a while ago that still shares a pose's view, if there is one."""
-        old = [k for k in self.keyframes if k.segment == segment][-EARLIER:-2]
-        near = [k for k in old if view_distance(k.T_world_camera, T_world_camera, 2.0) < 0.5 * REACH]
-        return near[:1]
+        *old, newest = [k for k in self.keyframes if k.segment == segment][-EARLIER:]
+        near = (k for k in old[:-1] if view_distance(k.T_world_camera, T_world_camera, 2.0) < 0.5 * REACH)
+        return [k for k in near if not drifted(k, newest)][:1]
 
     def rendered(self, T_world_camera: Matrix, like: Surface) -> Surface:
         """Returns what the map expects a depth camera at a pose to see, on the grid of a surface."""

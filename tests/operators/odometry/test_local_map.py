@@ -80,3 +80,13 @@ def test_a_camera_that_is_placed_again_is_not_laid_on_what_it_drifted_past_meanw
     known.add(keyframe(0))
 
     assert [k.stamp for k in known.nearby(keyframe(0).T_world_camera, 4, 0)] == [0]
+
+
+def test_what_moves_is_not_told_by_a_keyframe_that_the_odometry_has_drifted_from() -> None:
+    """Laid on one that is off, what stands still would seem to stand before it."""
+    known = LocalMap(20)
+    known.add(replace(keyframe(0), covariance=np.diag([4 * DRIFTED**2, 0, 0, 0, 0, 0])))
+    for number in range(1, 4):
+        known.add(keyframe(number))
+
+    assert [k.stamp for k in known.earlier(keyframe(0).T_world_camera, 0)] == [1]
