@@ -45,7 +45,7 @@ class SceneGraphBuilder(Operator):
         required=False, doc="holds the transform between `robot_frame` and the frame that `robot` poses"
     )
     recognized: Sampled[Activity] = Sampled(
-        required=False, doc="activities of agents by ActivityRecognizer; known and fresh ones replace our own"
+        required=False, doc="activities of agents by ActivityRecognizer; fresh ones, `unknown` too, replace our own"
     )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
@@ -212,14 +212,14 @@ class SceneGraphBuilder(Operator):
 
 
 def _recognized(act: Act, recognized: Activity) -> Act:
-    """Returns an act with what a recogniser says of its agent in place of ours."""
+    """Returns an act with what a recogniser says of its agent in place of ours, what it does not know included."""
     rows = np.flatnonzero(recognized.subjects == act.agent)
     if not len(rows):
         return act
     k = int(rows[0])
     name = recognized.class_names[recognized.class_ids[k]] if recognized.class_names else str(recognized.class_ids[k])
-    if name == UNKNOWN:
-        return act
+    if name == UNKNOWN:  # our own word would be wrong twice as often as right
+        return Act(act.agent, UNKNOWN, float(recognized.scores[k]), -1, act.since, act.goals)
     object = act.object if recognized.objects is None else int(recognized.objects[k])
     since = act.since if recognized.since is None else int(recognized.since[k])
     return Act(act.agent, name, float(recognized.scores[k]), object, since, act.goals)

@@ -209,18 +209,19 @@ def test_what_a_hand_has_is_held() -> None:
     assert not any(s == 2 and p == "on" for s, p, _ in found)
 
 
-def test_a_recognised_activity_counts_while_it_is_fresh() -> None:
+@pytest.mark.parametrize("said", ["drinking", "unknown"])
+def test_a_recognised_activity_counts_while_it_is_fresh(said: str) -> None:
     nodes = [room(k, [TABLE, person(0, 3)]) for k in range(8)]
     told = Activity(
         stamp=3 * STEP,
-        class_names=("drinking",),
+        class_names=(said,),
         subjects=np.array([9]),
         class_ids=np.array([0], np.int32),
         scores=np.array([0.7], np.float32),
     )
     played = play(SceneGraphBuilder(), {"nodes": nodes, "recognized": [told]})
     names = [m.class_names[m.class_ids[0]] for m in played["activities"] if isinstance(m, Activity)]
-    assert names[2:4] == ["drinking", "drinking"]
+    assert names[2:4] == [said, said]
     assert names[-1] == "standing"
 
 
