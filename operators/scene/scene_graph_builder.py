@@ -218,7 +218,7 @@ def _recognized(act: Act, recognized: Activity) -> Act:
         return act
     k = int(rows[0])
     name = recognized.class_names[recognized.class_ids[k]] if recognized.class_names else str(recognized.class_ids[k])
-    if name == UNKNOWN:  # our own word would be wrong twice as often as right
+    if name == UNKNOWN:  # our own word would more often be wrong than right
         return Act(act.agent, UNKNOWN, float(recognized.scores[k]), -1, act.since, act.goals)
     object = act.object if recognized.objects is None else int(recognized.objects[k])
     since = act.since if recognized.since is None else int(recognized.since[k])
