@@ -23,6 +23,8 @@ from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""
 
+_IN_SIGHT = 1_500_000_000  # nanoseconds since an agent was seen, up to which a recogniser may tell what it does
+
 
 class SceneGraphBuilder(Operator):
     """Relates the objects of a map: what is on, in, under, near, left of what, who does what, and where they are going.
@@ -45,7 +47,8 @@ class SceneGraphBuilder(Operator):
         required=False, doc="holds the transform between `robot_frame` and the frame that `robot` poses"
     )
     recognized: Sampled[Activity] = Sampled(
-        required=False, doc="activities of agents by ActivityRecognizer; fresh ones, `unknown` too, replace our own"
+        required=False,
+        doc="activities of agents by ActivityRecognizer; fresh ones replace our own, `unknown` of what is in sight, too",
     )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
@@ -181,7 +184,9 @@ class SceneGraphBuilder(Operator):
     def _activities(self, nodes: SceneGraph, now: Snapshot, recognized: Activity | None) -> Activity:
         acts = list(now.acts)
         if recognized is not None and nodes.stamp - recognized.stamp <= self.fresh * 1e9:
-            acts = [_recognized(act, recognized) for act in acts]
+            seen = np.full(nodes.count, nodes.stamp) if nodes.last_seen is None else nodes.last_seen
+            shown = set(nodes.ids[nodes.stamp - seen <= _IN_SIGHT].tolist())
+            acts = [_recognized(act, recognized, in_sight=act.agent in shown) for act in acts]
         names = tuple(dict.fromkeys([*ACTIVITIES, *(a.activity for a in acts)]))
         return Activity(
             stamp=nodes.stamp,
@@ -211,15 +216,19 @@ class SceneGraphBuilder(Operator):
         )
 
 
-def _recognized(act: Act, recognized: Activity) -> Act:
-    """Returns an act with what a recogniser says of its agent in place of ours, what it does not know included."""
+def _recognized(act: Act, recognized: Activity, *, in_sight: bool) -> Act:
+    """Returns an act with what a recogniser says of its agent in place of ours.
+
+    That it does not know counts too, while the agent is in sight: ours would more often be wrong than right. Out of
+    sight nobody can tell, and ours is what the agent did last.
+    """
     rows = np.flatnonzero(recognized.subjects == act.agent)
     if not len(rows):
         return act
     k = int(rows[0])
     name = recognized.class_names[recognized.class_ids[k]] if recognized.class_names else str(recognized.class_ids[k])
-    if name == UNKNOWN:  # our own word would more often be wrong than right
-        return Act(act.agent, UNKNOWN, float(recognized.scores[k]), -1, act.since, act.goals)
+    if name == UNKNOWN and not in_sight:
+        return act
     object = act.object if recognized.objects is None else int(recognized.objects[k])
     since = act.since if recognized.since is None else int(recognized.since[k])
     return Act(act.agent, name, float(recognized.scores[k]), object, since, act.goals)

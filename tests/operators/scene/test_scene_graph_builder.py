@@ -225,6 +225,25 @@ def test_a_recognised_activity_counts_while_it_is_fresh(said: str) -> None:
     assert names[-1] == "standing"
 
 
+@pytest.mark.parametrize(("ago", "name"), [(1.0, "unknown"), (2.0, "standing")])
+def test_of_who_is_out_of_sight_what_was_done_last_counts_where_nothing_is_recognised(ago: float, name: str) -> None:
+    operator = SceneGraphBuilder()
+    operator.setup()
+    for k in range(8):
+        operator.process(room(k, [TABLE, person(0, 3)]))
+    nodes = room(8, [TABLE, person(0, 3)])
+    told = Activity(
+        stamp=nodes.stamp,
+        class_names=("unknown",),
+        subjects=np.array([9]),
+        class_ids=np.array([0], np.int32),
+        scores=np.array([0.7], np.float32),
+    )
+    seen = np.array([nodes.stamp, nodes.stamp - round(ago * 1e9)])
+    said = operator.process(nodes.replace(last_seen=seen), recognized=told)["activities"]
+    assert said.class_names[said.class_ids[0]] == name
+
+
 def test_nodes_without_a_place_are_counted_and_other_frames_refused() -> None:
     nowhere: Thing = (2, "mug", (np.nan, 0, 0), (0.1, 0.1, 0.1))
     operator = SceneGraphBuilder()
