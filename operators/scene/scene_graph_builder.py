@@ -48,7 +48,7 @@ class SceneGraphBuilder(Operator):
     )
     recognized: Sampled[Activity] = Sampled(
         required=False,
-        doc="activities of agents by ActivityRecognizer; fresh ones replace our own, `unknown` of what is in sight, too",
+        doc="activities of agents by ActivityRecognizer; fresh ones replace our own, `unknown` of those in sight, too",
     )
     graph: Out[SceneGraph] = Out(doc="all nodes and the relations that hold, with their scores")
     activities: Out[Activity] = Out(doc="what agents do, to what, since when, and their likeliest goal")
