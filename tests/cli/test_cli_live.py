@@ -81,6 +81,7 @@ def test_commands_say_which_graph_they_follow(dataflow, tmp_path: Path, words: l
     assert "following" not in told.stdout
 
 
+@pytest.mark.usefixtures("running")
 def test_the_graph_that_is_meant_may_stand_in_the_environment(dataflow, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("DATAFLOW_GRAPH", "kitchen")
     assert "no graph 'kitchen' runs here" in dataflow("echo", code=2).stderr
@@ -88,6 +89,7 @@ def test_the_graph_that_is_meant_may_stand_in_the_environment(dataflow, monkeypa
     assert "total" in dataflow("hz", "--graph", "small", "--seconds", 0.2).stdout
 
 
+@pytest.mark.usefixtures("running")
 def test_echo_prints_fields_for_people(dataflow) -> None:
     told = dataflow("echo", "left/*", "-n", 4).stdout
 
