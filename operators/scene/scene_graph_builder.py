@@ -23,7 +23,7 @@ from operators.scene.relations import FLOOR, ROBOT, ROOM, SURFACE, RelationRules
 EXTRA = {FLOOR: "floor", ROBOT: "self", ROOM: "room"}
 """Classes of the nodes that are not objects, by id."""
 
-_IN_SIGHT = 1_500_000_000  # nanoseconds since an agent was seen, up to which a recogniser may tell what it does
+_IN_SIGHT = 1_500_000_000  # nanoseconds since an agent was seen, up to which no answer is an answer
 
 
 class SceneGraphBuilder(Operator):
