@@ -209,16 +209,21 @@ def test_what_a_hand_has_is_held() -> None:
     assert not any(s == 2 and p == "on" for s, p, _ in found)
 
 
-@pytest.mark.parametrize("said", ["drinking", "unknown"])
-def test_a_recognised_activity_counts_while_it_is_fresh(said: str) -> None:
-    nodes = [room(k, [TABLE, person(0, 3)]) for k in range(8)]
-    told = Activity(
-        stamp=3 * STEP,
-        class_names=(said,),
+def recognised(stamp: int, name: str) -> Activity:
+    """What a recogniser says of the person with id 9."""
+    return Activity(
+        stamp=stamp,
+        class_names=(name,),
         subjects=np.array([9]),
         class_ids=np.array([0], np.int32),
         scores=np.array([0.7], np.float32),
     )
+
+
+@pytest.mark.parametrize("said", ["drinking", "unknown"])
+def test_a_recognised_activity_counts_while_it_is_fresh(said: str) -> None:
+    nodes = [room(k, [TABLE, person(0, 3)]) for k in range(8)]
+    told = recognised(3 * STEP, said)
     played = play(SceneGraphBuilder(), {"nodes": nodes, "recognized": [told]})
     names = [m.class_names[m.class_ids[0]] for m in played["activities"] if isinstance(m, Activity)]
     assert names[2:4] == [said, said]
@@ -232,13 +237,7 @@ def test_of_who_is_out_of_sight_what_was_done_last_counts_where_nothing_is_recog
     for k in range(8):
         operator.process(room(k, [TABLE, person(0, 3)]))
     nodes = room(8, [TABLE, person(0, 3)])
-    told = Activity(
-        stamp=nodes.stamp,
-        class_names=("unknown",),
-        subjects=np.array([9]),
-        class_ids=np.array([0], np.int32),
-        scores=np.array([0.7], np.float32),
-    )
+    told = recognised(nodes.stamp, "unknown")
     seen = np.array([nodes.stamp, nodes.stamp - round(ago * 1e9)])
     said = operator.process(nodes.replace(last_seen=seen), recognized=told)["activities"]
     assert said.class_names[said.class_ids[0]] == name
